@@ -23,6 +23,7 @@ from experiments.file.problems import DocumentError, Problem
 from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
+from experiments.recording.reader import RecordingError
 from experiments.recording.run_folder import SOURCE
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
@@ -169,8 +170,6 @@ def reopen(folder: Path) -> Run:
     Raises:
         RecordingError: If there is no recording, or one cannot be read.
     """
-    from experiments.recording.reader import RecordingError  # noqa: PLC0415
-
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `zenpark run` prints the folder that it makes")
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)

@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.arrays import Array, norm
 from experiments.file.document import load
-from experiments.metrics.signals import beliefs, links_of
+from experiments.metrics.signals import beliefs
 from experiments.recording.trace import Trace
 from experiments.run import folder, show, simulate
 from experiments.sweep.pareto import front
@@ -53,7 +53,7 @@ for name, case in run.metrics.items():
 # %%
 def by_hand(trace: Trace) -> tuple[float, float]:
     """Messages in a second and IAE [m s], mean over the followers."""
-    net, duration = links_of(trace), float(trace.time[-1] - trace.time[0])
+    net, duration = trace.plan.links, float(trace.time[-1] - trace.time[0])
     position = trace.true_position
     off = np.abs(net.distance - norm(position[:, net.receiver] - position[:, net.sender]))  # (T, E)
     rates, errors = [], []
@@ -148,7 +148,7 @@ show(pictures["intervals"], OUT / "events-intervals")
 # time.)
 
 # %%
-net = links_of(event)
+net = event.plan.links
 believed = beliefs(event, net)  # (T, E) [m]
 ground = np.array([not name.startswith("CF") for name in event.robots])[net.sender]
 worst_ground = float(np.nanmax(believed[:, ground]))

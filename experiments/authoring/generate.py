@@ -34,7 +34,7 @@ HIGHEST: Final = 3.0  # gain of the reference experiment
 FREE: Final = 0.3  # share of the spacing that starts may be scattered by, on each axis
 PASSING: Final = 0.1  # [m] between robots on their way
 TELEMETRY: Final = 5000.0  # samples in a second, of all robots
-WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: as real drones wobble"
+WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"
 
 
 @dataclass(frozen=True)
@@ -136,11 +136,7 @@ def experiment_file(made: Layout, wanted: Wanted) -> str:
             "",
             "[disturbance.all]",
             "position_sigma = 0.0003        # m, white noise of motion capture",
-            *(
-                ["# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"]
-                if kind.flies
-                else []
-            ),
+            *([WOBBLE] if kind.flies else []),
             "",
             f"[robots]                       # {len(made)}; start: its place in the formation",
             *robots,

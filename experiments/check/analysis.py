@@ -166,7 +166,7 @@ class Analysis:
         return f"{self.names[links.sender[number]]} - {self.names[links.receiver[number]]}"
 
     def pair(self, number: int) -> str:
-        """One of the pairs `edges(...)` of the links that stand at the beginning, in words."""
+        """A pair of `edges(...)` of the links that stand at the beginning, in words."""
         first, second = edges(self.asked.select(self.standing))[number]
         return f"{self.names[first]} - {self.names[second]}"
 

@@ -251,7 +251,7 @@ def conflicts(links: Links, height: Array) -> list[Conflict]:
 
 
 def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Conflict:
-    """What height would close it: that of the triangle itself, standing on the two that share a height."""
+    """Height that would close a triangle: its own, standing on the two robots that share a height."""
     for apex in triangle:
         left, right = (row for row in triangle if row != apex)
         if height[left] == height[right] != height[apex]:
@@ -339,7 +339,7 @@ def stiffness(
 
 
 def expendable(position: Array, links: Links, led: Index) -> Redundancy:
-    """What a formation by distances can lose and stay rigid while heights are held: of its `edges`, and of its robots.
+    """Links and robots without which a formation by distances stays rigid while heights are held.
 
     Bars between leaders, rows `led`, cannot be lost as links are; they go with their robots.
     """

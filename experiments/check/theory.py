@@ -65,8 +65,9 @@ def network(analysis: Analysis) -> Iterator[Claim]:
     yield from problems
     if not problems:
         whole = "the network is whole; " if analysis.parts == 1 else ""
-        reached = f"every robot is reached by {listed(leaders)}" if leaders else "no leader: the formation finds a place"
-        yield Claim("note", "connected", whole + reached)
+        reached = f"every robot is reached by {listed(leaders)}"
+        led = reached if leaders else "no leader: the formation finds its own place"
+        yield Claim("note", "connected", whole + led)
 
 
 def realisation(analysis: Analysis) -> Iterator[Claim]:

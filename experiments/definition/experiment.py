@@ -69,7 +69,7 @@ class Rates(Part, frozen=True):
 
 
 class Robot(Part, frozen=True):
-    """One robot."""
+    """Robot: kind, start, body and settings."""
 
     kind: Annotated[str, Meta(description="crazyflie, tello, khepera4 or turtlebot3")]
     start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
@@ -355,7 +355,7 @@ class Hybrid(Part, frozen=True):
 
 
 class Experiment(Part, frozen=True):
-    """One experiment, or one case of it after `document.cases`."""
+    """Experiment, or a case of it after `document.cases`."""
 
     title: Annotated[str, Meta(description="what the experiment shows, for people")]
     robots: Annotated[dict[Name, Robot], Meta(description="robots by name", min_length=1)]

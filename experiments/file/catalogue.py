@@ -31,33 +31,18 @@ def path(name: str) -> Path:
 
 
 def copy_entry(name: str, target: Path) -> Path:
-    """Copies a catalogue entry; beside it its arena file, and the schema that its first line shows to editors.
-
-    Args:
-        name: Of the entry.
-        target: The new file, or a folder for it.
-
-    Returns:
-        The file that was written.
-
-    Raises:
-        DocumentError: If there is no such entry, or the target exists or cannot be written, or another arena file of
-            that name is there.
-    """
+    """Copies a catalogue entry to a file or into a folder; see `write_new`."""
     source = path(name)
     return write_new(source.read_text("utf-8"), target / source.name if target.is_dir() else target, furnished=True)
 
 
 def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
-    """Writes a new experiment file, with the schema beside it that its first line shows to editors.
+    """Writes a new experiment file and, beside it, the schema that its first line shows to editors.
 
     Args:
         text: Of the file.
-        target: The file.
+        target: The file, which is returned.
         furnished: The text is a catalogue entry's: the arena file that it names comes along.
-
-    Returns:
-        The file.
 
     Raises:
         DocumentError: If the target exists or cannot be written, or another arena file of that name is there.

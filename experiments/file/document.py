@@ -181,7 +181,7 @@ def write_json(experiment: Experiment) -> bytes:
 
 @dataclass(frozen=True)
 class _Reading:
-    """One reading of a parsed text."""
+    """Reading of a parsed text."""
 
     file: Path
     source: Source  # its arena files are added while it is read

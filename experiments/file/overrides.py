@@ -28,7 +28,7 @@ _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 @dataclass(frozen=True, eq=False)
 class Override:
-    """One `--set`: a path into the document, or into the table of the only `case` that it is for."""
+    """A `--set`: a path into the document, or into the table of the only `case` that it is for."""
 
     flag: str
     path: Path
@@ -284,7 +284,7 @@ def _path(key: str) -> Path:
 
 
 def _typed(text: str) -> object:
-    """What TOML makes of a value; the bare text if it makes nothing of it."""
+    """A value as TOML reads it; else the bare text."""
     try:
         values = tomllib.loads(f"value = {text}")
     except ValueError:

@@ -13,8 +13,6 @@ from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 
 LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
 BEGIN: Final = "zenpark new copies an experiment to begin with"
-# For a key of 20,000 parts `tomllib` takes 10 s, for one of 200,000 more memory than a machine has.
-_ENDLESS: Final = re.compile(r"""(?<![\w-])(?:["']?[\w-]++["']?[ \t]*+\.[ \t]*+){50}""")
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),
@@ -87,8 +85,6 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
     """
     if json:
         return _json(text, label)
-    if _ENDLESS.search(text):
-        raise refusal(label, "a key has more than 50 parts", "no value of an experiment lies so deep; shorten it")
     try:
         document = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or an integer of thousands of digits

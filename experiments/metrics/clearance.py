@@ -119,7 +119,7 @@ def _nearer(known: Approach | None, time: Array, gap: Array, between: tuple[str,
 
 
 def _overlaps(time: Array, gap: Array, between: tuple[str, str]) -> list[Collision]:
-    """One collision for each maximal time in which a gap (T,) is negative."""
+    """Collisions: one for each maximal time in which a gap (T,) is negative."""
     inside = gap < -TOUCH_M
     if not inside.any():
         return []

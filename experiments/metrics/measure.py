@@ -11,7 +11,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -197,32 +197,25 @@ def _robots(
     dropped = Counter(dict.fromkeys(trace.robots, 0))
     for link in passed:
         dropped[link.speaker] += link.dropped
+    counts: dict[str, Any] = {  # (N,) each
+        **{"messages": sent, "bytes": size, "recorded": recorded, "listeners": listeners, "heard": delivered},
+        **{"lost": trace.lost, "missed_deadlines": trace.missed_deadlines, "updates": trace.decisions},
+        **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
+    }
+    known: dict[str, Any] = {"iae": iae, "itae": itae, "rmse": rmse}  # (N,) each, NaN where unknown
+    known |= zip(("gap_min_s", "gap_median_s", "gap_max_s"), zip(*waits, strict=True), strict=True)
     return tuple(
         RobotMetrics(
             robot=name,
             kind=trace.experiment.robots[name].kind,
             f_hz=float(sent[i]) / duration,
-            messages=int(sent[i]),
-            bytes=int(size[i]),
-            iae=_number(iae[i]),
-            itae=_number(itae[i]),
-            rmse=_number(rmse[i]),
             acquired_s=phases[0][i].acquired_s,
-            lost=int(trace.lost[i]),
             dropped=dropped[name],
-            missed_deadlines=int(trace.missed_deadlines[i]),
             residual=phases[0][i].residual,
             worst=phases[0][i].worst,
             phases=tuple(phase[i] for phase in phases[1:]),
             settle_s=duration if (when := settled[i]) is None else when,
             missed_share=_share(trace.missed_deadlines[i], trace.ticks[i]),
-            updates=int(trace.decisions[i]),
-            gap_min_s=_number(waits[i][0]),
-            gap_median_s=_number(waits[i][1]),
-            gap_max_s=_number(waits[i][2]),
-            recorded=int(recorded[i]),
-            listeners=int(listeners[i]),
-            heard=int(delivered[i]),
             coverage=float(coverage[i]),
             known=float(errors.alive[there, i].mean()),
             collisions=len(own[i]),
@@ -231,16 +224,14 @@ def _robots(
             short=_short(trace, errors.net, i),
             near=clearance.robots[i],
             near_arena=clearance.arena[i],
-            interventions=int(trace.interventions[i]),
             intervened_share=_share(trace.interventions[i], trace.ticks[i]),
-            avoided=int(trace.avoided[i]),
             avoided_share=_share(trace.avoided[i], trace.ticks[i]),
             shadow=agreements[i],
-            goals=int(goals[i]),
-            goal_bytes=int(goal_bytes[i]),
             delay_mean_s=late[i].mean,
             delay_p95_s=late[i].p95,
             delay_max_s=late[i].largest,
+            **{what: int(each[i]) for what, each in counts.items()},
+            **{what: _number(each[i]) for what, each in known.items()},
         )
         for i, name in enumerate(trace.robots)
     )
@@ -271,7 +262,7 @@ def _slowest(trace: Trace) -> float | None:
 
 
 def _cost(robot: RobotMetrics) -> float:
-    """One robot's share of J2; an error that is unknown costs nothing."""
+    """Share of a robot in J2; an unknown error costs nothing."""
     effort = 0.02 * robot.messages + 0.1 * robot.updates + 0.3 * robot.settle_s
     return effort + 0.1 * (robot.iae or 0.0) + 0.01 * (robot.itae or 0.0)
 

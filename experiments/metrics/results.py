@@ -13,7 +13,7 @@ INDICES: Final = (
 
 
 class Phase(msgspec.Struct, frozen=True):
-    """One robot in one later phase: from a leg of the timeline to the next, or to the end."""
+    """Robot in a later phase: from a leg of the timeline to the next, or to the end."""
 
     start_s: float  # [s] since the common start
     acquired_s: float | None  # [s] since the start of the phase
@@ -76,7 +76,7 @@ class Guidance(msgspec.Struct, frozen=True):
 
 
 class RobotMetrics(msgspec.Struct, frozen=True):
-    """One robot in one case; unknown numbers are None."""
+    """Metrics of a robot in a case; unknown numbers are None."""
 
     robot: str
     kind: str
@@ -151,7 +151,7 @@ class Passage(msgspec.Struct, frozen=True):
 
 
 class CaseMetrics(msgspec.Struct, frozen=True):
-    """One case of a run."""
+    """Metrics of a case of a run."""
 
     case: str
     seed: int

@@ -23,11 +23,6 @@ from experiments.recording.trace import Trace
 RETURN_S: Final = 3.0  # robots come back one after the other when the network does
 
 
-def links_of(trace: Trace) -> Links:
-    """The links of the experiment in the row numbers of the trace."""
-    return trace.plan.formation.links
-
-
 def phase_starts(trace: Trace) -> tuple[float, ...]:
     """When phases begin: the common start, each leg of the timeline and each change of shape within the run [s]."""
     first, last = float(trace.time[0]), float(trace.time[-1])

@@ -11,15 +11,8 @@ import msgspec
 
 from experiments.metrics.results import INDICES, CaseMetrics
 
-SUMS: Final = (
-    "messages",
-    "bytes",
-    "iae",
-    "itae",
-    "lost",
-    "dropped",
-    "missed_deadlines",
-)  # grow with the length of a run
+# indices that grow with the length of a run
+SUMS: Final = ("messages", "bytes", "iae", "itae", "lost", "dropped", "missed_deadlines")
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:

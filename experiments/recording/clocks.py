@@ -20,7 +20,7 @@ from agents.network.messages import HostClock, State, Status
 
 @dataclass(frozen=True)
 class Sample:
-    """One question to a host and its answer."""
+    """Question to a host, and the answer."""
 
     left: float  # [s] our clock, when the question left
     there: float  # [s] the host's clock

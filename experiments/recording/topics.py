@@ -67,7 +67,7 @@ class SentGoal(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Topic:
-    """One kind of message."""
+    """Topic of a kind of message."""
 
     message: type[Message]  # on the network
     recorded: type[msgspec.Struct]  # in the file, as `zenpark_msgs/<its name>`

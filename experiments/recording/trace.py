@@ -87,10 +87,7 @@ class Goals:
             receipts: Goals that robots acted on: their row, when (`arrival`), and the stamp of the pose on which the
                 goal rests (`extra`).
             duration: Length of the run [s].
-            received: See the field.
-            lost: See the field.
-            dropped: See the field.
-            reports: See the field.
+            received, lost, dropped, reports: See the fields.
         """
         assert receipts.extra is not None
         acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]
@@ -140,7 +137,7 @@ def received_in_run(table: PoseTable, duration: float) -> PoseTable:
 
 @dataclass(frozen=True)
 class Trace:
-    """One case of a run. Arrays over samples (T) and robots (N); times since the common start [s]."""
+    """Trace of a case. Arrays over samples (T) and robots (N); times since the common start [s]."""
 
     case: str
     experiment: Experiment  # of this case, overrides applied

@@ -54,7 +54,7 @@ class ChunkIndices:
         setattr(writer, PRIVATE, self)
 
     def append(self, index: ChunkIndex) -> None:
-        """One more chunk.
+        """Keeps the index of a chunk.
 
         Raises:
             OSError: If the disk takes no more.

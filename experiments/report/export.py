@@ -18,7 +18,7 @@ import numpy as np
 
 from agents.formation.graph import adjacency
 from experiments.metrics.results import CaseMetrics, RobotMetrics
-from experiments.metrics.signals import formation_errors, links_of, phase_starts
+from experiments.metrics.signals import formation_errors, phase_starts
 from experiments.recording.trace import Trace
 
 LONGEST: Final = 63  # letters of a name in MATLAB
@@ -128,7 +128,7 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
 
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
-    net, sent, experiment = links_of(trace), trace.sent, trace.experiment
+    net, sent, experiment = trace.plan.links, trace.sent, trace.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
     columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
     links = {

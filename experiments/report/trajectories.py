@@ -17,7 +17,7 @@ from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from agents.arrays import Array
-from experiments.metrics.signals import links_of, phase_starts
+from experiments.metrics.signals import phase_starts
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
@@ -65,7 +65,7 @@ def plan_view(traces: Sequence[Trace]) -> Figure:
     for axes, trace in zip(grid.flat, traces, strict=False):
         x, y, _ = trace.experiment.arena.size
         scenery.from_above(axes, trace.experiment)
-        few, net = thinned(trace, len(traces)), links_of(trace)
+        few, net = thinned(trace, len(traces)), trace.plan.links
         place, last = trace.true_position, last_known(trace)
         for i, j in edges(net.receiver, net.sender):
             axes.plot(*last[[i, j], :2].T, color="#8a8a8a", linewidth=0.5, zorder=1)
@@ -149,7 +149,7 @@ def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> Non
     known = np.asarray(np.isfinite(place).all(axis=2))
     ends = place[len(place) - 1 - known[::-1].argmax(axis=0), np.arange(place.shape[1])]
     starts = place[known.argmax(axis=0), np.arange(place.shape[1])]
-    net = links_of(trace)
+    net = trace.plan.links
     pairs = edges(net.receiver, net.sender)
     thin = (1.0 if len(trace.robots) <= MANY else 0.5) / math.sqrt(columns)
     for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)) if pairs else ():

@@ -113,7 +113,7 @@ def goals_of(
 
 
 class Logbook:
-    """One repetition of a virtual run."""
+    """Repetition of a virtual run as a trace or a recording."""
 
     def __init__(self, log: Log, experiment: Experiment, case: str, copy: int = 0) -> None:
         """The repetition of `log.seeds[copy]`."""

@@ -175,7 +175,7 @@ def _bare(link: Index, seq: Index, stamp: Array, arrival: Array, extra: Array | 
 
 
 def _joined(tables: list[PoseTable], begin: float) -> PoseTable:
-    """One table, with times since the common start at `begin` [s]."""
+    """A single table, with times since the common start at `begin` [s]."""
     return (PoseTable.joined(tables) if tables else no_poses()).since(begin)
 
 

@@ -82,7 +82,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Robot:
-    """One of their robots."""
+    """Robot of theirs."""
 
     name: str
     kind: str  # as zenpark calls it
@@ -100,7 +100,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Park:
-    """One of their experiments."""
+    """Experiment of theirs."""
 
     mode: str  # physical, virtual or hybrid
     tool: str  # of the simulation, with its world

@@ -118,7 +118,7 @@ def _usual(gains: Sequence[float]) -> float | None:
 
 
 def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> list[str]:
-    """One line for each link that both ends ask for alike, one for each end else."""
+    """Lines of the file: one for each link that both ends ask for alike, else one for each end."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     asked: dict[tuple[str, str], tuple[Relation, Task]] = {}
     for robot, task in park.tasks:

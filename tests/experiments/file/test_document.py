@@ -417,10 +417,3 @@ def test_links_come_in_the_order_of_the_robots():
         ("KH03", "KH01", 0.83, 12.0),
         ("KH03", "KH02", 0.45, 12.0),
     ]
-
-
-def test_a_key_of_thousands_of_parts_is_refused_at_once(tmp_path):
-    file = tmp_path / "deep.toml"
-    file.write_text(f'title = "x"\nduration_s = 1.0\n{"a." * 20_000}a = 1\n')
-    with pytest.raises(DocumentError, match="a key has more than 50 parts"):
-        read(file)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from agents.formation.graph import laplacian
 from experiments.file.document import load, loads
-from experiments.metrics.signals import formation_errors, links_of
+from experiments.metrics.signals import formation_errors
 from experiments.recording.run_folder import SOURCE
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
@@ -56,7 +56,7 @@ def test_who_spoke_and_who_listens_count_from_one(flown, mat):
     assert read["sent"]["time"] == pytest.approx(trace.sent.stamp, abs=1e-6)
     assert read["sent"]["robot"].tolist() == (trace.sent.link + 1.0).tolist()
     assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
-    net = links_of(trace)
+    net = trace.plan.links
     assert read["links"]["listener"].tolist() == (net.receiver + 1.0).tolist()
     assert read["links"]["speaker"].tolist() == (net.sender + 1.0).tolist()
     assert read["links"]["distance"].tolist() == net.distance.tolist()

@@ -131,7 +131,7 @@ def test_what_is_said_is_smoothed(flown):
 
 def test_belief_error_is_that_of_the_prediction(flown):
     _, trace = flown
-    net = signals.links_of(trace)
+    net = trace.plan.links
     found = signals.beliefs(trace, net)
     listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.pose_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
