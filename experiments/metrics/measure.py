@@ -197,13 +197,18 @@ def _robots(
     dropped = Counter(dict.fromkeys(trace.robots, 0))
     for link in passed:
         dropped[link.speaker] += link.dropped
-    counts: dict[str, Any] = {  # (N,) each
+    numbers = {  # (N,) each
         **{"messages": sent, "bytes": size, "recorded": recorded, "listeners": listeners, "heard": delivered},
         **{"lost": trace.lost, "missed_deadlines": trace.missed_deadlines, "updates": trace.decisions},
         **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
     }
-    known: dict[str, Any] = {"iae": iae, "itae": itae, "rmse": rmse}  # (N,) each, NaN where unknown
-    known |= zip(("gap_min_s", "gap_median_s", "gap_max_s"), zip(*waits, strict=True), strict=True)
+    unsure = {"iae": iae, "itae": itae, "rmse": rmse}  # (N,) each, NaN where unknown
+    unsure |= zip(("gap_min_s", "gap_median_s", "gap_max_s"), np.array(waits).T, strict=True)
+    own_numbers: list[dict[str, Any]] = [
+        {what: int(each[i]) for what, each in numbers.items()}
+        | {what: _number(each[i]) for what, each in unsure.items()}
+        for i in range(rows)
+    ]
     return tuple(
         RobotMetrics(
             robot=name,
@@ -230,8 +235,7 @@ def _robots(
             delay_mean_s=late[i].mean,
             delay_p95_s=late[i].p95,
             delay_max_s=late[i].largest,
-            **{what: int(each[i]) for what, each in counts.items()},
-            **{what: _number(each[i]) for what, each in known.items()},
+            **own_numbers[i],
         )
         for i, name in enumerate(trace.robots)
     )
