@@ -105,8 +105,8 @@ class VirtualCentre:
         self._followed: list[PoseTable] = []
         self._received: list[PoseTable] = []
         rows = len(self.centre.guided)
-        told = np.flatnonzero(self.centre.guided)
-        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.needed, told)]
+        guided = np.flatnonzero(self.centre.guided)
+        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.needed, guided)]
         self._poses, self._goals = (
             VirtualChannel(experiment, links(pairs), seeds, stream=stream)
             for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
