@@ -1,4 +1,4 @@
-"""The page of a sweep, and of a search for parameters: what stands in the table, and messages against error."""
+"""The page of a sweep, and of a search for parameters: its table, and messages against error."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from experiments.file.document import Document
 from experiments.report import style
 from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.page import Row as Line
@@ -34,54 +33,60 @@ CAPTIONS: Final = (
 )
 
 
-def write(found: SweepResult, command: str) -> Path:
-    """Writes `sweep.html` and the figure into the folder of a sweep."""
+def write(found: SweepResult | TuningResult, command: str) -> Path:
+    """Writes `sweep.html` and the figure into the folder of a sweep or of a search."""
+    facts = [
+        ("Date", date_of(time.time())),
+        ("Clock", "virtual"),
+        ("Seeds", seeds_in_words(found.seeds)),
+        ("Duration", f"{found.read.experiment.duration_s:g} s"),
+        ("Robots", str(len(found.read.experiment.robots))),
+        ("Cells", str(len(found.tried if isinstance(found, TuningResult) else found.rows))),
+    ]
     notes = [Finding("fair", note) for note in found.notes]
-    if found.missing:
-        notes.append(Finding("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
-    if found.failures:
-        notes.append(Finding("bad", f"{len(found.failures)} runs failed; the first: {found.failures[0]}"))
+    if isinstance(found, TuningResult):
+        title, sections = "Tuned", _searched(found)
+        facts.append(("Tuning seeds", seeds_in_words(found.tuning)))
+        notes += verdict(found)
+    else:
+        title, sections = "Sweep", _swept(found)
+        if found.missing:
+            notes.append(Finding("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
+        if found.failures:
+            notes.append(Finding("bad", f"{len(found.failures)} runs failed; the first: {found.failures[0]}"))
+        notes += _fewest(found.rows)
     return render(
         found.folder / PAGE,
-        title=f"Sweep: {found.read.experiment.title}",
+        title=f"{title}: {found.read.experiment.title}",
         source=found.read.experiment.source,
-        facts=_facts(found.read, found.seeds, len(found.rows)),
+        facts=facts,
         command=command,
-        verdict=[*notes, *_fewest(found.rows)],
+        verdict=notes,
         sections=[
-            Section("Messages against error", pictures=_pictures(found.folder, found.rows, joined=True)),
-            Section(
-                "All cells",
-                tables=(table(found.rows),),
-                folded="Show the table" if len(found.rows) > MOST_LINES else "",
-            ),
-            *_ends(found.read),
+            *sections,
+            Section("The experiment", listing=found.read.listing, folded="Show the file"),
+            Section("Definitions", terms=TERMS),
         ],
     )
 
 
-def write_tuned(tuned: TuningResult, command: str) -> Path:
-    """Writes `sweep.html` and the figure of a search into its folder."""
+def _swept(found: SweepResult) -> list[Section]:
+    folded = "Show the table" if len(found.rows) > MOST_LINES else ""
+    return [
+        Section("Messages against error", pictures=_pictures(found.folder, found.rows, joined=True)),
+        Section("All cells", tables=(table(found.rows),), folded=folded),
+    ]
+
+
+def _searched(tuned: TuningResult) -> list[Section]:
     reference = [row for row in tuned.rows if row.reference]
-    words = seeds_in_words
-    return render(
-        tuned.folder / PAGE,
-        title=f"Tuned: {tuned.read.experiment.title}",
-        source=tuned.read.experiment.source,
-        facts=[*_facts(tuned.read, tuned.seeds, len(tuned.tried)), ("Tuning seeds", words(tuned.tuning))],
-        command=command,
-        verdict=[*(Finding("fair", note) for note in tuned.notes), *verdict(tuned)],
-        sections=[
-            Section("Result", (f"On seeds {words(tuned.seeds)}, which no choice has seen.",), (table(tuned.rows),)),
-            Section(
-                "Everything that was tried",
-                (f"On seeds {words(tuned.searched)}.",),
-                pictures=_pictures(tuned.folder, [*reference, *tuned.tried], joined=False),
-            ),
-            Section("What was tried", tables=(table(tuned.tried),), folded="Show the table"),
-            *_ends(tuned.read),
-        ],
-    )
+    seeds, searched = seeds_in_words(tuned.seeds), seeds_in_words(tuned.searched)
+    pictures = _pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
+    return [
+        Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
+        Section("All points of the search", (f"On seeds {searched}.",), pictures=pictures),
+        Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
+    ]
 
 
 def verdict(tuned: TuningResult) -> list[Finding]:
@@ -136,21 +141,3 @@ def _saved(row: CellRow) -> str:
     messages = row.ratio["messages"].mean
     less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %"
     return f"{less} messages, IAE {with_interval(row.ratio['iae'])}, ITAE {with_interval(row.ratio['itae'])}"
-
-
-def _facts(read: Document, seeds: Sequence[int], count: int) -> list[tuple[str, str]]:
-    return [
-        ("Date", date_of(time.time())),
-        ("Clock", "virtual"),
-        ("Seeds", seeds_in_words(seeds)),
-        ("Duration", f"{read.experiment.duration_s:g} s"),
-        ("Robots", str(len(read.experiment.robots))),
-        ("Cells", str(count)),
-    ]
-
-
-def _ends(read: Document) -> list[Section]:
-    return [
-        Section("The experiment", listing=read.listing, folded="Show the file"),
-        Section("Definitions", terms=TERMS),
-    ]

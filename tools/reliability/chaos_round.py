@@ -39,20 +39,19 @@ from tools.reliability.spoilt_process import Switch
 
 POLL_S: Final = 0.02
 BEGIN_S: Final = 100.0  # to the common start
-FORM_S: Final = 45.0  # a formation that has not come together by then does not: who avoids others takes its time
-HEAL_S: Final = 30.0  # at the latest so long after a fault is lifted the formation stands again
+FORM_S: Final = 45.0  # a formation that has not come together by then does not: avoidance takes its time
+HEAL_S: Final = 30.0  # the formation stands again at most so long after the end of a fault
 SETTLED_S: Final = 0.5  # and stays so
-FRESH_S: Final = 1.6  # a robot that says nothing for longer is not back: statuses come once a second
-HELD_M: Final = 0.25  # a robot that nobody steers goes no farther than this
+FRESH_S: Final = 1.6  # a robot without a status for longer is not back: statuses come once a second
+HELD_M: Final = 0.25  # largest distance of a robot that no process steers
 NOTICE_S: Final = 1.0  # after which it must have stopped
 FEWEST: Final = 3  # running robots with which a round goes on
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LEAD_S: Final = 1.0  # the start is announced not longer before
 SWITCHES: Final = "switches"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
-DEAF_S: Final = 1.0  # after which whoever listens to a robot that is there again has heard it
-NOTICED_S: Final = 1.0  # a robot that hears no router holds `link_silence_s` and so much later
-SAYS: Final = {"router": "router", "failover": "router", "disk": "recorder"}  # who ends, and is said to
+DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
+NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
 REFUSED: Final = 2  # exit code of a process whose name is taken
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
 LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
@@ -77,7 +76,7 @@ class Setting:
 
 @dataclass
 class _ActiveFault:
-    """A fault that was begun: to whom, when (monotonic [s]), when it was lifted, since when all is well again."""
+    """A fault that was begun; all times are monotonic [s]."""
 
     fault: Fault
     victim: str
@@ -86,12 +85,12 @@ class _ActiveFault:
     before: Array
     lifted: float | None = None
     well_since: float | None = None
-    why: str = ""  # it was not well last
+    why: str = ""  # last reason of not being well
     held_at: Array | None = None
     utc: float = field(default_factory=time.time)
-    there: set[str] = field(default_factory=set)  # who was under way before
+    there: set[str] = field(default_factory=set)  # robots under way before
     events: int = 0  # that had happened before
-    told: dict[str, int] = field(default_factory=dict)  # the last incident of each robot before
+    incidents: dict[str, int] = field(default_factory=dict)  # number of the last incident of each robot before
     restarted: float | None = None
     back: float | None = None
     died: bool = False
@@ -125,9 +124,9 @@ class ChaosRound:
         self._at = 0.0
         self._well: float | None = None  # since when all is well, before a fault
         self._formed_since: float | None = None
-        self._hears: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
+        self._senders: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
         for link in Plan(setting.experiment).one_way_links:
-            self._hears[link.receiver].add(link.sender)
+            self._senders[link.receiver].add(link.sender)
 
     def run(self) -> RoundResult:
         """Run the round to its end; no process is left behind."""
@@ -189,7 +188,7 @@ class ChaosRound:
     # ------------------------------------------------------------------ the run
 
     def _follow(self, watched: WatchedRun) -> None:
-        """Until the script is through, or the run ends."""
+        """Inject the faults of the script until it is through or the run ends."""
         duration = self._setting.experiment.duration_s
         began = time.monotonic()
         while watched.process.alive and not self._conductor_dead:
@@ -224,15 +223,15 @@ class ChaosRound:
         return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
 
     def _over(self) -> bool:
-        """Whether the run's time is over: then the conductor lands everybody, and nobody is let in again."""
+        """Whether the run's time is over: then the conductor lands all robots, and lets none in again."""
         return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
 
     def _judge(self, now: float) -> None:
         """Add new violations to the active fault, or to the round."""
         wrong = self._observer.violations()
         for name, since in self._dead.items():
-            told = self._observer.command.get(name)
-            if told is not None and told[1] > since + NOTICE_S and now < told[1] + POLL_S * 5:
+            command = self._observer.command.get(name)
+            if command is not None and command[1] > since + NOTICE_S and now < command[1] + POLL_S * 5:
                 wrong.append(f"{name} is dead and still commands its body")
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
@@ -269,8 +268,9 @@ class ChaosRound:
         self._disk_full |= fault.kind == "disk"
         self._conductor_dead = fault.kind == "conductor"
         self._observer.orders.clear()
-        told = {name: status.incidents[-1].seq for name, status in self._observer.status.items() if status.incidents}
-        self._now = _ActiveFault(fault, victim, now, note, before, there=running, events=len(self._events), told=told)
+        last = {name: status.incidents[-1].seq for name, status in self._observer.status.items() if status.incidents}
+        events = len(self._events)
+        self._now = _ActiveFault(fault, victim, now, note, before, there=running, events=events, incidents=last)
         self._at = t
         if fault.kind == "conductor":
             self._watch_landing(self._now)
@@ -290,7 +290,7 @@ class ChaosRound:
         active.why = why or active.why
         active.well_since = None if why else (active.well_since or now)
         settled = active.well_since is not None and now - active.well_since >= SETTLED_S
-        # who avoids others needs up to 35 s to come up with a leader that drives, without any fault
+        # with avoidance, robots need up to 35 s to come up with a leader that drives, without any fault
         driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
         if not settled and (now < active.lifted + HEAL_S + fault.properties.heals_s or t < driven + FORM_S):
             return
@@ -330,13 +330,13 @@ class ChaosRound:
         self._now = None
 
     def _hold(self, active: _ActiveFault, now: float) -> None:
-        """Nobody steers the victim: its body stops soon."""
+        """Check that the body of a victim stops soon, for no process steers it."""
         if now < active.begun + NOTICE_S or not self._observer.connected:
             return
         if active.held_at is None:
             active.held_at = self._observer.invariants.where(active.victim)
         if self._observer.moved(active.victim, active.held_at) > HELD_M:
-            active.add_violation(f"{active.victim} moved although nobody steered it")
+            active.add_violation(f"{active.victim} moved although no process steered it")
 
     def _not_recovered(self, active: _ActiveFault, t: float, now: float) -> str:
         """Why the run is not yet as it was; empty if it is."""
@@ -350,27 +350,29 @@ class ChaosRound:
             or self._not_in_formation(live, max(active.lifted or now, now - FRESH_S), t)
         )
 
-    # what of the effect of a fault has still to come, or to pass
+    # ------------------------------------------------------------------ checks by kind: why it is not well yet
 
     def _after_any(self, active: _ActiveFault, live: Set[str]) -> str:
-        kind = active.fault.kind
         if active.victim:
             return self._not_back(active.victim, live, active.lifted or active.begun)
-        if kind in SAYS and not any(e.kind.startswith(SAYS[kind]) and "ended" in e.text for e in self._events):
-            return f"nobody has said that the {SAYS[kind]} ended"
+        ended = active.fault.properties.reported
+        if ended and not any(event.kind.startswith(ended) and "ended" in event.text for event in self._events):
+            return f"the end of the {ended} is not reported"
         return ""
 
     def _after_kill(self, active: _ActiveFault, live: Set[str]) -> str:
         victim = active.victim
         if victim in self._observer.alive:
             return f"{victim} is dead, and its token still stands"
-        blind = [
-            name for name in live if victim in self._hears[name] and victim not in self._observer.status[name].missing
-        ]
-        return f"{', '.join(blind)}: not noticed that {victim} is gone" if blind else ""
+        unaware = [name for name in self._receivers(victim, live) if victim not in self._observer.status[name].missing]
+        return f"{', '.join(unaware)}: not noticed that {victim} is lost" if unaware else ""
+
+    def _receivers(self, sender: str, live: Set[str]) -> list[str]:
+        """Living robots that receive the poses of a sender."""
+        return [name for name in live if sender in self._senders[name]]
 
     def _after_bits(self, active: _ActiveFault, live: Set[str]) -> str:
-        """Some wrong bits make Zenoh's client abort its process, which TCP's own checksum would have kept from it."""
+        """Wrong bits may make Zenoh's client abort its process; TCP's own checksum would have kept them from it."""
         victim = active.victim
         if not active.died and "SIGABRT" in self._lost_since(active):
             active.died, active.note = True, "its process was aborted by Zenoh"
@@ -380,14 +382,14 @@ class ChaosRound:
         return self._after_any(active, live)
 
     def _lost_since(self, active: _ActiveFault) -> str:
-        """What the conductor has said since the fault began of the end of the victim's process; empty if nothing."""
+        """Report of the conductor on the end of the victim's process since the fault began; empty without one."""
         ends = [e.text for e in self._events[active.events :] if e.kind == "lost" and e.source == active.victim]
         return "".join(ends[:1])
 
     def _after_read_error(self, active: _ActiveFault, live: Set[str]) -> str:
         victim = active.victim
         if not any(order.robot == victim and order.action in ("land", "stop") for order in self._observer.orders):
-            return f"the body of {victim} was told neither to land nor to stop"
+            return f"the body of {victim} was ordered neither to land nor to stop"
         if self._observer.invariants.in_the_air(victim):
             return f"{victim} has not come down yet"
         if not self._lost_since(active):  # it lands for as long as a landing may take, for it sees nothing of it
@@ -398,7 +400,7 @@ class ChaosRound:
         victim = active.victim
         if active.restarted is None:
             if victim in self._observer.alive or not self._lost_since(active):
-                return f"nobody has said that {victim} is lost"
+                return f"the loss of {victim} is not reported"
             self._off.add(victim)
             active.restarted = time.monotonic()
             self._injector.restart(victim, self._observer.session, self._observer.keys)
@@ -408,14 +410,13 @@ class ChaosRound:
         if victim not in self._observer.alive:
             return f"{victim} is not back"
         active.back = active.back or time.monotonic()
-        deaf = [name for name in live if victim in self._hears[name]]
-        deaf = [name for name in deaf if self._observer.received_at.get((name, victim), 0.0) < active.restarted]
+        receivers = self._receivers(victim, live)
+        deaf = [name for name in receivers if self._observer.received_at.get((name, victim), 0.0) < active.restarted]
         if deaf and time.monotonic() - active.back > DEAF_S:
-            active.add_violation(
-                f"{', '.join(deaf)}: heard nothing of {victim} in the first {DEAF_S:g} s of its new life"
-            )
+            names = ", ".join(deaf)
+            active.add_violation(f"{names}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
         if deaf or victim not in live:
-            return f"{victim} does not take part yet, or is not heard by {', '.join(deaf) or 'anybody'}"
+            return f"{victim} does not take part yet, or its poses do not reach {', '.join(deaf) or 'any robot'}"
         return ""
 
     def _after_double(self, active: _ActiveFault, live: Set[str]) -> str:
@@ -423,7 +424,7 @@ class ChaosRound:
         assert second is not None
         for order in self._observer.orders:
             if order.robot == victim and not self._over():
-                active.add_violation(f"the body of {victim} was told to {order.action}")
+                active.add_violation(f"the body of {victim} was ordered to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"
         if second.handle.returncode != REFUSED:
@@ -450,31 +451,31 @@ class ChaosRound:
     _after_clock = _after_mocap_clock
 
     def _down(self, name: str) -> bool:
-        """Whether a robot says that it comes down, or is down."""
+        """Whether a robot reports that it comes down, or is down."""
         status = self._observer.status.get(name)
         return status is not None and status.phase in ("landing", "done")
 
     def _held(self, name: str, what: str, active: _ActiveFault) -> list[messages.Incident]:
-        """Since the fault began: what made a robot hold, or worse, of which `what` is part of the words."""
-        told = active.told.get(name, 0)
-        happened = [each for each in self._observer.status[name].incidents if each.seq > told and what in each.text]
-        return [each for each in happened if each.text.startswith(("hold", "land", "cut"))]
+        """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
+        last = active.incidents.get(name, 0)
+        new = [each for each in self._observer.status[name].incidents if each.seq > last and what in each.text]
+        return [each for each in new if each.text.startswith(("hold", "land", "cut"))]
 
     def _not_back(self, victim: str, live: Set[str], lifted: float) -> str:
         """Why a victim that lives is not back, and not down either."""
         if self._observer.status_at.get(victim, 0.0) < lifted:
-            return f"{victim} says nothing yet"
+            return f"no status of {victim} yet"
         if self._down(victim):
             return f"{victim} has not come down yet" if self._observer.invariants.in_the_air(victim) else ""
         return "" if victim in live else f"{victim} is not back"
 
     def _not_in_formation(self, live: Set[str], since: float, t: float) -> str:
-        """Why those who live are not in formation: silent since then, missing each other, or elsewhere."""
+        """Why living robots are not in formation: silent since then, missing each other, or elsewhere."""
         if not live and not self._dead:
-            return "nobody is running"
+            return "no robot is running"
         for name in live:
             if self._observer.status_at.get(name, 0.0) < since:
-                return f"{name} says nothing yet"
+                return f"no status of {name} yet"
             absent = [other for other in self._observer.status[name].missing if other in live]
             if absent:
                 return f"{name} misses {', '.join(absent)}"

@@ -1,33 +1,40 @@
-"""The script of a fault laboratory: which fault befalls whom and when, drawn from a seed. Pure."""
+"""Kinds of faults, and the script of a fault laboratory: fault, victim and moment, drawn from a seed. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from signal import SIGKILL, SIGSTOP, Signals
 from typing import Final, Literal
 
 import msgspec
 import numpy as np
 
+from tools.reliability.cables import Condition
+
 Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
-FORM_S: Final = (
-    15.0  # what a formation takes to come together, so that a round gets about as many faults as it has time for
-)
+FORM_S: Final = 15.0  # a formation needs so long to come together: a round gets about the faults that it has time for
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
 LAST_S: Final = 6.0  # before the end of the run nothing new begins
-CONDUCTOR_AFTER: Final = 3  # nothing can befall a run after the death of its launcher: it had better be late
+CONDUCTOR_AFTER: Final = 3  # faults before the death of the launcher, after which no other is possible
+FLIPS: Final = 0.05  # share of segments with a wrong bit
 
 
 @dataclass(frozen=True)
 class FaultKind:
-    """Properties of a kind of fault."""
+    """A kind of fault: how it is injected, and what a script must know of it."""
 
     meant: str  # for the report
     lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
     heals_s: float = 1.5  # usual time of the recovery [s]
     victim: bool = True  # one robot; else the whole run
     most: int = 1_000  # in one round
+    signal: Signals | None = None  # that its process gets
+    role: str = ""  # process that gets the signal; empty: that of the victim
+    cable: Callable[[float], Condition] | None = None  # state of the cables by its size
+    clock: tuple[str, float] | None = None  # switch, with the role of the victim's process for {}, and direction
+    reported: str = ""  # process whose end the conductor must report
     stage: Stage = "plain"  # the only one on which it can be done; "plain": on each
     never: Stage | None = None  # a stage on which it cannot be done
     size: tuple[float, float] = (0.0, 0.0)  # range of its size
@@ -35,44 +42,81 @@ class FaultKind:
 
 
 FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
-    "kill": FaultKind("SIGKILL to a robot's process; its body stays in the room and must come down.", most=2),
-    "freeze": FaultKind("SIGSTOP for 5 s, then SIGCONT.", 5.0),
+    "kill": FaultKind(
+        "SIGKILL to a robot's process; its body stays in the room and must come down.", most=2, signal=SIGKILL
+    ),
+    "freeze": FaultKind("SIGSTOP for 5 s, then SIGCONT.", 5.0, signal=SIGSTOP),
     "partition": FaultKind(
-        "Nothing passes between a robot and the router for 3 s; what was said meanwhile comes afterwards.", 3.0
+        "Nothing passes between a robot and the router for 3 s; messages of that time arrive afterwards.",
+        3.0,
+        cable=lambda _: Condition(cut=True),
     ),
     "router": FaultKind(
-        "SIGKILL to the only router; the conductor starts it again.", victim=False, most=3, never="two routers"
+        "SIGKILL to the only router; the conductor starts it again.",
+        victim=False,
+        most=3,
+        never="two routers",
+        signal=SIGKILL,
+        role="router",
+        reported="router",
     ),
-    "failover": FaultKind("SIGKILL to the first of two routers.", victim=False, most=1, stage="two routers"),
+    "failover": FaultKind(
+        "SIGKILL to the first of two routers.",
+        victim=False,
+        most=1,
+        stage="two routers",
+        signal=SIGKILL,
+        role="router",
+        reported="router",
+    ),
     "frozen-router": FaultKind(
         "SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold.",
         5.0,
         victim=False,
         most=2,
         stage="patient router",
+        signal=SIGSTOP,
+        role="router",
     ),
     "conductor": FaultKind(
-        "SIGKILL to the launcher: robots land by themselves, and everything ends.", victim=False, most=1
+        "SIGKILL to the launcher: robots land by themselves, and everything ends.",
+        victim=False,
+        most=1,
+        signal=SIGKILL,
+        role="conductor",
     ),
     "loss": FaultKind(
         "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts.",
         3.0,
         victim=False,
         size=(0.2, 0.2),
+        cable=lambda share: Condition(loss=share),
     ),
-    "delay": FaultKind("50 to 300 ms more in both directions for 3 s, for one robot.", 3.0, size=(0.05, 0.3)),
-    "bits": FaultKind("One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.", 1.0),
+    "delay": FaultKind(
+        "50 to 300 ms more in both directions for 3 s, for one robot.",
+        3.0,
+        size=(0.05, 0.3),
+        cable=lambda seconds: Condition(delay_s=seconds),
+    ),
+    "bits": FaultKind(
+        "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.",
+        1.0,
+        cable=lambda _: Condition(flips=FLIPS),
+    ),
     "clock": FaultKind(
         "The wall clock of all processes steps by 0.5 to 5 s, forward or back.",
         victim=False,
         size=(0.5, 5.0),
         signed=True,
+        clock=("clock", 1.0),
     ),
     "clock-behind": FaultKind(
-        "SIGKILL to a robot's process; it is started again with a clock that is 3 to 4.5 s behind, and must be heard.",
+        "SIGKILL to a robot's process; it is started again with a clock 3 to 4.5 s behind, and must be received.",
         heals_s=12.0,
         most=2,
         size=(3.0, 4.5),
+        signal=SIGKILL,
+        clock=("clock-{}", -1.0),
     ),
     "mocap-clock": FaultKind(
         "The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position.",
@@ -82,14 +126,15 @@ FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
         stage="motion capture",
         size=(0.5, 4.5),
         signed=True,
+        clock=("clock-positioning", 1.0),
     ),
     "double": FaultKind(
         "A second process of a robot's name is started: it must be refused, and touch nothing.", heals_s=6.0
     ),
     "read-error": FaultKind(
-        "Reading a robot's body raises: it must be told to land or to stop all the same.", heals_s=12.0, most=1
+        "Reading a robot's body raises: it must be ordered to land or to stop all the same.", heals_s=12.0, most=1
     ),
-    "disk": FaultKind("The recording can grow no more.", victim=False, most=1),
+    "disk": FaultKind("The recording can grow no more.", victim=False, most=1, reported="recorder"),
     "corrupt": FaultKind("Payloads of nonsense on every key that a robot believes.", 1.0),
 }
 KINDS: Final = tuple(FAULT_KINDS)
@@ -111,7 +156,7 @@ class Fault(msgspec.Struct, frozen=True):
 
 
 class Round(msgspec.Struct, frozen=True):
-    """One run of the experiment, on which stage, and what befalls it."""
+    """One run of the experiment: its stage and its faults."""
 
     faults: list[Fault]
     stage: Stage = "plain"
@@ -120,10 +165,10 @@ class Round(msgspec.Struct, frozen=True):
 def script(
     robots: Sequence[str], duration_s: float, count: int, seed: int, kinds: Sequence[str] = KINDS
 ) -> list[Round]:
-    """Rounds that hold so many faults, each kind as often as any other; the same seed gives the same script.
+    """Rounds with `count` faults, each kind as often as any other; the same seed gives the same script.
 
     Args:
-        robots: Who may be a victim.
+        robots: Possible victims.
         duration_s: Of a round [s].
         count: How many faults.
         seed: Of all choices.
@@ -149,7 +194,7 @@ def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.
         if place is None:
             if faults:
                 break
-            place = 0  # what fits nowhere has a round of its own
+            place = 0  # a fault that fits nowhere has a round of its own
         kind = deck.pop(place)
         dealt.append(kind)
         gap = round(float(random.uniform(*GAP_S)), 2)

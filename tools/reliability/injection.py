@@ -1,4 +1,4 @@
-"""How each fault of a script is done to a run that is under way, and how it is lifted again."""
+"""Injection of the faults of a script into a run that is under way, and their end."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import resource
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -19,34 +19,11 @@ from agents.network import messages
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.real_time.hosts.launcher import Launcher, Process
-from tools.reliability.cables import GOOD, Cables, Condition
+from tools.reliability.cables import GOOD, Cables
 from tools.reliability.fault_script import Fault
 from tools.reliability.run_process import PROC, WatchedRun
 from tools.reliability.spoilt_process import Switch
 
-# which process gets which signal, if it is not a robot's, and on which robots' cables what happens
-SIGNALS: Final[Mapping[str, tuple[str, signal.Signals]]] = {
-    "kill": ("", signal.SIGKILL),
-    "freeze": ("", signal.SIGSTOP),
-    "clock-behind": ("", signal.SIGKILL),
-    "router": ("router", signal.SIGKILL),
-    "failover": ("router", signal.SIGKILL),
-    "frozen-router": ("router", signal.SIGSTOP),
-    "conductor": ("conductor", signal.SIGKILL),
-}
-CABLES: Final[Mapping[str, Callable[[float], Condition]]] = {
-    "partition": lambda _: Condition(cut=True),
-    "loss": lambda share: Condition(loss=share),
-    "delay": lambda seconds: Condition(delay_s=seconds),
-    "bits": lambda _: Condition(flips=FLIPS),
-}
-# which switch, with the role of the victim's process, and in which direction
-CLOCKS: Final[Mapping[str, tuple[str, float]]] = {
-    "clock": ("clock", 1.0),
-    "mocap-clock": ("clock-positioning", 1.0),
-    "clock-behind": ("clock-{}", -1.0),
-}
-FLIPS: Final = 0.05  # share of segments with a wrong bit
 GARBAGE: Final = 20  # payloads of nonsense at a time, on each key of a victim
 
 
@@ -69,7 +46,7 @@ class Injector:
         self._folder, self._random, self._groups, self._recording = folder, random, groups, recording
         self._stopped: list[int] = []
         self._switches: dict[str, Switch] = {}
-        self.second: Process | None = None  # of a name that is taken
+        self.second: Process | None = None  # second process of a name
         self.answer = messages.RunReply()  # to the last restart
 
     def begin(self, fault: Fault, victim: str, session: zenoh.Session, keys: Keys) -> str:
@@ -77,23 +54,22 @@ class Injector:
 
         Args:
             fault: What.
-            victim: To whom; empty for the whole run.
+            victim: A robot; empty for the whole run.
             session: For nonsense.
             keys: Of the realm.
         """
-        kind, size = fault.kind, fault.size
-        if kind in SIGNALS:
-            role, number = SIGNALS[kind]
-            sent = self._send(victim or role, number, most=1)
-            self._stopped = sent if number == signal.SIGSTOP else []
-        if kind in CABLES:
-            self._cables.set(CABLES[kind](size), self._groups.get(victim))
+        kind, size, how = fault.kind, fault.size, fault.properties
+        if how.signal is not None:
+            sent = self._send(victim or how.role, how.signal)
+            self._stopped = sent if how.signal == signal.SIGSTOP else []
+        if how.cable is not None:
+            self._cables.set(how.cable(size), self._groups.get(victim))
         if kind == "read-error":
             self._switch(f"read-{victim}").write(1.0)
         if kind == "double":
             self.second = self._again(victim)
-        if kind in CLOCKS:
-            name, direction = CLOCKS[kind]
+        if how.clock is not None:
+            name, direction = how.clock
             switch = self._switch(name.format("+".join(self._companions(victim))))
             switch.write(direction * size + (switch.read() if kind == "clock" else 0.0))
             return f"{direction * size:+g} s"
@@ -104,7 +80,7 @@ class Injector:
     def end(self, fault: Fault) -> None:
         """Lift a fault."""
         if fault.kind == "mocap-clock":
-            self._switch(CLOCKS[fault.kind][0]).write(0.0)
+            self._switch("clock-positioning").write(0.0)
         elif fault.lasts_s:
             self.release()
 
@@ -119,7 +95,7 @@ class Injector:
         threading.Thread(target=ask, name="restart", daemon=True).start()
 
     def release(self) -> None:
-        """Nothing is stopped or cut any more, whatever was under way."""
+        """Continue stopped processes and mend all cables."""
         for pid in self._stopped:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
@@ -127,9 +103,9 @@ class Injector:
         self._cables.set(GOOD)
 
     def spoil(self, victim: str, session: zenoh.Session, keys: Keys) -> int:
-        """Nonsense on every key that a robot and its body believe; how many. On the emergency stop's it would stop."""
-        listening = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
-        targets = [key(victim) for key in listening]
+        """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
+        read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
+        targets = [key(victim) for key in read]
         for key in targets:
             for _ in range(GARBAGE):
                 session.put(key, self._nonsense(victim), encoding=messages.JSON)
@@ -159,7 +135,7 @@ class Injector:
         return self._launcher.spawn(f"double-{victim}-{pid}-{time.monotonic_ns()}", ["env", tag, *words])
 
     def _fill(self) -> str:
-        """The recording may not grow any more: the recorder gets the error of a disk that is full."""
+        """Limit the recording to its present size: the recorder gets the error of a disk that is full."""
         full = self._recording.stat().st_size
         for pid in self._running("recorder"):
             with contextlib.suppress(ProcessLookupError):
@@ -175,8 +151,9 @@ class Injector:
         """The processes of a role, or of a robot."""
         return [pid for pid, name in sorted(self._watched.processes().items()) if role in name.split("+")]
 
-    def _send(self, role: str, number: signal.Signals, most: int | None = None) -> list[int]:
-        found = self._running(role)[:most]
+    def _send(self, role: str, number: signal.Signals) -> list[int]:
+        """Send a signal to the first process of a role."""
+        found = self._running(role)[:1]
         for pid in found:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
