@@ -21,7 +21,7 @@ from agents.network.endpoints import free_endpoint
 from tests.waiting import until
 
 hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
-hypothesis_settings.register_profile("quick", deadline=None, max_examples=10)  # `./zenpark test --quick`
+hypothesis_settings.register_profile("quick", deadline=None, max_examples=5)  # `./zenpark test --quick`
 hypothesis_settings.load_profile("zenpark")
 # no test may find the runs of whoever uses this machine, least of all to stop them
 os.environ["ZENPARK_RUNS"] = tempfile.mkdtemp(prefix="zenpark-tests-")

@@ -27,7 +27,7 @@ def intruders(root: Path) -> dict[str, Path | None]:
 
 
 def explanation(found: dict[str, Path | None], root: Path) -> str:
-    """What is in the way, whose it is, and what to do."""
+    """Foreign packages in the way, their place, and the remedy."""
     from importlib.metadata import packages_distributions  # noqa: PLC0415 (slow, and needed in trouble only)
 
     owners = packages_distributions()

@@ -1,4 +1,4 @@
-"""What a person sees of a run in the terminal: a live table, or a line now and then where there is no terminal."""
+"""Progress of a run in the terminal: a live table, or a line now and then where there is no terminal."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Lines:
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
             errors = ", ".join(
-                f"{name} {'-' if seen.gone else _metres(seen.error)}" for name, seen in progress.robots.items()
+                f"{name} {'-' if view.gone else _metres(view.error)}" for name, view in progress.robots.items()
             )
             what = _silence(progress) or f"error [m] {errors}"
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
@@ -96,33 +96,33 @@ def _table(progress: Progress) -> RenderableType:
     for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
         grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
     now = progress.clock.utc()
-    for name, seen in progress.robots.items():
-        grid.add_row(name, *_cells(seen, now))
+    for name, view in progress.robots.items():
+        grid.add_row(name, *_cells(view, now))
     news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]
     return Group(grid, *(Text(f"  {event.kind} {event.source}: {event.text}", style="dim") for event in news))
 
 
 def _silence(progress: Progress) -> str:
-    """That nothing is known of the robots at the moment; empty while a router answers."""
+    """The outage of the network in words; empty while a router answers."""
     silent_s = time.monotonic() - progress.silent_since
     return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
 
 
-def _cells(seen: RobotView, now: float) -> tuple[str, ...]:
-    status = seen.status
-    out = f"[{'red' if seen.left_because == 'lost' else 'dim'}]{seen.left_because}[/]"
+def _cells(view: RobotView, now: float) -> tuple[str, ...]:
+    status = view.status
+    out = f"[{'red' if view.left_because == 'lost' else 'dim'}]{view.left_because}[/]"
     if status is None:
-        return (out if seen.gone else "starting", *[""] * 8)
+        return (out if view.gone else "starting", *[""] * 8)
     silent = now - status.stamp > FROZEN_S
-    phase = out if seen.gone else ("[yellow]silent[/]" if silent else status.phase)
+    phase = out if view.gone else ("[yellow]silent[/]" if silent else status.phase)
     note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
     if status.malformed:
         note += f" {status.malformed} malformed"
     return (
         phase,
-        _metres(seen.error),
+        _metres(view.error),
         str(status.sent),
-        f"{seen.rate:.1f}",
+        f"{view.rate:.1f}",
         str(sum(status.lost.values())),
         str(status.missed),
         f"{status.cpu_s:.1f} s",
@@ -163,7 +163,7 @@ class Bar:
             self._bar.stop()
 
     def show(self, what: str, done: int, of: int) -> None:
-        """So much of so much is done; cheap enough to be called a thousand times a second."""
+        """Show `done` of `of`; cheap enough to be called a thousand times a second."""
         now = time.monotonic()
         if what != self._what:
             self._what, self._began = what, now

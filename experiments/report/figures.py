@@ -49,7 +49,7 @@ from experiments.report.style import (
     thinned,
     time_axis,
 )
-from experiments.report.trajectories import after, before, formation_after, formation_before, plan_view, seen
+from experiments.report.trajectories import after, before, formation_after, formation_before, has_positions, plan_view
 
 __all__ = [
     "errors", "events", "every", "formation_after", "formation_before", "global_bars", "intervals", "plan_view",
@@ -67,16 +67,16 @@ def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Fi
     figures: dict[str, Figure] = {}
     if cases:
         figures["global_bars"] = global_bars(cases)
-    if any(seen(trace, before(trace)) for trace in first):
+    if any(has_positions(trace, before(trace)) for trace in first):
         figures["formation_before"] = formation_before(first)
-    if any(len(phase_starts(trace)) > 1 and seen(trace, after(trace)) for trace in first):
+    if any(len(phase_starts(trace)) > 1 and has_positions(trace, after(trace)) for trace in first):
         figures["formation_after"] = formation_after(first)
     if cases:
         figures["robot_bars"] = robot_bars(cases)
     if first:
         figures["errors"], figures["events"] = errors(first), events(first)
         figures["intervals"] = intervals(first)
-    if any(seen(trace) for trace in first):
+    if any(has_positions(trace) for trace in first):
         figures["plan_view"] = plan_view(first)
     return figures
 
@@ -132,7 +132,7 @@ def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
     width = 0.8 / max(1, len(grouped))
     for axes, (index, label, unit) in zip(panels, BARS, strict=True):
         for k, (name, runs) in enumerate(grouped.items()):
-            found = [spread([getattr(robot, index) for robot in _same(runs, who)]) for who in names]
+            found = [spread([getattr(robot, index) for robot in _same(runs, name)]) for name in names]
             x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * width
             _bars(axes, x, found, width=width, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
@@ -253,7 +253,7 @@ def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
 
 
 def _steps(waits: Array) -> tuple[Array, Array]:
-    """The empirical distribution, thinned to what can be seen."""
+    """The empirical distribution, thinned to what a column can show."""
     x = np.sort(np.maximum(waits, 1e-4))
     share = np.arange(1, len(x) + 1) / len(x)
     few = np.unique(np.linspace(0, len(x) - 1, 300).round().astype(int))
@@ -298,7 +298,7 @@ def shadows(traces: Sequence[Trace]) -> Figure:
 
 
 def _rows(trace: Trace) -> list[int]:
-    """Robots whose twin was ever seen."""
+    """Robots with a shadow twin of known position."""
     return np.flatnonzero(np.isfinite(differences(trace)).all(axis=2).any(axis=0)).tolist()
 
 

@@ -39,7 +39,7 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
 
 
 def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
-    """One row per case and robot, and a row `mean` per case; empty where a value is unknown."""
+    """Rows per case and robot, and a row `mean` per case; empty where a value is unknown."""
     later = max((len(case.starts_s) for case in cases), default=1)
     parts = ("phases", "near", "near_arena", "shadow")
     plain = [field for field in RobotMetrics.__struct_fields__ if field not in parts]
@@ -68,7 +68,7 @@ def _flat_approach(what: str, near: Approach | None) -> dict[str, float | str]:
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
-    """Its fields as columns; those along three axes as three."""
+    """Fields of a shadow twin as columns; those along three axes as three."""
     flat: dict[str, object] = {}
     for field in ShadowMetrics.__struct_fields__:
         value = None if shadow is None else getattr(shadow, field)

@@ -68,7 +68,7 @@ Mark = Literal["good", "fair", "bad", "plain"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence and how to take it."""
+    """A sentence of the verdict and its mark."""
 
     mark: Mark
     text: str
@@ -142,7 +142,7 @@ def inline(svg: str, prefix: str, label: str) -> str:
     Args:
         svg: As `figures.svg` gives it.
         prefix: For every id and every reference to one.
-        label: What it shows, for those who cannot see it; plain words without markup.
+        label: Its content for screen readers; plain words without markup.
     """
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<style.*?</style>|<metadata.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)

@@ -41,11 +41,11 @@ PROOF: Final = (
 )
 CLOCKS: Final = (
     "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
-    "run was taken off wherever robots there made a stamp or obeyed the start. What drift added since, they followed; "
+    "run was subtracted from all stamps there and from the start. Drift since then was corrected during the run; "
     "the largest error that was left in stamps until they did is taken off here."
 )
-SEEN: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
-WORKED_OUT: Final = (
+FROM_WORLD: Final = "Contacts are those that the world saw begin; distances are between surfaces, on true positions."
+FROM_POSITIONS: Final = (
     "Where no world watched for contacts, they are worked out from true positions; distances are between surfaces."
 )
 SHADOWS: Final = (
@@ -144,8 +144,8 @@ def write(
             tables=(gaps_table(cases),),
         ),
         Section(
-            "What neighbours hold",
-            ("How far the last pose heard on each link, carried on by the prediction, is from where its robot is.",),
+            "Belief of neighbours",
+            ("Distance of the last pose received on each link, carried on by the prediction, from the true one.",),
             (links_table(cases),),
             folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
         ),
@@ -284,8 +284,8 @@ def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_be
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
         touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()
-        said = SEEN if all(case.watched for case in cases) else WORKED_OUT
-        sections.append(Section("Did anything touch?", (said,), (*touched, *clearance_tables(cases))))
+        source = FROM_WORLD if all(case.watched for case in cases) else FROM_POSITIONS
+        sections.append(Section("Did anything touch?", (source,), (*touched, *clearance_tables(cases))))
     if tables := shadow_tables(cases):
         seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
         drawn = ((figure, f"{SHADOWS}{seed}") for figure in shadow_figures.shadow_figures(traces).values())

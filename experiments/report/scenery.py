@@ -1,7 +1,7 @@
 """Draws what stands in an arena, from above and in space: border, obstacles, start boxes. All pictures use it.
 
-Greys only, so that colours are left for robots, and told apart by outline and hatch: grey is an obstacle at rest,
-hatched one that can be pushed (where it stood at the start), dashed is where a moving one ends, with its path dotted.
+Greys only, so that colours are left for robots, distinguished by outline and hatch: grey is an obstacle at rest,
+hatched one that can be pushed (where they stood at the start), dashed is where a moving one ends, with its path dotted.
 """
 
 from __future__ import annotations
@@ -144,16 +144,16 @@ def legend(experiments: Sequence[Experiment], *, space: bool = False) -> tuple[l
 def caption(experiments: Sequence[Experiment], *, space: bool = False) -> str:
     """Caption text about the obstacles, from above or in space; empty without any."""
     given = [obstacle for experiment in experiments for obstacle in experiment.arena.obstacles.values()]
-    said = []
+    words = []
     if given:
-        said.append("obstacles grey")
+        words.append("obstacles grey")
     if any(obstacle.plan is not None for obstacle in given):
-        said.append("paths of moving ones dotted")
+        words.append("paths of moving ones dotted")
     if any(obstacle.mass is not None for obstacle in given):
-        said.append(f"what can be pushed {'pale' if space else 'hatched'}, where it stood at the start")
+        words.append(f"movable ones {'pale' if space else 'hatched'}, where they stood at the start")
     if any(experiment.arena.starts for experiment in experiments):
-        said.append("start boxes dashed")
-    text = ", ".join(said)
+        words.append("start boxes dashed")
+    text = ", ".join(words)
     return f" {text[0].upper()}{text[1:]}." if text else ""
 
 

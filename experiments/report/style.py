@@ -188,7 +188,7 @@ def merged(times: Array, pixel: float) -> tuple[Array, Array]:
 
 
 def boxes(begin: Array, end: Array, row: int) -> Outline:
-    """One outline of many boxes: a collection would repeat its style for each of them."""
+    """Outline of many boxes in one path: a collection would repeat its style for each of them."""
     low, high = np.full_like(begin, row - 0.36), np.full_like(begin, row + 0.36)
     corners = np.array([[begin, low], [end, low], [end, high], [begin, high], [begin, low]])
     codes = np.tile([Outline.MOVETO, *[Outline.LINETO] * 3, Outline.CLOSEPOLY], len(begin))
@@ -202,6 +202,6 @@ def last_known(trace: Trace) -> Array:
     return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])
 
 
-def edges(listener: Iterable[Any], speaker: Iterable[Any]) -> list[tuple[int, int]]:
+def edges(receiver: Iterable[Any], sender: Iterable[Any]) -> list[tuple[int, int]]:
     """Each pair of linked rows once."""
-    return sorted({(min(i, j), max(i, j)) for i, j in zip(listener, speaker, strict=True)})
+    return sorted({(min(i, j), max(i, j)) for i, j in zip(receiver, sender, strict=True)})

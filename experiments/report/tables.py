@@ -38,7 +38,7 @@ SUMMARY: Final = (
 )
 DEFINITIONS: Final = (
     ("e(t)", "Formation error of a robot: the sum of |distance − target distance| over the links on which it listens;"
-     " for one that listens to nobody, over the links on which it is listened to. Taken on true positions."),
+     " for one without incoming links, over its outgoing ones. Taken on true positions."),
     ("f", "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too."),
     ("IAE", "Integral of e(t) over the run (trapezoidal)."),
     ("ITAE", "Integral of t · e(t); t counts from the common start."),
@@ -50,7 +50,7 @@ DEFINITIONS: Final = (
     ("Worst link", "Of each robot the link with the largest error, averaged over the last second of a phase."),
     ("Net rotation", "How fast the formation turns about its centroid, seen from above, after it was acquired: the"
      " slope of the angle that fits the followers' positions best to those at acquisition."),
-    ("Belief", "What a listener holds of a neighbour: the newest pose heard, carried on by the prediction until the"
+    ("Belief", "A receiver's estimate of a neighbour: the newest pose received, carried on by the prediction until the"
      " next."),
     ("J2", "0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE + 0.01 · ITAE, summed over all"
      " robots, all of the whole run; the settling time is when e(t) enters 2 % of its largest value for good (the"
@@ -410,8 +410,8 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Correlation x, y, z", signed("correlation", scale=1.0, form=".4f")),
         ("of speeds", signed("correlation_speed", scale=1.0, form=".4f")),
     ]
-    followed = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
-    rows: _Rows[RobotMetrics] = _Rows("Robot", followed, attrgetter("robot"), columns)
+    shadows = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
+    rows: _Rows[RobotMetrics] = _Rows("Robot", shadows, attrgetter("robot"), columns)
     tables = (rows.table(name, runs[:1]) for name, runs in by_case(cases).items())
     return tuple(table for table in tables if table.rows)
 
@@ -442,14 +442,16 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
     rows = [
         Row(
             (
-                *(trace.case, lie.host, ", ".join(lie.robots)),
-                *(f"{1e3 * lie.first:+.3f}", f"{1e3 * lie.last:+.3f}", f"{1e3 * lie.uncertainty:.3f}"),
-                "" if lie.drift is None else f"{1e6 * lie.drift:+.1f} ± {2e6 * lie.uncertainty / lie.over:.1f}",
-                *(f"{1e3 * (lie.last - lie.first):+.3f}", f"{1e3 * lie.worst:.3f}"),
+                *(trace.case, offset.host, ", ".join(offset.robots)),
+                *(f"{1e3 * offset.first:+.3f}", f"{1e3 * offset.last:+.3f}", f"{1e3 * offset.uncertainty:.3f}"),
+                ""
+                if offset.drift is None
+                else f"{1e6 * offset.drift:+.1f} ± {2e6 * offset.uncertainty / offset.over:.1f}",
+                *(f"{1e3 * (offset.last - offset.first):+.3f}", f"{1e3 * offset.worst:.3f}"),
             )
         )
         for trace in traces
-        for lie in trace.clocks
+        for offset in trace.clocks
     ]
     heading = (
         "Case",

@@ -105,7 +105,7 @@ def _row(trace: Trace, at: float) -> int:
     return int(np.searchsorted(trace.time, at - 1e-9))
 
 
-def seen(trace: Trace, rows: slice = slice(None)) -> bool:
+def has_positions(trace: Trace, rows: slice = slice(None)) -> bool:
     """Whether the position of any robot is known there."""
     return bool(np.isfinite(trace.true_position[rows]).all(axis=2).any())
 
@@ -124,7 +124,7 @@ def _spatial(traces: Sequence[Trace], rows_of: Callable[[Trace], slice]) -> Figu
         box = ((column - 0.02) / columns, 1.0 - (above + height * (row + 1)) / whole, 1.0 / columns, height / whole)
         axes = figure.add_axes(box, projection="3d", computed_zorder=False)
         assert isinstance(axes, Axes3D)
-        if seen(trace, rows_of(trace)):
+        if has_positions(trace, rows_of(trace)):
             _draw_spatial(axes, trace, trace.true_position[rows_of(trace)], columns)
         else:
             axes.set_axis_off()
@@ -175,7 +175,7 @@ def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> Non
     scenery.in_space(axes, trace.experiment, low, high)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     x, y, z = (high - low) / math.dist(high, low)
-    wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # as seen from 26° above and 60° aside
+    wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # from 26° above and 60° aside
     axes.set_box_aspect((x, y, z), zoom=min(0.94 / wide, 0.82 / tall))
     axes.view_init(26, -60)
     size_pt, pad = (8, -8 if z > FLAT else -5) if columns == 1 else (6.5, -11)

@@ -129,9 +129,10 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
 def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
     found = []
     for name, runs in by_case(cases).items():
-        gone = list(dict.fromkeys(robot for run in runs for robot in run.died))
-        if gone:
-            found.append(Finding("bad", f"In {name}, {_list(gone)} dropped out; the means leave {_them(gone)} out."))
+        died = list(dict.fromkeys(robot for run in runs for robot in run.died))
+        if died:
+            them = "it" if len(died) == 1 else "them"
+            found.append(Finding("bad", f"In {name}, {_list(died)} dropped out; the means leave {them} out."))
     return found
 
 
@@ -256,9 +257,9 @@ def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
     for what, known in (("robots", near), ("robot and arena", arena)):
         if known:
             closest, case = min(known, key=lambda each: each[0].gap)
-            who = "–".join(closest.between)
+            pair = "–".join(closest.between)
             where = f", {case}" if len(by_case(cases)) > 1 else ""
-            gaps.append(f"{number(closest.gap, 100.0)} cm between {what} ({who} at {closest.at_s:.1f} s{where})")
+            gaps.append(f"{number(closest.gap, 100.0)} cm between {what} ({pair} at {closest.at_s:.1f} s{where})")
     return [Finding("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
 
 
@@ -305,8 +306,8 @@ def _unfinished(cases: Sequence[CaseMetrics]) -> list[Finding]:
     for case in cases:
         short = [each for each in case.robots if each.short is not None and each.short > UNFINISHED_M]
         if short:
-            who = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
-            found.append(Finding("bad", f"Not where the plan wanted them at the end of {case.case}: {who}."))
+            names = _list([f"{each.robot} by {number(each.short, 100.0)} cm" for each in short])
+            found.append(Finding("bad", f"Not where the plan wanted them at the end of {case.case}: {names}."))
     return found
 
 
@@ -329,7 +330,3 @@ def _was(names: Sequence[str]) -> str:
 
 def _is(names: Sequence[str]) -> str:
     return "is" if len(names) == 1 else "are"
-
-
-def _them(names: Sequence[str]) -> str:
-    return "it" if len(names) == 1 else "them"

@@ -7,8 +7,8 @@ any that does not, and the more so the farther. A limit counts as kept when the 
 interval over the seeds keeps it.
 
 The best of many was also the luckiest on its seeds. So a third of the tuning seeds serves the search, and the choice
-among the best that it found is made on the others. What was chosen is run on seeds that no choice has seen, and only
-these are reported.
+among the best is made on the others. The chosen one is run on seeds that took part in no choice, and only these are
+reported.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def wish_of(text: str) -> Wish:
 
 
 def searched(tuning: Sequence[int]) -> tuple[int, ...]:
-    """Of the tuning seeds those of the search; the others are those of the choice."""
+    """Tuning seeds of the search; the others are those of the choice."""
     return tuple(tuning[: round(SEARCH * len(tuning))])
 
 
@@ -156,7 +156,7 @@ def tune(
 
     Raises:
         DocumentError: If the file or an argument is wrong.
-        SweepError: If the library is not installed, or the workers are gone.
+        SweepError: If the library is not installed, or the workers are lost.
         KeyboardInterrupt: After Ctrl-C; the same call goes on from there.
     """
     wish = wish_of(wished)
@@ -188,7 +188,7 @@ def tune(
     cma = _library()
     folder = Path(out) if out is not None else folder_of(read, spans, "optimize")
     tried: list[CellRow] = []
-    picked: list[CellRow] = []
+    selected: list[CellRow] = []
     plan: dict[tuple[str, str], Cell] = {}
     with Store(folder) as store:
         notes = store.changed_since(origin(read, [read.cases()[name] for name in (reference, *ranges)]))
@@ -198,14 +198,14 @@ def tune(
                 rows = search.run(cma, runner, name, mine, progress)
                 tried += rows
                 best = search.choose(runner, rows, mine)
-                picked.append(best)
+                selected.append(best)
                 for cell in search.again(best, mine):
                     plan.setdefault((cell.case, cell.digest), cell)
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
             if not runner.run_missing(final, seeds, lambda _done, _of: None):
                 raise KeyboardInterrupt
             reported = runner.rows(final, seeds)
-    return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(picked), folder, tuple(notes))
+    return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class _Search:
         return self.cells({axis: words_of(row.parameters[axis.path]) for axis in axes}, row.case)
 
     def choose(self, runner: SweepRunner, rows: Sequence[CellRow], axes: Sequence[Axis]) -> CellRow:
-        """The best of what was tried, on seeds that the search has not seen; raises KeyboardInterrupt on Ctrl-C."""
+        """The best point of the search, on seeds that took no part in it; raises KeyboardInterrupt on Ctrl-C."""
         fresh = self.tuning[len(searched(self.tuning)) :]
         ranked = sorted(rows, key=self.wish.rank)
         looked_at: list[CellRow] = []

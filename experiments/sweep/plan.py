@@ -79,7 +79,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Cell:
-    """One case with one value of each axis that it has."""
+    """A case with one value of each axis that it has."""
 
     case: str  # name of the case
     parameters: Mapping[str, Any]  # values of the axes, by path

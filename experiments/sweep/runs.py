@@ -34,7 +34,7 @@ FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end w
 
 
 class Figures(msgspec.Struct, frozen=True):
-    """One run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace."""
+    """A run in numbers, the same to the bit as `experiments.metrics.measure.measure` makes of its whole trace."""
 
     seed: int  # of the run
     f_hz: float | None  # transmissions per second; this and the next five are means over robots, without leaders
@@ -63,10 +63,10 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
     Args:
         case: An experiment as JSON.
         seeds: Of the runs; each comes out as it would alone.
-        code: What `code` said where the work was given out; nothing is run with other code.
+        code: `code_of` the experiment in the process that distributes the work; nothing is run with other code.
 
     Returns:
-        An `WorkResult` as JSON, runs in the order of the seeds.
+        A `WorkResult` as JSON, runs in the order of the seeds.
     """
     try:
         experiment = msgspec.json.decode(case, type=Experiment)
@@ -163,7 +163,7 @@ def _figures(trace: Trace) -> Figures:
 
 
 def _mean(values: Sequence[float]) -> float | None:
-    """Of what is known."""
+    """Mean of the known values; None without any."""
     known = [value for value in values if math.isfinite(value)]
     return statistics.fmean(known) if known else None
 

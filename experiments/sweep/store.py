@@ -97,16 +97,16 @@ class Store:
         return self._runs.get((cell, code), {})
 
     def failed(self, cell: str, code: str) -> dict[int, str]:
-        """Seeds that failed, and why."""
+        """Reasons by seed that failed."""
         return self._failed.get((cell, code), {})
 
     def missing(self, cell: str, code: str, seeds: Sequence[int]) -> list[int]:
-        """Of these seeds those that are neither done nor known to fail."""
+        """Seeds that are neither done nor known to fail."""
         done, failed = self.runs(cell, code), self.failed(cell, code)
         return [seed for seed in seeds if seed not in done and seed not in failed]
 
     def add(self, cell: str, code: str, outcome: WorkResult) -> None:
-        """Keeps what came of some seeds; it is on the disk when this returns.
+        """Keeps results of some seeds; they are on the disk when this returns.
 
         Raises:
             DocumentError: If the disk is full.
@@ -123,7 +123,7 @@ class Store:
     def _read(self) -> None:
         content = self._path.read_bytes()
         if content and not content.endswith(b"\n"):
-            self._file.write(b"\n")  # what was cut off must not swallow the next line
+            self._file.write(b"\n")  # a line that was cut off must not swallow the next
             self._file.flush()
         for text in content.splitlines():
             if text:

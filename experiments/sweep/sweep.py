@@ -92,7 +92,7 @@ def sweep(
 
     Raises:
         DocumentError: If the file or an argument is wrong.
-        SweepError: If the workers are gone.
+        SweepError: If the workers are lost.
     """
     read = load(file, *settings)
     axes, words = arguments(given)
@@ -168,7 +168,7 @@ class SweepRunner:
         return found
 
     def failures(self, plan: Sequence[Cell], seeds: Sequence[int]) -> tuple[str, ...]:
-        """Why runs failed."""
+        """Reasons of failed runs."""
         return tuple(
             f"{cell.case} {' '.join(f'{path}={value}' for path, value in cell.parameters.items())}, seed {seed}: {why}"
             for cell in _distinct(plan)

@@ -69,7 +69,7 @@ def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures
 
 
 def write_csv(path: Path, rows: Sequence[CellRow]) -> None:
-    """One line for each row; empty where a value is unknown, and where a case has no such parameter."""
+    """A line for each row; empty where a value is unknown, and where a case has no such parameter."""
     paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
     columns = [part for index in MEANS for part in (index, f"{index}_ci95")]
     columns += [part for index in RATIOS for part in (f"{index}_ratio", f"{index}_ratio_ci95")]

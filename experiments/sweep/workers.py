@@ -58,7 +58,7 @@ class Workers:
         """Runs all works, and yields each when it is done, in any order.
 
         Raises:
-            SweepError: If the workers are gone, or have other code.
+            SweepError: If the workers are lost, or have other code.
         """
         if self.executor is None:
             for work in works:
@@ -158,7 +158,7 @@ def cluster(address: str) -> Iterator[Workers]:
         def reason(error: Exception) -> str:
             if isinstance(error, distributed.KilledWorker):
                 return f"workers died of the same work again and again, for want of memory? ({_first_line(error)})"
-            return f"the scheduler at {address} is gone, start it again ({_first_line(error)})"
+            return f"the scheduler at {address} is lost, start it again ({_first_line(error)})"
 
         failures = (distributed.KilledWorker, CancelledError, OSError)
         yield Workers(client.get_executor(pure=False, retries=1), threads, "a worker", failures, reason)

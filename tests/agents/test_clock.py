@@ -60,8 +60,13 @@ def test_a_step_of_the_wall_clock_moves_no_clock_that_was_read_before(monkeypatc
     assert clock.at(4.0) == 999.5
 
 
-# of reports and figures: no robot moves by them
-DATES = {"experiments/report/report.py", "experiments/run.py", "experiments/sweep/page.py"}
+# of reports, figures and the live view: no robot moves by them
+DATES = {
+    "experiments/report/report.py",
+    "experiments/run.py",
+    "experiments/sweep/page.py",
+    "experiments/view/live.py",
+}
 
 
 def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():

@@ -347,7 +347,7 @@ def words() -> Iterator[Target]:
     from bridges.vicon.publisher import parse_server  # noqa: PLC0415
     from experiments.definition.links import link_pairs  # noqa: PLC0415
     from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
-    from twins.devices import vicon  # noqa: PLC0415
+    from twins.devices.device import Faults  # noqa: PLC0415
 
     kinds = (crazyflie.Settings, khepera4.Settings, tello.Settings, turtlebot3.Settings)
 
@@ -370,8 +370,7 @@ def words() -> Iterator[Target]:
             "tello": lambda text: tello.endpoint("R1", text),
             "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.Settings()),
             "vicon": parse_server,
-            "listen": vicon._address,
-            "faults": vicon._faults,
+            "faults": lambda text: msgspec.json.decode(text, type=Faults),
             "device": device,
             "key": key_expression,
             "plugin": lambda text: registry.struct(registry.TRIGGERS, text),
@@ -385,7 +384,7 @@ def words() -> Iterator[Target]:
             "khepera": ["khepera4://10.0.0.1:50000?server=fork", "kteam://host:9", "kteam:///dev/ttyS0"],
             "tello": ["tello://192.168.10.1", "tello://127.0.0.2:8889"],
             "turtlebot": ["ros2dds://tb3_0?distro=humble", "rmw://tb3_0?domain=0&distro=jazzy"],
-            "vicon": ["10.0.0.2:801", "host"], "listen": ["127.0.0.1:801"],
+            "vicon": ["10.0.0.2:801", "host"],
             "faults": ['{"occluded_from_s": 5, "loss": 0.1}'],
             "device": ['{"server":"2025-05","poll_hz":10}', '{"positioning":{"system":"loco","anchors":[[0,0,1]]}}',
                        '{"control":"position","log_hz":50,"parameters":{"a.b":1}}',

@@ -98,7 +98,7 @@ def encounter(
         kinds: Of the robots.
         avoidance: As in an experiment file.
         between: Angle between the places where one robot and the next begin [rad]; more than two are spread evenly.
-        stubborn: So many of them, from the last, avoid nobody.
+        stubborn: So many of them, from the last, avoid no robot.
         sensors: Range sensors of all of them; none: they only hear each other.
         duration_s: How long they have for it [s]; `PATIENCE` times the slowest's way if left out.
     """
@@ -135,7 +135,7 @@ def encounter(
 
 
 def meet(experiment: Experiment, seeds: Sequence[int]) -> Outcome:
-    """One encounter for each seed.
+    """Encounters, one for each seed.
 
     Raises:
         experiments.virtual_time.conductor.Stuck: If robots do not take off or land.

@@ -1,7 +1,7 @@
 """Effect of intruders on robots in flight: lateness of their control loops, against quiet times of the same run.
 
 Intruder and robots share this machine here, which they do not in a laboratory. So each flood is measured twice: first
-against a decoy, a second router of the same lab to which nobody else is connected, which shows what the flood costs the
+against a decoy, a second router of the same lab without other members, which shows what the flood costs the
 machine; then against the robots' router.
 """
 
@@ -43,7 +43,7 @@ ATTACKS: Final = (
     ("large", "KH01", "park/KH01/pose"),
     ("replay", "KH01", "park/KH01/pose"),
     ("nonsense", "KH01", "park/KH01/pose"),
-    # last: after these a TLS listener lets nobody in for a while, intruders neither
+    # last: after these a TLS listener accepts no connection for a while
     ("half-open", "observer", "park/estop"),
     ("garbage", "observer", "park/estop"),
 )

@@ -29,7 +29,7 @@ SEEDS: Final = 20  # side by side in virtual time
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One measured figure, and its ratio to a baseline of the same run."""
+    """A measured figure, and its ratio to a baseline of the same run."""
 
     benchmark: str
     name: str

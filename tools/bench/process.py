@@ -36,7 +36,7 @@ class Spent(NamedTuple):
 
     @classmethod
     def of(cls, pid: int) -> Spent:
-        """Of another process on this machine, now."""
+        """Resources of another process on this machine, now."""
         cpu_s = time.clock_gettime(~pid << 3 | 2)  # clock_getcpuclockid(3): exact, where /proc counts in 10 ms
         pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
         return cls(time.monotonic(), cpu_s, pages * resource.getpagesize() / 1e6)

@@ -1,10 +1,10 @@
 """A lab's certificate authority: makes, renews and revokes the certificates of robots and people.
 
 Keys are of the curve P-256, certificates carry a name as their common name, by which a router knows whose rights hold.
-Only who listens gets a certificate with which one may pose as a router; a robot's is for connecting.
+Only listening members get a certificate that is valid for a router; a robot's is for connecting.
 Zenoh reads no revocation lists. What counts here is the register: a router gives rights to the common name that stands
 in it, and `revoke` moves that on, from `CF01` to `CF01.2`. The old key still opens a connection, in which nothing is
-allowed. A new authority (`renew --authority`) ends that as well, at the price of new files for everybody.
+allowed. A new authority (`renew --authority`) ends that as well, at the price of new files for all members.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CLOCKS: Final = timedelta(hours=1)  # how far a robot's clock may be behind
 
 @dataclass(frozen=True)
 class Authority:
-    """Who signs, opened from the folder of a lab."""
+    """The signing authority, opened from the folder of a lab."""
 
     folder: Path
     certificate: x509.Certificate
@@ -58,7 +58,7 @@ def create(
         folder: Must not hold a lab.
         identities: Role by name.
         hosts: Names and addresses at which the routers can be reached, beside this machine.
-        listening: The same for others who must listen themselves, by name: the members of a mesh.
+        listening: The same for other members that listen, by name: those of a mesh.
         days: For which certificates are valid.
         authority_days: For which the authority is.
 
@@ -111,17 +111,17 @@ def renew(
 
     Args:
         folder: Of the lab.
-        names: Whose; everybody's if none is named.
+        names: Of identities; all if none is named.
         hosts: Names and addresses at which those named may listen from now on, beside those from before.
         days: For which they are valid.
-        authority: Whether the authority is a new one, whose certificates alone count from now on: everybody's.
+        authority: Whether the authority is a new one, whose certificates alone count from now on: all of them.
 
     Raises:
         LabError: If there is no such identity, or the authority's key is not on this machine.
     """
     known = register(folder)
     if authority and names:
-        raise LabError("a new authority signs everybody's certificate anew: name nobody behind --authority")
+        raise LabError("a new authority signs all certificates anew: give no name with --authority")
     if hosts and not names:
         raise LabError("only routers need --host: name them, as in `zenpark keys renew LAB router --host ADDRESS`")
     signing = _found(folder, AUTHORITY_DAYS) if authority else _opened(folder)

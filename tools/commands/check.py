@@ -138,8 +138,8 @@ def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figur
     import msgspec
 
     ok = all(each.severity != "error" for each in found)
-    said = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
-    print(json.dumps(said, indent=2))
+    result = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
+    print(json.dumps(result, indent=2))
 
 
 def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
@@ -169,11 +169,11 @@ def _counted(count: int, what: str) -> str:
 
 
 def _rows(numbers: Mapping[str, Figures]) -> list[str]:
-    """One line for each figure; where the cases differ, each with its name."""
-    said = {name: _worded(each) for name, each in numbers.items()}
+    """A line for each figure; where the cases differ, each with its name."""
+    worded = {name: _worded(each) for name, each in numbers.items()}
     lines = []
-    for label in next(iter(said.values())):
-        values = {name: words[label] for name, words in said.items()}
+    for label in next(iter(worded.values())):
+        values = {name: words[label] for name, words in worded.items()}
         same = len(set(values.values())) == 1
         shown = next(iter(values.values())) if same else ", ".join(f"{name} {word}" for name, word in values.items())
         lines.append(f"  {label:<36}{shown}")

@@ -30,7 +30,7 @@ YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
 HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
 SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
 SOON_DAYS: Final = 14.0
-VAGUE_S: Final = 0.02  # a clock that cannot be told within this lets robots start apart
+VAGUE_S: Final = 0.02  # a clock with a larger uncertainty lets robots start apart
 REACH_S: Final = 15.0
 INSTALL_S: Final = 900.0
 FILES: Final = ("zenpark", "pyproject.toml", "README.md", "LICENSE")
@@ -60,7 +60,7 @@ exec "$folder/zenpark" --version
 
 @dataclass
 class Row:
-    """What was found on one host: a cell of each column, and what is to be done."""
+    """Result of one host: a cell of each column, and the remedies."""
 
     cells: list[str]
     trouble: list[str] = field(default_factory=list)
@@ -81,7 +81,7 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None)
     experiment = read.experiment
     chosen = choose(experiment.hosts, on or [])
     heading = HEADING if endpoints.folder(experiment, read.path, lab) is None else SECURED
-    rows = [looked_at(name, experiment, heading) for name, host in chosen.items() if host.address is None]
+    rows = [_without_address(name, experiment, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
         rows += [_row(each, experiment, heading) for each in found]
     for line in table(rows, heading):
@@ -196,8 +196,8 @@ def stations(
         yield found
 
 
-def looked_at(name: str, experiment: Experiment, heading: Sequence[str] = HEADING) -> Row:
-    """A host that nobody here can reach: its robots come by themselves."""
+def _without_address(name: str, experiment: Experiment, heading: Sequence[str] = HEADING) -> Row:
+    """A host without an address: its robots join by themselves."""
     robots = ", ".join(experiment.hosts[name].robots) or "no robots"
     return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
 
@@ -265,7 +265,7 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
 
 
 def _mended(there: Station, router: Found, experiment: Experiment) -> str:
-    """What to do about a router that a host does not reach."""
+    """Remedy for a router that a host does not reach."""
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
@@ -318,7 +318,7 @@ def put(name: str, host: Host) -> str:
         raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
     wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
     names = [each for each in wanted if (version.ROOT / each).exists()]
-    said = deliver(
+    output = deliver(
         name,
         host,
         PUT_ZENPARK,
@@ -328,13 +328,13 @@ def put(name: str, host: Host) -> str:
         late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
         failed="not installed",
     )
-    return f"{said.strip()} ({version.digest()[: version.SHOWN]}) installed"
+    return f"{output.strip()} ({version.digest()[: version.SHOWN]}) installed"
 
 
 def deliver(
     name: str, host: Host, script: str, words: Sequence[object], cargo: bytes, *, limit_s: float, late: str, failed: str
 ) -> str:
-    """Let a script unpack something on a host; return what it said.
+    """Let a script unpack a tar on a host; return its output.
 
     Args:
         name: Of the host.
@@ -343,8 +343,8 @@ def deliver(
         words: Of the script, from $0 on.
         cargo: A compressed tar.
         limit_s: It must be over within this [s].
-        late: What to say if it is not.
-        failed: What to say before the reason if it cannot be done.
+        late: Message if it is not.
+        failed: Message before the reason if it cannot be done.
 
     Raises:
         HostError: If it was not done.
@@ -365,16 +365,16 @@ def deliver(
         )
     except subprocess.TimeoutExpired:
         raise HostError(f"{name}: {late}") from None
-    said = done.stderr.decode(errors="replace").strip()
+    errors = done.stderr.decode(errors="replace").strip()
     if done.returncode == ssh.BROKEN:
-        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, said)}")
+        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, errors)}")
     if done.returncode != 0:
-        raise HostError(f"{name}: {failed}: {said or 'it said nothing'}")
+        raise HostError(f"{name}: {failed}: {errors or 'without a message'}")
     return done.stdout.decode(errors="replace")
 
 
 def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
-    """What stands at a place, as a compressed tar that names nobody here; nothing that was made there by running it.
+    """Files of a folder as a compressed tar without user names and without files made by running it.
 
     Args:
         root: The place.
@@ -440,7 +440,7 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         name: Of the host.
         host: Has an address.
         folder: Of the lab, here.
-        robots: Whose; nobody else's stay there.
+        robots: Their names; no other certificates stay there.
 
     Raises:
         HostError: If some cannot be sent, or there is no place for them.
@@ -455,9 +455,9 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
     place = PurePosixPath(host.lab.removeprefix("~/"))
     if place in (PurePosixPath(), PurePosixPath("/")) or ".." in place.parts:
         raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
-    # the key before its certificate: who reads them in between finds that they do not fit, and tries again
+    # the key before its certificate: a process that reads them in between finds that they do not fit, and tries again
     files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
-    said = deliver(
+    output = deliver(
         name,
         host,
         PUT_CERTIFICATES,
@@ -467,6 +467,6 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
         failed="certificates not put there",
     )
-    removed = said.split()
+    removed = output.split()
     more = f"; removed {', '.join(removed)}" if removed else ""
     return f"certificates of {', '.join(robots)} put into {place}{more}"

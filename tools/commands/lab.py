@@ -34,7 +34,7 @@ def keys(
     lab: Lab = None,
     identity: As = "observer",
 ) -> None:
-    """Show who is on the network and which keys they hold; make certificates (init, issue, renew, revoke, show)."""
+    """Show the members of the network and their keys; make certificates (init, issue, renew, revoke, show)."""
     if context.invoked_subcommand is None:
         from tools.commands.network import print_members
 
@@ -44,7 +44,7 @@ def keys(
 @app.command()
 def init(
     folder: Folder,
-    who: Annotated[
+    given: Annotated[
         list[str] | None, typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, whose robots; or their names.")
     ] = None,
     host: Hosts = None,
@@ -56,9 +56,9 @@ def init(
 
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
-    identities |= _robots(who or [], set(SERVICES))
+    identities |= _robots(given or [], set(SERVICES))
     known = create(
-        place, identities, hosts=host or [], listening=_listening(who or []), days=days, authority_days=authority_days
+        place, identities, hosts=host or [], listening=_listening(given or []), days=days, authority_days=authority_days
     )
     _print(place, known, list(known.identities))
     typer.echo(
@@ -112,15 +112,15 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
     _print(Path(folder), made(Path(folder), names, days=days), names)
     typer.echo(
         "The old keys have no rights at a `zenpark router` that reads this lab.json: one that runs notices it in a "
-        "second; copy the file to routers elsewhere. Their owners are no longer heard: give them the new files. "
-        "A zenohd notices nothing, and the old keys go on working: print its file again (zenpark router FILE --lab LAB "
-        "--print-config) and restart it"
+        "second; copy the file to routers elsewhere. Poses of their owners are not received any more: give them new "
+        "files. A zenohd notices nothing, and the old keys go on working: print its file again (zenpark router FILE "
+        "--lab LAB --print-config) and restart it"
     )
 
 
 @app.command()
 def show(folder: Folder, as_json: AsJson = False) -> int:
-    """Show who is in a lab and until when; exit code 1 if a certificate has ended."""
+    """Show the members of a lab and the ends of their certificates; exit code 1 if a certificate has ended."""
     import msgspec
 
     from agents.network.lab import register
@@ -148,19 +148,21 @@ def _cases(each: str) -> list[Experiment] | None:
     return list(document.read(each).cases().values()) if known else None
 
 
-def _listening(who: list[str]) -> dict[str, list[str]]:
-    """Where identities of experiments listen that are meshes."""
+def _listening(given: list[str]) -> dict[str, list[str]]:
+    """Addresses at which members of meshes listen."""
     from experiments.definition import mesh
 
-    return {name: at for each in who for case in _cases(each) or () for name, at in mesh.listening_hosts(case).items()}
+    return {
+        name: at for each in given for case in _cases(each) or () for name, at in mesh.listening_hosts(case).items()
+    }
 
 
-def _robots(who: list[str], taken: set[str]) -> dict[str, Role]:
+def _robots(given: list[str], taken: set[str]) -> dict[str, Role]:
     """Robots of experiments, and those that are named themselves."""
     from agents.network.lab import LabError
 
     found: dict[str, Role] = {}
-    for each in who:
+    for each in given:
         cases = _cases(each)
         found |= {each: "robot"} if cases is None else {robot: "robot" for case in cases for robot in case.robots}
     if clash := sorted(set(found) & taken):

@@ -58,7 +58,7 @@ def key_expression(text: str) -> str:
 
 
 def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
-    """Who is on the network, by name, from the admin space of routers and members of a mesh, without `session` itself.
+    """Members of the network, by name, from the admin space of routers and members of a mesh, without `session` itself.
 
     A frozen process is still listed, for its router knows it; only its name is then unknown.
     """
@@ -115,7 +115,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
             try:
                 yield str(sample.key_expr), msgspec.json.decode(sample.payload.to_bytes())
             except (msgspec.MsgspecError, ValueError, RecursionError):
-                continue  # somebody else's idea of JSON
+                continue  # not of this project
 
 
 def print_members(connect: Sequence[str], *, as_json: bool, identity: str) -> None:
@@ -147,7 +147,7 @@ def print_members(connect: Sequence[str], *, as_json: bool, identity: str) -> No
 
 
 def readable(payload: bytes, mime: str) -> str:
-    """One line for a payload: JSON and MessagePack as JSON, text as a JSON string, the rest by its size.
+    """A line for a payload: JSON and MessagePack as JSON, text as a JSON string, the rest by its size.
 
     Everything is decoded and encoded again, so that nothing in it can steer the terminal.
     """
@@ -207,7 +207,7 @@ def echo(
 
 @dataclass
 class Rate:
-    """How often a key was heard in a window: [1/s], [bytes/s], and its intervals [s] (NaN when there are none)."""
+    """Rate of a key in a window: [1/s], [bytes/s], and its intervals [s] (NaN when there are none)."""
 
     key: str
     hz: float

@@ -79,7 +79,7 @@ def order(
             if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
         ]
         if not alive:
-            print(f"zenpark: no robot is there in the realm '{realm}'; `zenpark keys` shows who is", file=sys.stderr)
+            print(f"zenpark: no robot in the realm '{realm}'; `zenpark keys` shows the members", file=sys.stderr)
             return 2
         receivers = robots or sorted(alive)
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
@@ -210,7 +210,7 @@ def replace(
     lab: Lab = None,
     identity: As = "operator",
 ) -> int:
-    """Let another body take over a robot's name, links and plan; a spare of its kind if nothing else is said."""
+    """Let another body take over a robot's name, links and plan; by default a spare of its kind."""
     from agents.network.messages import RunOrder
 
     order = RunOrder("replace", [name], who=identity, spare=spare, body=body, at=at, yaw=yaw)

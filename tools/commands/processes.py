@@ -109,7 +109,7 @@ def router(
 
 
 def _places(endpoints: Sequence[str]) -> list[str]:
-    """Where this machine finds a router; not at a port that the system chooses, nor at what `serve` will refuse."""
+    """Addresses of a router on this machine, without ports that the system chooses and those that `serve` refuses."""
     from agents.network.endpoints import from_here
 
     places = []

@@ -75,15 +75,15 @@ class Cables:
     def lay(self, name: str, endpoint: str) -> str:
         """A new cable to a router at `endpoint` (tcp/HOST:PORT); the endpoint of its near end."""
         host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-        listener = socket.create_server(("127.0.0.1", 0))
-        listener.setblocking(False)
-        near = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+        server = socket.create_server(("127.0.0.1", 0))
+        server.setblocking(False)
+        near = f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
         async def begin() -> None:
             cable = _Cable(name)
             cable.whole.set()
             self._cables.append(cable)
-            self._keep(self._accept(cable, listener, (host, int(port))))
+            self._keep(self._accept(cable, server, (host, int(port))))
 
         asyncio.run_coroutine_threadsafe(begin(), self._loop).result()
         return near
@@ -106,11 +106,11 @@ class Cables:
         self._tasks.add(task)  # a loop holds its tasks weakly
         task.add_done_callback(self._tasks.discard)
 
-    async def _accept(self, cable: _Cable, listener: socket.socket, router: tuple[str, int]) -> None:
-        with listener:
+    async def _accept(self, cable: _Cable, server: socket.socket, router: tuple[str, int]) -> None:
+        with server:
             while True:
                 await cable.whole.wait()  # a client of a cut cable waits in the backlog
-                near, _ = await self._loop.sock_accept(listener)
+                near, _ = await self._loop.sock_accept(server)
                 self._keep(self._connect(cable, near, router))
 
     async def _connect(self, cable: _Cable, near: socket.socket, router: tuple[str, int]) -> None:
@@ -160,7 +160,7 @@ class Cables:
             reading.cancel()
 
     def _suffer(self, condition: Condition, data: bytes) -> tuple[float, bytes]:
-        """When a segment is due at the other end, and its bits there."""
+        """Arrival time of a segment at the other end, and its bits there."""
         if data and condition.flips and self._random.random() < condition.flips:
             spoilt = bytearray(data)
             spoilt[self._random.integers(len(data))] ^= 1 << int(self._random.integers(8))

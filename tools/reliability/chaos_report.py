@@ -1,4 +1,4 @@
-"""What a fault laboratory found: a table of fault kinds, recovery times as a figure, and a page."""
+"""Results of a fault laboratory: a table of fault kinds, recovery times as a figure, and a page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tools.reliability.fault_script import FAULT_KINDS, KINDS, Fault, Round
 
 
 class FaultResult(msgspec.Struct, frozen=True):
-    """ChaosResult of one fault."""
+    """Result of one fault."""
 
     round: int  # counted from 1
     fault: Fault  # as in the script
@@ -37,7 +37,7 @@ class FaultResult(msgspec.Struct, frozen=True):
 
 
 class RoundResult(msgspec.Struct, frozen=True):
-    """ChaosResult of one round."""
+    """Result of one round."""
 
     round: int  # counted from 1
     left: list[Fault]  # faults that it had no time for
@@ -59,7 +59,7 @@ def line(outcome: FaultResult) -> str:
 
 
 def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_full: bool) -> list[str]:
-    """What is wrong with the recording of a round: it must open, and say what happened."""
+    """Faults of the recording of a round, which must open and have the events."""
     opened = recording
     try:
         if disk_full:
@@ -71,15 +71,15 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
     wrong = []
     if not (read.complete or disk_full):
         wrong.append("the recording has no end")
-    said = {(event.kind, event.source) for event in read.trace.events}
-    kinds = {kind.rstrip("0123456789") for kind, _ in said}
+    events = {(event.kind, event.source) for event in read.trace.events}
+    kinds = {kind.rstrip("0123456789") for kind, _ in events}
     if not disk_full:
         for outcome in outcomes:
             kind = outcome.fault.kind
-            if kind in ("kill", "read-error", "clock-behind") and ("lost", outcome.victim) not in said:
-                wrong.append(f"the recording does not say that {outcome.victim} was lost")
+            if kind in ("kill", "read-error", "clock-behind") and ("lost", outcome.victim) not in events:
+                wrong.append(f"the recording has no loss of {outcome.victim}")
             elif kind in ("router", "failover") and "router" not in kinds:
-                wrong.append("the recording does not say that the router ended")
+                wrong.append("the recording has no end of the router")
     return wrong
 
 
@@ -107,7 +107,7 @@ class ChaosResult(msgspec.Struct, frozen=True):
 
     @property
     def violations(self) -> int:
-        """How many things happened that must not."""
+        """Number of violations."""
         return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
 
 

@@ -103,7 +103,7 @@ class _ActiveFault:
 
 
 class ChaosRound:
-    """One round.
+    """A round.
 
     Attributes:
         outcomes: Of the faults that were done.
@@ -323,7 +323,7 @@ class ChaosRound:
         self._say(line(outcome))
 
     def _unfinished(self, active: _ActiveFault) -> None:
-        """The run has ended before it could be seen whether all was well again: the fault is done once more."""
+        """Put a fault back whose recovery was not observed before the run ended."""
         if active.violations:
             self._wrong += [f"{active.fault.kind} {active.victim}: {text}" for text in active.violations]
         self._left.insert(0, active.fault)
@@ -339,7 +339,7 @@ class ChaosRound:
             active.add_violation(f"{active.victim} moved although no process steered it")
 
     def _not_recovered(self, active: _ActiveFault, t: float, now: float) -> str:
-        """Why the run is not yet as it was; empty if it is."""
+        """Reason why the run is not yet as it was; empty if it is."""
         live = self._observer.running() - self._dead.keys()
         check = getattr(self, f"_after_{active.fault.kind.replace('-', '_')}", self._after_any)
         away = active.there - live - self._dead.keys() - {active.victim}
@@ -462,7 +462,7 @@ class ChaosRound:
         return [each for each in new if each.text.startswith(("hold", "land", "cut"))]
 
     def _not_back(self, victim: str, live: Set[str], lifted: float) -> str:
-        """Why a victim that lives is not back, and not down either."""
+        """Reason why a living victim is neither back nor down; empty if it is."""
         if self._observer.status_at.get(victim, 0.0) < lifted:
             return f"no status of {victim} yet"
         if self._down(victim):
@@ -470,7 +470,7 @@ class ChaosRound:
         return "" if victim in live else f"{victim} is not back"
 
     def _not_in_formation(self, live: Set[str], since: float, t: float) -> str:
-        """Why living robots are not in formation: silent since then, missing each other, or elsewhere."""
+        """Reason why living robots are not in formation: silent since then, missing each other, or elsewhere."""
         if not live and not self._dead:
             return "no robot is running"
         for name in live:
@@ -505,14 +505,14 @@ class ChaosRound:
     # ------------------------------------------------------------------ the end
 
     def _finish(self, watched: WatchedRun) -> float:
-        """End the run if it has not ended; how long until all its processes were gone [s]."""
+        """End the run if it has not ended; return the time until all its processes had ended [s]."""
         began = time.monotonic()
         if watched.process.alive:
             watched.close()
         deadline = began + LANDED_S
         while (left := watched.processes()) and time.monotonic() < deadline:
             time.sleep(POLL_S * 5)
-        gone = time.monotonic() - began
+        gone_s = time.monotonic() - began
         self._events += watched.news()
         with contextlib.suppress(subprocess.TimeoutExpired):
             watched.process.handle.wait(LAST_BREATH_S)
@@ -520,11 +520,11 @@ class ChaosRound:
             self._wrong.append(f"left behind after {LANDED_S:g} s: {', '.join(sorted(left.values()))}")
         code = watched.process.handle.poll()
         if not self._conductor_dead and code != 0:
-            self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.said)}")
-        return gone
+            self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.output)}")
+        return gone_s
 
     def _missed(self) -> float:
-        """Share of the ticks that robots missed which nobody stopped."""
+        """Share of missed ticks of robots without a fault."""
         stopped = {each.victim for each in self.outcomes} | self._dead.keys()
         statuses = [status for name, status in self._observer.status.items() if name not in stopped and status.ticks]
         ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))

@@ -141,22 +141,22 @@ KINDS: Final = tuple(FAULT_KINDS)
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """One fault."""
+    """A fault of a script."""
 
     kind: str
     after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
     lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
-    victim: str = ""  # a robot; if it is gone by then, the next that is alive. Empty: the whole run
+    victim: str = ""  # a robot; if it has ended by then, the next that is alive. Empty: the whole run
     size: float = 0.0  # delay or clock step [s], or share of lost segments
 
     @property
     def properties(self) -> FaultKind:
-        """Of its kind."""
+        """Its kind."""
         return FAULT_KINDS[self.kind]
 
 
 class Round(msgspec.Struct, frozen=True):
-    """One run of the experiment: its stage and its faults."""
+    """A run of the experiment: its stage and its faults."""
 
     faults: list[Fault]
     stage: Stage = "plain"

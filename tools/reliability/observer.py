@@ -1,10 +1,4 @@
-"""What must hold whatever fails: robots inside, apart and in formation. Row-wise over robots; times are the caller's.
-
-seen = Invariants(experiment)
-seen.place("CF01", (0.1, 0.2, 0.8))
-seen.violations()                          # what is wrong now, each once for as long as it lasts
-seen.formation_error({"CF01", "KH01"}, t=12.0)    # the largest error of the links that live
-"""
+"""Invariants that hold whatever fails: robots inside the arena, apart and in formation; and their observer."""
 
 from __future__ import annotations
 
@@ -25,7 +19,7 @@ from agents.network.messages import Command
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 
-TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of what was heard
+TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of poses
 OUT_M: Final = 0.01  # [m] so far outside a place is outside
 BELOW_M: Final = 0.05
 DOWN_M: Final = 0.08  # [m] a robot that flies and is lower is on the floor
@@ -52,8 +46,8 @@ class Invariants:
         self.position: Array = np.full((len(row), 3), np.nan)
         links = [link for link in Plan(experiment).one_way_links if np.isinf(link.reach)]
         self._links = links
-        self._listener = np.array([row[link.receiver] for link in links], dtype=np.intp)
-        self._speaker = np.array([row[link.sender] for link in links], dtype=np.intp)
+        self._receiver = np.array([row[link.receiver] for link in links], dtype=np.intp)
+        self._sender = np.array([row[link.sender] for link in links], dtype=np.intp)
         self._distance = np.array([link.wanted.distance for link in links])
         self._relative = np.array([link.wanted.relative for link in links]).reshape(-1, 3)
         self._bearing = np.array([link.wanted.bearing for link in links]).reshape(-1, 3)
@@ -107,10 +101,10 @@ class Invariants:
             t: Since the common start [s].
         """
         here = np.array([name in live for name in self.names])
-        there = here[self._listener] & here[self._speaker] & (self._span[:, 0] <= t) & (t < self._span[:, 1])
+        there = here[self._receiver] & here[self._sender] & (self._span[:, 0] <= t) & (t < self._span[:, 1])
         if not there.any():
             return 0.0
-        apart = self.position[self._listener] - self.position[self._speaker]
+        apart = self.position[self._receiver] - self.position[self._sender]
         by_distance = np.abs(norm(apart) - self._distance)
         planar = np.where(np.isfinite(self._relative), apart - self._relative, 0.0)
         known = np.isfinite(self._bearing)
@@ -131,14 +125,14 @@ class Invariants:
         setpoint = np.array(command.setpoint or (np.nan,) * 4)
         kind = self._kinds[command.robot]
         if not np.isfinite(setpoint).all():
-            return f"{command.robot} is told {command.setpoint}"
+            return f"{command.robot} gets the command {command.setpoint}"
         if kind.takes == "position":
             low, high = self._low - STEP_M, self._high + STEP_M
             bad = ((setpoint[:3] < low) | (setpoint[:3] > high)).any()
         else:
             axes = slice(0, 3) if kind.takes == "velocity" else slice(0, 1)
             bad = (np.abs(setpoint[axes]) > SLACK * kind.speed).any()
-        return f"{command.robot} is told {command.setpoint}" if bad else ""
+        return f"{command.robot} gets the command {command.setpoint}" if bad else ""
 
 
 class Observer:
@@ -167,7 +161,7 @@ class Observer:
         self.connected = True  # a router is there
 
     def update(self) -> None:
-        """Take in what was received since the last update."""
+        """Take in messages received since the last update."""
         now = time.monotonic()
         self.connected = network.connected(self.session)
         for status in self._statuses.read():
@@ -175,7 +169,7 @@ class Observer:
         for truth in self._truths.read():
             self.invariants.place(truth.robot, truth.position)
         for state in self._states.read():
-            self.received_at |= {(state.robot, heard.speaker): now for heard in state.heard}
+            self.received_at |= {(state.robot, pose.speaker): now for pose in state.heard}
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
         for command in self._commands.read():

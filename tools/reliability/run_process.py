@@ -1,4 +1,4 @@
-"""A run in a process of its own, for those that watch runs: `python -m tools.reliability.run_process REQUEST`.
+"""A run in a process of its own, to be watched from outside: `python -m tools.reliability.run_process REQUEST`.
 
 The request is a struct as JSON. Each event of the conductor is a line of JSON on standard output. Standard input is the
 lifeline: when it is lost, all robots land.
@@ -6,7 +6,6 @@ lifeline: when it is lost, all robots land.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import resource
 import secrets
@@ -16,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import msgspec
 
@@ -30,10 +29,11 @@ from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import RunOptions, conduct
 from experiments.real_time.conductor.conductor import RunFailed
 from experiments.real_time.conductor.emergency import Emergency
-from experiments.real_time.conductor.run_view import News, Progress
+from experiments.real_time.conductor.run_view import Progress
 from experiments.real_time.conductor.support import StandInError
 from experiments.real_time.hosts.hosts import HostError
-from experiments.real_time.hosts.launcher import RUN, Launcher, Process
+from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged
+from tools.progress import Lines
 from tools.reliability import spoilt_process
 from tools.reliability.spoilt_process import ROBOT, role_of
 
@@ -74,16 +74,8 @@ class CabledLauncher(Launcher):
         return super().start(name, module, *arguments)
 
 
-class EventLines:
+class EventLines(Lines):
     """Prints each event once, as a line of JSON."""
-
-    def __init__(self) -> None:
-        self._news = News()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
 
     def __call__(self, progress: Progress) -> None:
         """Print new events."""
@@ -124,7 +116,7 @@ class WatchedRun:
         spoilt = [] if request.switches is None else [spoilt_process.MODULE, request.switches]
         words = [sys.executable, "-m", *spoilt, "tools.reliability.run_process", msgspec.json.encode(request).decode()]
         self.process: Process = launcher.spawn(NAME, ["env", self.tag, *words])
-        self.said: list[str] = []  # lines that were no events
+        self.output: list[str] = []  # lines that were no events
 
     def news(self) -> Iterator[messages.Event]:
         """Events since the last call."""
@@ -132,11 +124,11 @@ class WatchedRun:
             try:
                 yield messages.decode(line.encode(), messages.JSON, messages.Event)
             except messages.Malformed:
-                self.said.append(line)
+                self.output.append(line)
 
     def processes(self) -> dict[int, str]:
         """All processes of the run, with their roles."""
-        return _tagged(self.tag)
+        return {pid: role_of(words) for pid, words in tagged(self.tag)}
 
     def close(self) -> None:
         """Cut the lifeline, as the death of its holder does, and do not wait."""
@@ -146,17 +138,6 @@ class WatchedRun:
     def end(self) -> None:
         """Land the robots and end all processes."""
         self._launcher.end([NAME], grace_s=END_S)
-
-
-def _tagged(tag: str) -> dict[int, str]:
-    """Processes with NAME=VALUE in their environment that still run, with their roles; zombies are gone."""
-    mark, found = tag.encode(), {}
-    for folder in PROC.glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # another user's, or gone meanwhile
-            if mark in (folder / "environ").read_bytes().split(b"\0"):
-                words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
-                found[int(folder.name)] = role_of(words)
-    return found
 
 
 @dataclass(frozen=True)
@@ -170,7 +151,7 @@ class Usage:
 
 
 def usage_of(pid: int) -> Usage | None:
-    """Resources of a process; None if it is gone."""
+    """Resources of a process; None if it has ended."""
     folder = PROC / str(pid)
     try:
         fields = (folder / "stat").read_bytes().rpartition(b")")[2].split()

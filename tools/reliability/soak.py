@@ -67,12 +67,12 @@ def text(count: int, duration_s: float) -> str:
     for group in range(groups):
         x, y = ((place - (columns - 1) / 2) * SPACING for place in (group % columns, group // columns))
         names: list[str] = []
-        for kind, (dx, dy), heard in MEMBERS[: count - group * len(MEMBERS)]:
+        for kind, (dx, dy), senders in MEMBERS[: count - group * len(MEMBERS)]:
             name = f"{PREFIX[kind]}{len(robots) + 1:02}"
             hover = ", hover = 0.8" if kind == "crazyflie" else ""
             yaw = "" if names else ", 0.0"
             robots.append(f'{name} = {{ kind = "{kind}", start = [{x + dx:g}, {y + dy:g}{yaw}]{hover} }}')
-            for other in heard:
+            for other in senders:
                 ox, oy = MEMBERS[other][1]
                 arrow = ">" if other == 0 else "-"
                 links.append(f'"{names[other]} {arrow} {name}" = {{ offset = [{dx - ox:g}, {dy - oy:g}] }}')
@@ -132,7 +132,7 @@ def soak(
             experiment,
             request,
             interrupted=interrupted,
-            tell=lambda line: print(line, file=sys.stderr, flush=True),
+            show=lambda line: print(line, file=sys.stderr, flush=True),
         )
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)

@@ -34,7 +34,7 @@ TABLE: Final = "soak.csv"
 PRINT_S: Final = 60.0
 
 
-class Listener:
+class Receiver:
     """The last status of each robot, and the delays [s] of the poses that it received since the last sample."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
@@ -50,7 +50,7 @@ class Listener:
         self.status |= {status.robot: status for status in self._statuses.read()}
         for state in self._states.read():
             if state.phase == "running":
-                self.delays[state.robot] += [heard.arrived - heard.stamp for heard in state.heard]
+                self.delays[state.robot] += [pose.arrived - pose.stamp for pose in state.heard]
 
     def sampled(self, row: Row) -> Row:
         """The row of a process with the counters of its robots, whose delays begin anew; others stay as they are."""
@@ -73,8 +73,8 @@ class Listener:
         )
 
 
-def rows(found: Mapping[int, str], listener: Listener, t: float, recording: Path) -> Iterator[Row]:
-    """One row for each process, by its id and role, `t` [s] after the common start."""
+def rows(found: Mapping[int, str], receiver: Receiver, t: float, recording: Path) -> Iterator[Row]:
+    """A row for each process, by its id and role, `t` [s] after the common start."""
     for pid, name in found.items():
         usage = usage_of(pid)
         if usage is None or name == OTHER:
@@ -82,7 +82,7 @@ def rows(found: Mapping[int, str], listener: Listener, t: float, recording: Path
         row = Row(round(t, 2), name, round(usage.rss_mb, 3), usage.threads, usage.files, usage.cpu_s)
         if name == "recorder" and recording.exists():
             row = msgspec.structs.replace(row, recording_mb=round(recording.stat().st_size / 1e6, 3))
-        yield listener.sampled(row)
+        yield receiver.sampled(row)
 
 
 def sample(  # noqa: PLR0915 - one loop that follows one run
@@ -90,7 +90,7 @@ def sample(  # noqa: PLR0915 - one loop that follows one run
     request: Request,
     *,
     interrupted: Callable[[], bool],
-    tell: Callable[[str], None],
+    show: Callable[[str], None],
 ) -> Soaked:
     """Run a case and sample it until it is over.
 
@@ -107,19 +107,19 @@ def sample(  # noqa: PLR0915 - one loop that follows one run
     sampled: list[Row] = []
     died: dict[str, float] = {}
     start: float | None = None
-    began = told = time.monotonic()
+    began = printed = time.monotonic()
     with ExitStack() as stack:
         launcher = stack.enter_context(Launcher(folder / "logs"))
         watched = WatchedRun(launcher, request)
         session = stack.enter_context(network.open_session([endpoint], name="soak", wait_s=ROUTER_S))
-        listener = Listener(session, Keys(experiment.network.realm), list(experiment.robots))
+        receiver = Receiver(session, Keys(experiment.network.realm), list(experiment.robots))
         table = stack.enter_context((folder / TABLE).open("w", newline="", encoding="utf-8"))
         written = csv.writer(table)
         written.writerow(COLUMNS)
         due, over, clock = 0.0, False, Clock()
         while watched.process.alive and not interrupted():
             time.sleep(POLL_S)
-            listener.read()
+            receiver.read()
             now = clock.utc()
             for event in watched.news():
                 if event.kind == "start":
@@ -137,15 +137,15 @@ def sample(  # noqa: PLR0915 - one loop that follows one run
                     raise RunFailed(f"it does not end {OVER_S:g} s after its time: see {folder / 'logs'}")
                 continue
             due += every
-            fresh = list(rows(watched.processes(), listener, now - start, recording))
+            fresh = list(rows(watched.processes(), receiver, now - start, recording))
             sampled += fresh
             written.writerows(msgspec.structs.astuple(row) for row in fresh)
             table.flush()
-            if time.monotonic() > told + PRINT_S:
-                told = time.monotonic()
+            if time.monotonic() > printed + PRINT_S:
+                printed = time.monotonic()
                 lost, memory = sum(row.lost or 0 for row in fresh), sum(row.rss_mb for row in fresh)
                 minutes = f"{(now - start) / 60.0:6.1f} of {duration / 60.0:g} min"
-                tell(f"{minutes}: {len(fresh)} processes, {memory:.0f} MB, {lost} poses lost")
+                show(f"{minutes}: {len(fresh)} processes, {memory:.0f} MB, {lost} poses lost")
         asked = interrupted()
         watched.end()
         code = watched.process.handle.poll()

@@ -1,4 +1,4 @@
-"""What a soak comes to: whether anything grows, is lost, slows down or dies; with its figure and its page."""
+"""Verdict of a soak: whether anything grows, is lost, slows down or dies; with its figure and its page."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ SLOWER: Final = 2.0  # times the delay at the beginning
 DELAY_S: Final = 0.005  # delays below are the noise of the machine
 CAPTION: Final = (
     "Resident memory of each process relative to its own after the warm-up (shaded), and the delay of poses from "
-    "speaker to listener, median and largest of each sample. Robots thin, router, recorder and conductor thick."
+    "sender to receiver, median and largest of each sample. Robots thin, router, recorder and conductor thick."
 )
 THICK: Final = {"router": "#0072b2", "recorder": "#d55e00", "conductor": "#009e73", "world": "#cc79a7"}
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One process at one time; what only robots have is None of the others."""
+    """A process at one time; fields of robots are None for others."""
 
     time_s: float  # from the common start [s]
     process: str  # a robot's name, "router", "recorder", "conductor"
@@ -69,7 +69,7 @@ class Soaked:
     died: dict[str, float]  # processes that ended too early, and when [s]
     interrupted: bool = False  # by the user
 
-    def of(self) -> dict[str, list[Row]]:
+    def by_process(self) -> dict[str, list[Row]]:
         """The rows of each process."""
         found: dict[str, list[Row]] = {}
         for row in self.rows:
@@ -90,19 +90,19 @@ class Ends:
     last: Sequence[Row]  # of the last window
 
     def growth(self, what: Callable[[Row], float]) -> float:
-        """Of the median, as a share of the first."""
+        """Growth of the median, as a share of the first."""
         first, last = (statistics.median(map(what, rows)) for rows in (self.first, self.last))
         return last / first - 1.0 if first else 0.0
 
     def more(self, what: Callable[[Row], int]) -> int:
-        """How many more there are at most."""
+        """Growth of the maximum."""
         return max(map(what, self.last)) - max(map(what, self.first))
 
 
 def ends(soaked: Soaked) -> dict[str, Ends]:
     """Both ends of each process that has enough rows to have them."""
     found = {}
-    for process, rows in soaked.of().items():
+    for process, rows in soaked.by_process().items():
         counted = [row for row in rows if row.time_s >= soaked.warm_s]
         size = max(2, round(WINDOW * len(counted)))
         if len(counted) >= 2 * size:
@@ -130,9 +130,9 @@ def passed(findings: Sequence[Finding]) -> bool:
 
 def _alive(soaked: Soaked) -> list[Finding]:
     lasted = max((row.time_s for row in soaked.rows), default=0.0)
-    seen = soaked.of()
+    sampled = soaked.by_process()
     bad = [f"{name} ended after {at:.0f} s" for name, at in soaked.died.items()]
-    bad += [f"{name} was never seen" for name in soaked.robots if name not in seen and name not in soaked.died]
+    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled and name not in soaked.died]
     if soaked.exit != 0:
         bad.append(f"the run ended with exit code {soaked.exit}: see logs/")
     if soaked.interrupted:
@@ -170,17 +170,17 @@ def _handles(both: dict[str, Ends]) -> list[Finding]:
 
 
 def _losses(soaked: Soaked) -> list[Finding]:
-    last = {process: rows[-1] for process, rows in soaked.of().items()}
+    last = {process: rows[-1] for process, rows in soaked.by_process().items()}
     lost = {process: row.lost for process, row in last.items() if row.lost}
-    heard = sum(row.heard or 0 for row in soaked.rows)
+    received = sum(row.heard or 0 for row in soaked.rows)
     malformed = sum(row.malformed or 0 for row in last.values())
     found = []
     if lost:
-        found.append(Finding("bad", "lost poses: " + ", ".join(f"{who} {count}" for who, count in lost.items())))
-    elif not heard:
-        found.append(Finding("bad", "nobody heard a pose: nothing was tested"))
+        found.append(Finding("bad", "lost poses: " + ", ".join(f"{name} {count}" for name, count in lost.items())))
+    elif not received:
+        found.append(Finding("bad", "no pose was received: nothing was tested"))
     else:
-        found.append(Finding("good", f"0 of {heard} poses were lost"))
+        found.append(Finding("good", f"0 of {received} poses were lost"))
     if malformed:
         found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
     return found
@@ -200,7 +200,7 @@ def _delays(soaked: Soaked, both: dict[str, Ends]) -> list[Finding]:
 
 
 def _punctual(soaked: Soaked) -> list[Finding]:
-    last = [rows[-1] for rows in soaked.of().values() if rows[-1].ticks]
+    last = [rows[-1] for rows in soaked.by_process().values() if rows[-1].ticks]
     ticks, missed = sum(row.ticks or 0 for row in last), sum(row.missed or 0 for row in last)
     if not ticks:
         return []
@@ -237,7 +237,7 @@ def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: st
 def table(soaked: Soaked) -> Table:
     """Each process after the warm-up and at the end."""
     lines = []
-    rows = soaked.of()
+    rows = soaked.by_process()
     for process, each in sorted(ends(soaked).items()):
         last, first = each.last[-1], each.first[0]
         lasted = last.time_s - first.time_s
@@ -266,7 +266,7 @@ def figure(soaked: Soaked) -> Figure:
     """Memory of each process and delays over time."""
     drawn, (memory, delay) = plt.subplots(2, 1, figsize=(6.3, 4.0), sharex=True, layout="constrained")
     both = ends(soaked)
-    for process, rows in soaked.of().items():
+    for process, rows in soaked.by_process().items():
         warm = statistics.median(row.rss_mb for row in (both[process].first if process in both else rows))
         line = {"color": THICK.get(process, "#7a7a7a"), "linewidth": 1.4 if process in THICK else 0.5}
         minutes = [row.time_s / 60.0 for row in rows]

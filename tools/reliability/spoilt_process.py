@@ -62,12 +62,12 @@ class Switch:
             self._shared = mmap.mmap(opened.fileno(), _NUMBER.size)
 
     def read(self) -> float:
-        """What it says now."""
+        """Its present value."""
         (value,) = _NUMBER.unpack_from(self._shared)
         return float(value)
 
     def write(self, value: float) -> None:
-        """What it says from now on."""
+        """Set its value."""
         _NUMBER.pack_into(self._shared, 0, value)
 
 

@@ -91,7 +91,7 @@ class Conductor:
                 if self._until("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
-                    self._drift = stack.enter_context(Drift(self._context.hosts.followed()))
+                    self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
                     self._view.report("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
                     if self._take_off():
                         start = self._start()

@@ -37,7 +37,7 @@ class Held(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Holding(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a folder holds: whom it trusts (PEM), the identities that were asked for, and keys of others."""
+    """Content of a folder: its authority (PEM), the requested identities, and keys of others."""
 
     authority: str = ""
     held: list[Held] = []
@@ -45,7 +45,7 @@ class Holding(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def held(folder: Path, names: Sequence[str]) -> Holding:
-    """What a folder on this machine holds of the identities `names`."""
+    """Content of a folder on this machine, of the identities `names`."""
     return Holding(
         _text(folder / f"{AUTHORITY}.pem"),
         [Held(name, _text(folder / f"{name}.pem"), _wrong(folder, name)) for name in names],
@@ -89,7 +89,7 @@ def of_host(name: str, hosts: Mapping[str, Host]) -> list[str]:
 
 
 def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
-    """What keeps identities of a lab on this machine from being sent, each with its remedy."""
+    """Reasons why identities of a lab on this machine cannot be sent, each with its remedy."""
     known = register(folder).identities
     for name in names:
         if name not in known:
@@ -104,14 +104,14 @@ def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
 
 
 def days_left(folder: Path, names: Sequence[str]) -> float:
-    """How long the first of some certificates is still valid [days], by the register."""
+    """Time until the first of some certificates ends [days], by the register."""
     known = register(folder).identities
     ends = [datetime.fromisoformat(known[name].until) for name in names if name in known]
     return (min(ends) - datetime.now(UTC)).total_seconds() / 86400.0 if ends else 0.0
 
 
 def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
-    """What is the matter with what a machine holds, each with its remedy; nothing, if all of it counts.
+    """Faults of the certificates of a machine, each with its remedy.
 
     Args:
         found: What it says.
@@ -162,7 +162,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
 
 
 def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
-    """Why robots would not believe a router: the name by which they reach it must stand in its certificate.
+    """Reasons why robots would refuse a router: its certificate must name the address by which they reach it.
 
     Raises:
         LabError: If the register cannot be read.

@@ -1,8 +1,8 @@
-"""Clocks of other machines during a run: measured again and again, and followed by the robots that run there.
+"""Clocks of other machines during a run: measured again and again, and corrected in the robots that run there.
 
 A host that drifts by 50 ppm is 0.18 s off after an hour. Every so often each station is asked as before the run, and
-the robots' processes are told their new correction on their lifelines (`agents.clock`): no one else can say it, and it
-needs no network of the experiment. A correction moves only as far as a measurement proves that it is off.
+the robots' processes get their new correction on their lifelines (`agents.clock`): only the launcher holds these, and
+no network of the experiment is needed. A correction moves only as far as a measurement proves that it is off.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ LATEST_S: Final = 10.0
 ALLOWED_S: Final = 1e-3  # of drift from one measurement to the next
 
 
-class Followed(Protocol):
-    """A host whose clock is measured, and whose robots follow (`experiments.real_time.hosts.hosts.Station`)."""
+class MeasuredHost(Protocol):
+    """A host whose clock is measured and corrected (`experiments.real_time.hosts.hosts.Station`)."""
 
     name: str
     clock: HostClock | None
@@ -32,12 +32,12 @@ class Followed(Protocol):
     def measure(self, robots: Sequence[str], samples: int) -> HostClock:
         """Measure its clock."""
 
-    def follow(self, applied: float) -> HostClock:
+    def correct(self, applied: float) -> HostClock:
         """Send its robots the correction of their stamps [s]."""
 
 
 def due(before: HostClock, now: HostClock) -> float:
-    """How long to wait for the next measurement [s], by how much the clock has drifted since the one before."""
+    """Time to the next measurement [s], by the drift of the clock since the last one."""
     proved = abs(now.offset - before.offset) - now.uncertainty - before.uncertainty
     if proved <= 0.0:
         return LATEST_S
@@ -45,14 +45,14 @@ def due(before: HostClock, now: HostClock) -> float:
 
 
 def applied(now: HostClock, before: float) -> float:
-    """What to take off stamps from now on [s]: as `before`, but for what the measurement proves it to be off."""
+    """Correction of stamps from now on [s]: `before`, moved only by the error that the measurement proves."""
     return min(max(before, now.offset - now.uncertainty), now.offset + now.uncertainty)
 
 
 class Drift:
-    """Follows the clocks of some hosts in a thread of its own, for an answer may be long in coming."""
+    """Measures and corrects the clocks of some hosts in a thread of its own, for an answer may take long."""
 
-    def __init__(self, hosts: Iterable[tuple[Followed, list[str]]]) -> None:
+    def __init__(self, hosts: Iterable[tuple[MeasuredHost, list[str]]]) -> None:
         """`hosts` with the robots that run on each; measured once already."""
         self._hosts = list(hosts)
         self._over = threading.Event()
@@ -78,7 +78,7 @@ class Drift:
             self._thread.join()
 
     def news(self) -> tuple[list[HostClock], list[str]]:
-        """What was measured since the last call, and what kept a clock from being measured or followed."""
+        """Measurements since the last call, and the reasons of those that failed or were not applied."""
         with self._lock:
             found = self._measured, self._trouble
             self._measured, self._trouble = [], []
@@ -94,10 +94,10 @@ class Drift:
             except HostError as error:
                 del times[number]
                 with self._lock:
-                    self._trouble.append(f"{error}; its clock is not followed any more")
+                    self._trouble.append(f"{error}; its clock is not corrected any more")
 
-    def _measure(self, host: Followed, robots: list[str]) -> float:
-        """Measure one clock and have its robots follow; return when to do so again [s]."""
+    def _measure(self, host: MeasuredHost, robots: list[str]) -> float:
+        """Measure one clock and correct its robots; return the time to the next measurement [s]."""
         before = host.clock
         assert before is not None
         assert before.applied is not None
@@ -105,12 +105,12 @@ class Drift:
         wanted = applied(now, before.applied)
         jumped = abs(wanted - before.applied) > STEP_S
         if not jumped:
-            now = host.follow(wanted)
+            now = host.correct(wanted)
         with self._lock:
             self._measured.append(now)
             if jumped:
                 self._trouble.append(
                     f"{host.name}: its clock jumped by {wanted - before.applied:+.3f} s, which is no drift and is not "
-                    "followed: was it suspended? Start the run again"
+                    "corrected: was it suspended? Start the run again"
                 )
         return LATEST_S if jumped else due(before, now)

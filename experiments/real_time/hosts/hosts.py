@@ -32,13 +32,13 @@ from experiments.recording import clocks, version
 HELLO_S: Final = 60.0  # the first start of a zenpark that was changed brings its packages up to date
 ANSWER_S: Final = 5.0
 SAMPLES: Final = 24
-HANDSHAKES: Final = 6  # at once with one machine: of more than ten, sshd turns some away (MaxStartups)
+HANDSHAKES: Final = 6  # at once with one machine: sshd refuses some of more than ten (MaxStartups)
 POLL_S: Final = 0.02
-STATION: Final = "host-"  # how the process of the connection to a host is called, before its name
+STATION: Final = "host-"  # prefix of the process of the connection to a host
 
 
 class HostError(RuntimeError):
-    """Hosts that cannot take part, with what is in the way and what to do."""
+    """Hosts that cannot take part, with reason and remedy."""
 
 
 class Station:
@@ -130,7 +130,7 @@ class Station:
         deadline = time.monotonic() + limit_s
         text = msgspec.json.encode(question) + b"\n"
         left = self._ours.utc()
-        with suppress(BrokenPipeError):  # what was said on the other channel tells why
+        with suppress(BrokenPipeError):  # the output of ssh tells the reason
             os.write(self._out.fileno(), text)
         while self._waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
             data = os.read(self._in.fileno(), 65536)
@@ -147,8 +147,8 @@ class Station:
     def _broken(self) -> str:
         with suppress(TimeoutError):
             self.process.handle.wait(ANSWER_S)
-        said = self.process.log.read_text(errors="replace")
-        return f"{self.name}: {ssh.explained(self.address, self.host.zenpark, said)}"
+        output = self.process.log.read_text(errors="replace")
+        return f"{self.name}: {ssh.explained(self.address, self.host.zenpark, output)}"
 
     @property
     def same_version(self) -> bool:
@@ -169,17 +169,17 @@ class Station:
         self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
         return self.clock
 
-    def follow(self, applied: float) -> HostClock:
+    def correct(self, applied: float) -> HostClock:
         """Set the correction of the host's clock for its robots [s], those that are started later too."""
         assert self.clock is not None
         self.applied = applied
         for process, launcher in self._robots:
-            launcher.tell(process, clock.correction_line(-applied))
+            launcher.send_line(process, clock.correction_line(-applied))
         self.clock = msgspec.structs.replace(self.clock, applied=applied)
         return self.clock
 
     def holds(self, names: Sequence[str]) -> certificates.Holding:
-        """What its folder holds of the certificates of some robots.
+        """Certificates of some robots in its folder.
 
         Raises:
             HostError: If it does not answer.
@@ -187,7 +187,7 @@ class Station:
         return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
 
     def distrusted(self, names: Sequence[str]) -> list[str]:
-        """Why its robots and a router would not believe each other, in a lab, each with its remedy.
+        """Reasons why its robots and a router would refuse each other, in a lab, each with its remedy.
 
         Raises:
             HostError: If it does not answer.
@@ -204,7 +204,7 @@ class Station:
 
     @property
     def folder(self) -> str:
-        """Of certificates, there."""
+        """Folder of certificates on the host."""
         return self.host.lab.removeprefix("~/")
 
     def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
@@ -215,13 +215,13 @@ class Station:
         connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.applied:.6f}"
         words = self.command("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
-        process = launcher.spawn(name, ssh.command(self.address, words), told=document + b"\n")
+        process = launcher.spawn(name, ssh.command(self.address, words), first_input=document + b"\n")
         self._starting.append(process)
         self._robots.append((process, launcher))
         return process
 
     def _under_way(self) -> list[Process]:
-        """Processes whose ssh has not got through yet: the other end says at once that it is there."""
+        """Processes whose ssh is not through yet: the other end prints a line at once."""
         self._starting = [each for each in self._starting if each.alive and not each.log.stat().st_size]
         return self._starting
 
@@ -236,7 +236,6 @@ class Hosts:
             launcher: Starts the ssh of each process.
             routers: As this machine reaches them, those that listen everywhere as they listen.
         """
-        # routers: as this machine reaches them, those that listen everywhere as they listen
         self._launcher, self.routers = launcher, list(routers)
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}
@@ -246,7 +245,7 @@ class Hosts:
         """Connect the hosts of a case that have robots and an address; return their clocks.
 
         Raises:
-            HostError: With everything that is in the way, of every host.
+            HostError: With all obstacles of every host.
         """
         wanted = {name: host for name, host in experiment.hosts.items() if host.address is not None and host.robots}
         fresh = []
@@ -277,21 +276,21 @@ class Hosts:
     @staticmethod
     def _begin(station: Station, robots: Sequence[str]) -> HostClock:
         station.reset_clock()
-        return station.follow(station.measure(robots).offset)
+        return station.correct(station.measure(robots).offset)
 
-    def followed(self) -> list[tuple[Station, list[str]]]:
-        """Hosts of the case, and who runs there."""
+    def in_use(self) -> list[tuple[Station, list[str]]]:
+        """Hosts of the case, and the robots that run there."""
         stations = dict.fromkeys(self._robots.values())
         return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
 
     def station_of(self, robot: str) -> Station | None:
-        """Where a robot runs; None: here."""
+        """Host of a robot; None: this machine."""
         return self._robots.get(robot)
 
     def clocks(self) -> tuple[list[HostClock], list[str]]:
-        """The clocks of all hosts of the case now, and what is in the way of reading the others."""
+        """Clocks of all hosts of the case now, and the reasons why others could not be read."""
         measured, trouble = [], []
-        for station, robots in self.followed():
+        for station, robots in self.in_use():
             try:
                 measured.append(station.measure(robots))
             except HostError as error:
@@ -299,7 +298,7 @@ class Hosts:
         return measured, trouble
 
     def sweep(self) -> list[str]:
-        """Kill what is left of the run on every host, and report what that was."""
+        """Kill remaining processes of the run on every host, and name them."""
         killed = []
         for station in self._stations.values():
             with suppress(HostError):  # its station does that by itself as soon as the lifeline is lost

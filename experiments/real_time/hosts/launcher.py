@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +26,7 @@ from agents.clock import Clock
 from agents.runtime.lifeline import BEAT_S
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
-LAND_S: Final = 15.0  # what robots may take to come down after their lifeline was cut
+LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
 
@@ -37,8 +37,8 @@ class Process:
     name: str
     handle: subprocess.Popen[bytes]
     log: Path
-    untold: bytearray = field(default_factory=bytearray)  # what its standard input has yet to get
-    shown: int = 0  # bytes of its output that `Launcher.said` has handed out
+    unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
+    shown: int = 0  # bytes of its output that `news` has returned
 
     @property
     def alive(self) -> bool:
@@ -46,14 +46,14 @@ class Process:
 
     @property
     def exit(self) -> str:
-        """How it ended, in words."""
+        """Its end, in words."""
         code = self.handle.poll()
         if code is None:
             return "still running"
         return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
 
     def news(self) -> list[str]:
-        """The whole lines of its output that were not handed out before."""
+        """New whole lines of its output."""
         try:
             with self.log.open("rb") as output:
                 output.seek(self.shown)
@@ -99,7 +99,7 @@ class Launcher:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
-        self.end(list(self._processes), grace_s=0.0)  # everybody is down: nobody needs a router any more
+        self.end(list(self._processes), grace_s=0.0)  # all robots are down: no router is needed any more
         self._over.set()
         self._beat.join()
 
@@ -113,7 +113,7 @@ class Launcher:
         name: str,
         command: Sequence[str],
         *,
-        told: bytes = b"",
+        first_input: bytes = b"",
         answers: bool = False,
         environment: Mapping[str, str] | None = None,
     ) -> Process:
@@ -122,7 +122,7 @@ class Launcher:
         Args:
             name: Of the process, and of its log.
             command: And its arguments.
-            told: What it reads there before the first heartbeat.
+            first_input: Read there before the first heartbeat.
             answers: Its standard output is the caller's to read, and only its errors are logged.
             environment: Added to the launcher's own.
         """
@@ -139,18 +139,18 @@ class Launcher:
             )
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
-        process = Process(name, handle, log, bytearray(told))
+        process = Process(name, handle, log, bytearray(first_input))
         with self._lock:
             self._processes[name] = process
-            self._tell(process)
+            self._write(process)
         return process
 
-    def tell(self, process: Process, line: bytes) -> None:
-        """Report a line on the lifeline of a process; one that has not read the last gets it no more."""
+    def send_line(self, process: Process, line: bytes) -> None:
+        """Send a line on the lifeline of a process; it is dropped if the process has not read the last one."""
         with self._lock:
-            if not process.untold:
-                process.untold += line
-                self._tell(process)
+            if not process.unsent:
+                process.unsent += line
+                self._write(process)
 
     def get(self, name: str) -> Process:
         """The process of that name."""
@@ -162,13 +162,13 @@ class Launcher:
             return name in self._processes and self._processes[name].alive
 
     def release(self, name: str) -> None:
-        """Cut the lifeline of a process: robots land by themselves, then it ends, which `died` tells."""
+        """Cut the lifeline of a process: robots land by themselves, then it ends, which `died` reports."""
         with self._lock:
             if name in self._processes:
                 self._close(self._processes[name])
 
     def kill(self, name: str) -> None:
-        """End a process that does not even follow its lifeline, at once; `died` tells when it is gone."""
+        """End a process that ignores its lifeline, at once; `died` reports its end."""
         with self._lock:
             if name in self._processes and self._processes[name].alive:
                 os.killpg(self._processes[name].handle.pid, signal.SIGKILL)
@@ -224,16 +224,24 @@ class Launcher:
         while not self._over.wait(BEAT_S):
             with self._lock:
                 for process in self._processes.values():
-                    process.untold += b"" if process.untold else b"\n"
-                    self._tell(process)
+                    process.unsent += b"" if process.unsent else b"\n"
+                    self._write(process)
 
     @staticmethod
-    def _tell(process: Process) -> None:
+    def _write(process: Process) -> None:
         """Write as much as fits into the pipe: the reader may be slow."""
         if process.handle.stdin is not None:
             with contextlib.suppress(OSError, ValueError):  # dead, or frozen with a full pipe
-                while process.untold:
-                    del process.untold[: os.write(process.handle.stdin.fileno(), process.untold)]
+                while process.unsent:
+                    del process.unsent[: os.write(process.handle.stdin.fileno(), process.unsent)]
 
 
-RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host: how they are found again
+RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host, by which they are found
+
+
+def tagged(tag: str) -> Iterator[tuple[int, list[str]]]:
+    """Ids and command lines of running processes with a tag NAME=VALUE in their environment; zombies have none."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # another user's, or ended meanwhile
+            if tag.encode() in (folder / "environ").read_bytes().split(b"\0"):
+                yield int(folder.name), (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")

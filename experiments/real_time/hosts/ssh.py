@@ -12,7 +12,7 @@ from agents.network.endpoints import UNIX, Endpoint
 CONNECT_S: Final = 10
 BROKEN: Final = 255  # exit code of ssh when it is ssh itself that failed
 
-# BatchMode: nobody could answer a question. Three missed replies end a connection, as silence ends a robot's lifeline.
+# BatchMode: no user could answer a question. Three missed replies end a connection, as silence ends a robot's lifeline.
 OPTIONS: Final = {
     "BatchMode": "yes",
     "ConnectTimeout": str(CONNECT_S),
@@ -60,12 +60,12 @@ def script(address: str, text: str, words: Sequence[str]) -> list[str]:
     return command(address, ["sh", "-c", text, *words])
 
 
-def explained(address: str, zenpark: str, said: str) -> str:
-    """What an ssh that failed means, by what it said: the cause, and the remedy."""
+def explained(address: str, zenpark: str, output: str) -> str:
+    """Cause and remedy of a failed ssh, by its output."""
     for pattern, cause, remedy in _TROUBLE:
-        if re.search(pattern, said, re.IGNORECASE | re.MULTILINE):
+        if re.search(pattern, output, re.IGNORECASE | re.MULTILINE):
             return f"{cause}; {remedy}".format(address=address, zenpark=zenpark)
-    last = said.strip().splitlines()[-1:] or ["it said nothing"]
+    last = output.strip().splitlines()[-1:] or ["it said nothing"]
     return f"ssh failed: {last[0]}; try it by hand, which must ask nothing: ssh {address} true"
 
 
@@ -84,6 +84,6 @@ def forwarded(endpoint: Endpoint) -> str:
     return f"127.0.0.1:0:{host}" + (f":{endpoint.port}" if endpoint.port else "")
 
 
-def allocated(said: str) -> list[int]:
-    """The ports that sshd chose, in the order of the `-R`, by what ssh said."""
-    return [int(port) for port, _ in _ALLOCATED.findall(said)]
+def allocated(output: str) -> list[int]:
+    """The ports that sshd chose, in the order of the `-R`, by the output of ssh."""
+    return [int(port) for port, _ in _ALLOCATED.findall(output)]

@@ -1,8 +1,8 @@
-"""What runs on a host beside its robots: answers the launcher's questions over ssh, and sees that nobody stays behind.
+"""Station of a host: answers the launcher's questions over ssh, and leaves no process of the run behind.
 
 `zenpark station`: questions come in on standard input, a line of JSON each, answers go out on standard output. Standard
 input is the lifeline as well. When it is lost, the station waits until the robots of its run are down and gone, and
-kills the ones that are not in time: a frozen process obeys nobody else.
+kills those that are late: a frozen process obeys nothing else.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from agents.network.endpoints import EndpointError
 from agents.plugins import registry
 from agents.runtime.lifeline import SILENCE_S
 from experiments.real_time.hosts import certificates
-from experiments.real_time.hosts.launcher import LAND_S, RUN
+from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
 from experiments.recording import version
 
 POLL_S: Final = 0.1
-FROZEN_S: Final = 2.0  # after the loss of the lifeline; who hangs for longer than that is killed
+FROZEN_S: Final = 2.0  # after the loss of the lifeline; a process that is frozen for longer is killed
 REACH_S: Final = 3.0
 USB: Final = Path("/sys/bus/usb/devices")
 RADIO: Final = {"1915:7777": "Crazyradio", "0483:5740": "Crazyflie on USB"}
@@ -42,31 +42,28 @@ UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 
 
 class Question(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a launcher wants to know: who is there, what the clock says, whether routers and devices can be had.
-
-    `lab` is a folder of certificates, and `names` those that are asked about, or shown to routers.
-    """
+    """A launcher's question."""
 
     ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep"]
-    endpoints: list[str] = []
-    bodies: list[str] = []
-    lab: str | None = None
-    names: list[str] = []
+    endpoints: list[str] = []  # routers to reach
+    bodies: list[str] = []  # whose devices are asked for
+    lab: str | None = None  # folder of certificates
+    names: list[str] = []  # certificates that are asked for, or shown to routers
 
 
 class Found(msgspec.Struct, frozen=True):
-    """Something that was looked for, and what is the matter with it if it is not well."""
+    """A thing that was looked for."""
 
     what: str
     well: bool
-    text: str
+    text: str  # the fault, if it is not well
 
 
 class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A station's answer: `clock` is this machine's UTC when the question was read [s]."""
+    """A station's answer."""
 
-    zenpark: str
-    clock: float
+    zenpark: str  # digest of its code
+    clock: float  # [s] UTC of this machine when the question was read
     version: str = ""
     python: str = ""
     machine: str = ""
@@ -112,7 +109,7 @@ def _reach(endpoint: str, question: Question) -> Found:
 
 
 def devices(bodies: Sequence[str]) -> Iterator[Found]:
-    """What the bodies of a host's robots need there: libraries, radios, serial ports, and the right to use them."""
+    """Needs of the bodies of a host's robots: libraries, radios, serial ports, and the right to use them."""
     words = {registry.body_name(body) for body in bodies}
     for word, library in (("radio", "cflib"), ("usb", "cflib"), ("tello", "djitellopy")):
         if word in words and importlib.util.find_spec(library) is None:
@@ -146,17 +143,9 @@ def _radios() -> Iterator[Found]:
 
 
 def _others() -> list[int]:
-    """Processes of the same run on this machine, but for this one and what it came from."""
+    """Processes of the same run on this machine, but for this one and its parent."""
     run = os.environ.get(RUN)
-    if not run:
-        return []
-    mark, found = f"{RUN}={run}".encode(), []
-    for file in Path("/proc").glob("[0-9]*/environ"):
-        pid = int(file.parent.name)
-        with contextlib.suppress(OSError):  # another user's, or gone meanwhile
-            if pid not in (os.getpid(), os.getppid()) and mark in file.read_bytes().split(b"\0"):
-                found.append(pid)
-    return found
+    return [pid for pid, _ in tagged(f"{RUN}={run}") if pid not in (os.getpid(), os.getppid())] if run else []
 
 
 def _frozen(pid: int) -> bool:
@@ -168,7 +157,7 @@ def _frozen(pid: int) -> bool:
 
 
 def kill(pids: Sequence[int]) -> list[int]:
-    """Kill processes; return those that were still there."""
+    """Kill processes; return those that still ran."""
     killed = []
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
@@ -181,15 +170,15 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     """Answer until the lifeline is lost, then wait until the robots have landed; return the exit code of the process.
 
     Args:
-        fd: Where the questions come in.
-        patience_s: How long robots may take to land and to be gone [s].
+        fd: Descriptor of the questions.
+        patience_s: Time for robots to land and to end [s].
     """
     here = Clock()
     decoder = msgspec.json.Decoder(Question)
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
     rest = b""
-    with contextlib.suppress(OSError):  # nobody listens any more
+    with contextlib.suppress(OSError):  # the other end is closed
         while waiting.poll(SILENCE_S * 1e3):
             data = os.read(fd, 65536)
             clock = here.utc()
@@ -208,7 +197,7 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     lost = time.monotonic()
     while (left := _others()) and time.monotonic() < lost + patience_s:
         if time.monotonic() > lost + FROZEN_S and all(_frozen(pid) for pid in left):
-            break  # nobody lands any more
+            break  # none of them lands any more
         time.sleep(POLL_S)
     kill(_others())
     return 0

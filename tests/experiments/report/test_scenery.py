@@ -92,7 +92,7 @@ def test_the_caption_says_how_it_is_drawn(short):
     assert scenery.caption([short.experiment]) == ""
     said = scenery.caption([within(short, FULL).experiment])
     assert said == (
-        " Obstacles grey, paths of moving ones dotted, what can be pushed hatched, where it stood at the start, "
+        " Obstacles grey, paths of moving ones dotted, movable ones hatched, where they stood at the start, "
         "start boxes dashed."
     )
 

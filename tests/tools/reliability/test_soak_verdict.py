@@ -50,7 +50,7 @@ def test_memory_that_is_taken_before_the_warm_up_does_not_count():
         (lambda name, t: {"lost": int(t > 1800.0)} if name == "CF02" else {}, "lost poses: CF02 1"),
         (lambda name, t: {"malformed": 3} if name == "CF02" else {}, "3 payloads were refused"),
         (lambda name, t: {"delay_s": 0.002 + t / 1e5} if name in ROBOTS else {}, "delay of poses"),
-        (lambda name, t: {"heard": 0} if name in ROBOTS else {}, "nobody heard a pose"),
+        (lambda name, t: {"heard": 0} if name in ROBOTS else {}, "no pose was received"),
     ],
 )
 def test_what_was_planted_is_found(change, said):

@@ -72,7 +72,7 @@ class Host:
         self.clock = HostClock("lab2", time.time(), self.offsets.pop(0), UNCERTAINTY_S, robots, self.clock.applied)
         return self.clock
 
-    def follow(self, applied):
+    def correct(self, applied):
         self.told.append(applied)
         self.clock = HostClock("lab2", 0.0, self.clock.offset, UNCERTAINTY_S, self.clock.robots, applied)
         return self.clock
@@ -94,7 +94,7 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
     assert host.told == pytest.approx([0.21 - UNCERTAINTY_S, 0.22 - UNCERTAINTY_S])
     assert [each.offset for each in measured] == pytest.approx([0.21, 0.21 + 2 * STEP_S, 0.22])
     assert "its clock jumped by +1" in trouble[0]
-    assert "says nothing; its clock is not followed any more" in trouble[1]
+    assert "says nothing; its clock is not corrected any more" in trouble[1]
 
 
 def test_nobody_abroad_nothing_to_follow():
