@@ -203,6 +203,12 @@ def _bar(*, transient: bool) -> Any:  # noqa: ANN401 - rich is imported only her
     return Progress(*columns, TimeRemainingColumn(), console=console, transient=transient, get_time=time.monotonic)
 
 
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, its columns as wide as they must be."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
 def print_findings(findings: Sequence[Finding]) -> None:
     """Print the verdict of a page, a line for each finding."""
     for finding in findings:

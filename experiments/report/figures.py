@@ -51,19 +51,16 @@ from experiments.report.style import (
 )
 from experiments.report.trajectories import after, before, formation_after, formation_before, has_positions, plan_view
 
-__all__ = [
-    "errors", "events", "every", "formation_after", "formation_before", "global_bars", "intervals", "plan_view",
-    "robot_bars", "save", "svg",
-]  # fmt: skip
+__all__ = ["formation_after", "formation_before", "plan_view", "save", "svg"]  # besides those of this module
 
 
 def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Figure]:
     """All figures of a run by name, in the order of the paper; motions of the first seed.
 
-    What there is nothing for is left out: all without a trace; `formation_after` without a leg in the timeline, where
+    Figures without content are left out: all without a trace; `formation_after` without a leg in the timeline, where
     it would show the same as `formation_before`; pictures of space where no position is known.
     """
-    first = [trace for trace in _first_seed(traces) if len(trace.time)]
+    first = [trace for trace in first_seed(traces) if len(trace.time)]
     figures: dict[str, Figure] = {}
     if cases:
         figures["global_bars"] = global_bars(cases)
@@ -247,7 +244,7 @@ def _bars(
     return height, error
 
 
-def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
+def first_seed(traces: Sequence[Trace]) -> list[Trace]:
     """The first trace of each case."""
     return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
 
@@ -272,8 +269,7 @@ PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
 
 def shadow_figures(traces: Sequence[Trace]) -> dict[str, Figure]:
     """The figures of twins beside robots by name; nothing where there are none."""
-    shown = [(trace, row) for trace in traces for row in _rows(trace)]
-    return {"shadows": shadows(traces)} if shown else {}
+    return {"shadows": shadows(traces)} if any(map(_rows, traces)) else {}
 
 
 @styled

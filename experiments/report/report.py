@@ -15,7 +15,6 @@ from experiments.metrics.results import CaseMetrics
 from experiments.metrics.statistics import by_case
 from experiments.recording.trace import Trace
 from experiments.report import figures, scenery
-from experiments.report import figures as shadow_figures
 from experiments.report.page import Finding, PageFigure, Section, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
@@ -110,7 +109,7 @@ def write(
     if not traces:
         raise ValueError("there is no case to report: no robot had started")
     cases = [measure(trace) for trace in traces] if measured is None else measured
-    first = _first_seed(traces)
+    first = figures.first_seed(traces)
     experiment = traces[0].experiment
     seeds = sorted({trace.seed for trace in traces})
     folder.mkdir(parents=True, exist_ok=True)
@@ -288,7 +287,7 @@ def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_be
         sections.append(Section("Did anything touch?", (source,), (*touched, *clearance_tables(cases))))
     if tables := shadow_tables(cases):
         seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
-        drawn = ((figure, f"{SHADOWS}{seed}") for figure in shadow_figures.shadow_figures(traces).values())
+        drawn = ((figure, f"{SHADOWS}{seed}") for figure in figures.shadow_figures(traces).values())
         pictures = numbered(drawn, figures_before + 1)
         sections.append(Section("Twins beside robots", tables=tables, pictures=pictures))
     return sections
@@ -322,14 +321,6 @@ def _label(name: str, trace: Trace, traces: Sequence[Trace]) -> str:
 def _interval_note(cases: Sequence[CaseMetrics]) -> str:
     most = max(len(runs) for runs in by_case(cases).values())
     return f" Whiskers: 95 % confidence over {most} seeds." if most > 1 else ""
-
-
-def _first_seed(traces: Sequence[Trace]) -> list[Trace]:
-    """The first trace of each case."""
-    found: dict[str, Trace] = {}
-    for trace in traces:
-        found.setdefault(trace.case, trace)
-    return list(found.values())
 
 
 def _words(words: Iterable[str]) -> str:

@@ -76,6 +76,7 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None)
     """Say whether each host can take part: version, clock, devices, certificates, router."""
     from experiments.definition import endpoints
     from experiments.file import document
+    from tools.progress import columns
 
     read = document.read(file, settings or [])
     experiment = read.experiment
@@ -84,11 +85,9 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None)
     rows = [_without_address(name, experiment, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
         rows += [_row(each, experiment, heading) for each in found]
-    for line in table(rows, heading):
-        print(line)
-    for row in rows:
-        for each in row.trouble:
-            print(each, file=sys.stderr)
+    print("\n".join(columns([heading, *(row.cells for row in rows)])))
+    for each in (each for row in rows for each in row.trouble):
+        print(each, file=sys.stderr)
     return 0 if all(row.well for row in rows) else 1
 
 
@@ -293,13 +292,6 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
         remedy = f"`zenpark keys renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong
-
-
-def table(rows: Sequence[Row], heading: Sequence[str] = HEADING) -> list[str]:
-    """The lines of the table, columns as wide as they must be."""
-    lines = [list(heading), *(row.cells for row in rows)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(heading))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
 
 
 def put(name: str, host: Host) -> str:

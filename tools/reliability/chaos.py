@@ -1,4 +1,4 @@
-"""`zenpark chaos`: draws a script of faults, runs it, and says what did not hold."""
+"""`zenpark chaos`: draws a script of faults, runs it, and reports what did not hold."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def again(faults: Sequence[Fault]) -> list[Round]:
     return rounds
 
 
-# it measures contacts; a busy machine is no fault; and rounds are long, for starts take time
+# pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
 ALWAYS: Final = ('world.engine="pymunk"', "start.deadline_s=60", "duration_s=90")
 # without one, robots cannot keep clear of a dead one that stands in their way, nor of one that lands below them
 AVOIDANCE: Final = 'avoidance={ kind = "barrier", hears = "all", clearance = 1.0 }'
@@ -148,12 +148,9 @@ def _kinds(given: Sequence[str]) -> list[str]:
 
 
 def _print(result: ChaosResult) -> None:
-    from tools.progress import print_findings
+    from tools.progress import columns, print_findings
     from tools.reliability import chaos_report
 
     made = chaos_report.table(result)
-    rows = [made.head, *(tuple(map(str, row.cells)) for row in made.rows)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(made.head))]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    print("\n".join(columns([made.head, *(tuple(map(str, row.cells)) for row in made.rows)])))
     print_findings(chaos_report.findings(result))

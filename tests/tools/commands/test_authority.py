@@ -113,7 +113,7 @@ def test_a_new_authority_signs_everybody_anew(folder):
     for name in ROBOTS:
         certificate(folder, name).verify_directly_issued_by(after)
         files(folder, name)
-    with pytest.raises(LabError, match="name nobody behind --authority"):
+    with pytest.raises(LabError, match="give no name with --authority"):
         authority.renew(folder, ["CF01"], authority=True)
 
 

@@ -15,7 +15,8 @@ from experiments.real_time.hosts import hosts
 from experiments.recording import playback, version
 from tests.system.lab import ROOT, Flight
 from tools.commands import hosts as tool
-from tools.commands.hosts import HEADING, Row, choose, packed, table
+from tools.commands.hosts import HEADING, choose, packed
+from tools.progress import columns
 
 FAKE = """\
 #!{python}
@@ -120,7 +121,7 @@ def test_another_zenpark_is_refused_before_anything_moves(home, tmp_path, monkey
 
 
 def test_a_table_has_straight_columns():
-    lines = table([Row(["a", "✓ b", *["–"] * 5]), Row(["longer", "✗", *["–"] * 5])])
+    lines = columns([HEADING, ["a", "✓ b", *["–"] * 5], ["longer", "✗", *["–"] * 5]])
     assert lines[0].split() == list(HEADING)
     assert {line.index(mark) for line, mark in zip(lines, ("reachable", "✓", "✗"), strict=True)} == {8}
 
