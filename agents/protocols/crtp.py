@@ -13,6 +13,8 @@ from struct import Struct
 from typing import Final
 
 VERSION: Final = 12  # the first with a supervisor port
+PARAM_READ, PARAM_WRITE = 1, 2  # channels of `Port.PARAM`
+NULL: Final = (15, 3)  # port and channel of a packet without content
 VERSIONS: Final = 1  # channel of `Port.PLATFORM` on which a drone says its versions,
 FIRMWARE: Final = 1  # and the question for that of its firmware, which is a text such as "2025.02"
 MTU: Final = 30  # [bytes] of payload

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from math import isfinite
 from typing import Final
@@ -14,12 +15,13 @@ from agents.body.external_pose import External
 from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan, Rays
 from agents.network.messages import Inspection, number
 from agents.protocols.crazyflie import (
-    PACKETS_PER_RADIO,
     Lighthouse,
     address,
+    capacity,
     chosen,
-    crowded,
     device_of,
+    dongle_of,
+    overload,
     radio_loads,
 )
 from bridges.crazyflie.link import prepare
@@ -28,6 +30,8 @@ from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
+WINDOW_S: Final = 0.25  # in which the exchanges of a radio are counted
+MEASURING_S: Final = 2.0  # a radio that carries too little in each window of this time is refused
 
 
 class CrazyflieBody:
@@ -48,18 +52,24 @@ class CrazyflieBody:
             chosen(name, device, external=outside)
             for name, device, outside in zip(request.names, request.device, request.external, strict=True)
         ]
-        self._congestion = [crowded(addresses, settings).get(each, "") for each in addresses]
         self._loads = radio_loads(addresses, settings)
         rows = len(addresses)
+        dongles = [dongle_of(each) for each in addresses]
+        self._radios = {one: [row for row in range(rows) if dongles[row] == one] for one in dongles if one}
+        self._capacity: dict[str, float] = {}  # [1/s] measured, by radio
+        self._dongles, self._settings = dongles, settings
+        turns = {one: threading.Lock() for one in self._radios}
         self._board = Board(rows)
-        self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0
+        in_turn = max((len(on_it) for on_it in self._radios.values()), default=1)
+        self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0 * in_turn
         self._pilots = [
             Pilot(
                 name,
                 where,
                 each,
                 Telemetry(self._board, row, lighthouse=isinstance(each.positioning, Lighthouse)),
-                (request.start[row], float(request.yaw[row])),
+                place=(request.start[row], float(request.yaw[row])),
+                turn=turns.get(dongles[row], threading.Lock()),
             )
             for row, (name, where, each) in enumerate(zip(request.names, addresses, settings, strict=True))
         ]
@@ -72,7 +82,7 @@ class CrazyflieBody:
         """See `Body.open`. Unreachable drones are left out, retried in the background, and named in the notes.
 
         Raises:
-            BodyError: If no drone is reachable, or another process uses one.
+            BodyError: If no drone is reachable, another process uses one, or a radio carries less than is asked of it.
         """
         prepare(self._addresses)
         self._claims.take()
@@ -87,6 +97,28 @@ class CrazyflieBody:
             self.close()
             failures = [pilot.failure for pilot in self._pilots if pilot.failure is not None]
             raise failures[0] if failures else BodyError(f"{', '.join(self._names)}: not ready in time")
+        refusals = [self._measure_radio(radio, rows) for radio, rows in self._radios.items()]
+        if any(refusals):
+            self.close()
+            raise BodyError("; ".join(filter(None, refusals)))
+
+    def _measure_radio(self, radio: str, rows: list[int]) -> str:
+        """Measure what a radio carries while its drones log; returns why it is too little, or an empty text."""
+        settings = [self._settings[row] for row in rows]
+        refusal, best = "", 0.0
+        end = time.monotonic() + MEASURING_S
+        while time.monotonic() < end:
+            before, begin = self._exchanges(rows), time.monotonic()
+            time.sleep(WINDOW_S)
+            best = max(best, (self._exchanges(rows) - before) / (time.monotonic() - begin))
+            self._capacity[radio] = capacity(best)
+            refusal = overload(radio, settings, self._capacity[radio])
+            if not refusal:
+                break
+        return refusal
+
+    def _exchanges(self, rows: list[int]) -> int:
+        return sum(self._pilots[row].exchanges for row in rows)
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
@@ -148,7 +180,7 @@ class CrazyflieBody:
             firmware=self._pilots[row].firmware,
             volts=number(float(self._board.volts[row])),
             packets_hz=load,
-            capacity_hz=None if load is None else PACKETS_PER_RADIO,
+            capacity_hz=self._capacity.get(self._dongles[row]),
         )
 
     def close(self) -> None:
@@ -162,7 +194,7 @@ class CrazyflieBody:
     def _note(self, row: int, now: float) -> str:
         age = now - self._board.pose_time[row]
         stale = f"no pose for {age:.1f} s" if STALE_S < age < np.inf else ""
-        return "; ".join(part for part in (self._pilots[row].note, stale, self._congestion[row]) if part)
+        return "; ".join(part for part in (self._pilots[row].note, stale) if part)
 
     def _scan(self, row: int) -> RangeScan | None:
         scanned = float(self._board.ranges_time[row])

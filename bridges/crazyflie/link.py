@@ -1,6 +1,8 @@
 """Connection to one Crazyflie through cflib, with the deadlines and the supervision that cflib lacks.
 
-A lost connection is never repaired: it is closed, and a new object is made.
+Over a radio cflib gives a link up after 100 unanswered polls, 0.3 s with one drone. Here the link stays and its polls
+go on; `Link.gap` tells how long nothing was answered. Parameters are read one by one when they are needed: reading all
+of them takes longer than a Crazyflie flies without setpoints.
 """
 
 from __future__ import annotations
@@ -8,11 +10,12 @@ from __future__ import annotations
 import logging
 import os
 import re
+import struct
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from agents.body.interface import BodyError
 from agents.protocols import crtp
@@ -22,17 +25,21 @@ from agents.protocols.crtp import Port
 from bridges.crazyflie.dongle import plug_in
 
 FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
-SILENCE_S: Final = 1.0  # between two packets while the connection is set up
-ANSWER_S: Final = 1.0  # to the confirmation of a parameter
+SILENCE_S: Final = 1.0  # between two answers while the connection is set up
+ANSWER_S: Final = 3.0  # to the answer about a parameter
+REPEAT_S: Final = 0.3  # a question about a parameter is repeated after this
+POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never before `Link.gap` has told
 JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
 
-LogCallback = Callable[[float, Mapping[str, float]], None]
+LogCallback = Callable[[float, int, Mapping[str, float]], None]
 
 
 class Packet(Protocol):
     """The part of cflib's packet that is used."""
 
+    port: int
+    channel: int
     data: bytes
 
 
@@ -51,11 +58,12 @@ def prepare(addresses: Sequence[str]) -> None:
         BodyError: If cflib is not installed, or one radio is to be in several simulated airs.
     """
     try:
-        import cflib.crtp  # noqa: PLC0415 - an optional extra, under another licence
+        import cflib.crtp.radiodriver  # noqa: PLC0415 - an optional extra, under another licence
     except ModuleNotFoundError:
         raise BodyError("Crazyflies need cflib (GPL-3.0), which is an extra: pip install -e '.[crazyflie]'") from None
     if not cflib.crtp.CLASSES:  # a second call would register every driver twice
         cflib.crtp.init_drivers()
+    cflib.crtp.radiodriver.set_retries_before_disconnect(POLLS)
     airs = {(dongle_of(address), air) for address in addresses if (air := software(address)) is not None}
     if len(dict(airs)) < len(airs):
         raise BodyError(
@@ -71,6 +79,36 @@ def cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / "crazyflie"
 
 
+def _tables() -> Any:  # noqa: ANN401 - cflib's
+    """Cache of tables of contents: files, and one copy in memory for all drones of the process."""
+    from cflib.crazyflie.toccache import TocCache  # noqa: PLC0415
+
+    class Tables(TocCache):  # type: ignore[misc]
+        known: ClassVar[dict[int, Any]] = _KNOWN_TABLES
+
+        def fetch(self, crc: int) -> Any:  # noqa: ANN401
+            if crc not in self.known and (table := super().fetch(crc)):
+                self.known[crc] = _plain(table)
+            return self.known.get(crc)
+
+        def insert(self, crc: int, toc: Any) -> None:  # noqa: ANN401
+            super().insert(crc, toc)
+            self.known[crc] = _plain(toc)
+
+    return Tables(rw_cache=str(cache()))
+
+
+_KNOWN_TABLES: dict[int, Any] = {}
+
+
+def _plain(table: Any) -> Any:  # noqa: ANN401 - cflib's
+    """Mark no entry as extended: cflib asks for the kind of each at every connection, and nothing here uses it."""
+    for group in table.values():
+        for element in group.values():
+            element.extended = False
+    return table
+
+
 class Link:
     """Connection to one Crazyflie; `prepare` must have been called."""
 
@@ -78,22 +116,30 @@ class Link:
         from cflib.crazyflie import Crazyflie  # noqa: PLC0415
 
         self.address = address
-        self.last_packet = time.monotonic()  # [s]
+        self.last_packet = time.monotonic()  # [s] of any kind, also one without content, which only a radio sends
+        self.exchanges = 0  # packets received
+        self._longest_gap = 0.0  # [s] between two of them, see `take_gap`
         self.firmware: str | None = None  # version, as the drone says it
         self.replies: dict[int, tuple[int, int]] = {}  # of the planner, by command: number of replies, last code
-        self._full = threading.Event()
+        self._last_answer = self.last_packet  # [s] packet with a content
+        self._connected = threading.Event()
         self._error: str | None = None
-        self._answered = False
+        self._answered = self._unsafe = False
         self._blocks: dict[str, Any] = {}
-        cf = self.cf = Crazyflie(rw_cache=str(cache()))
+        self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
+        self._values: dict[str, float] = {}  # answers about parameters
+        cf = self.cf = Crazyflie()
+        cf._toc_cache = _tables()
         cf.link_statistics.start = lambda: None  # its pings cost ten packets a second, and its thread can join itself
+        cf.param.request_update_of_all_params = lambda: None
         cf.packet_received.add_callback(self._note_packet)
-        cf.fully_connected.add_callback(lambda _uri: self._full.set())
+        cf.connected.add_callback(lambda _uri: self._connected.set())
         cf.link_established.add_callback(self._request_resending)
         cf.connection_failed.add_callback(lambda _uri, text: self._fail(text))
         cf.connection_lost.add_callback(lambda _uri, text: self._fail(text))
         cf.add_port_callback(int(Port.HIGH_LEVEL), self._reply)
         cf.add_port_callback(int(Port.PLATFORM), self._note_firmware)
+        cf.add_port_callback(int(Port.PARAM), self._note_parameter)
 
     @property
     def answered(self) -> bool:
@@ -105,23 +151,50 @@ class Link:
         """Reason of the loss; None while connected."""
         return self._error
 
-    def open(self, deadline: float, end: threading.Event) -> None:
-        """Connect and read all parameters; give up at `deadline` on the monotonic clock [s], or at `end`.
+    @property
+    def gap(self) -> float:
+        """Time since the last packet [s]; over a radio there is one for every answered poll."""
+        return time.monotonic() - self.last_packet
+
+    def take_gap(self) -> float:
+        """Longest gap between two packets since the last call that has ended [s]."""
+        longest, self._longest_gap = self._longest_gap, 0.0
+        return longest
+
+    @property
+    def busy(self) -> bool:
+        """Whether a packet waits for the radio: one more would block the sender."""
+        waiting = getattr(self.cf.link, "out_queue", None)
+        return waiting is not None and bool(waiting.full())
+
+    def open(self, deadline: float, end: threading.Event, meanwhile: Callable[[Link], None]) -> None:
+        """Connect; give up at `deadline` on the monotonic clock [s], or at `end`.
+
+        `meanwhile` is called again and again once packets are exchanged.
 
         Raises:
-            SilentError: If no answer comes, or answers cease.
+            SilentError: If no answer comes, answers cease, or safelink is missing.
             LinkError: If the driver fails, or at the deadline.
         """
-        self.last_packet = time.monotonic()
+        self.last_packet = self._last_answer = time.monotonic()
         self.cf.open_link(self.address)
-        while not self._full.wait(0.02):
+        if self.cf.link is not None and self.is_radio:
+            self.cf.link.link_error_callback = None  # a packet that finds no room for 2 s would end the link
+        while not self._connected.wait(0.02):
             now = time.monotonic()
             if self._error is not None:
                 raise LinkError(self._error)
-            if now - self.last_packet > (SILENCE_S if self._answered else FIRST_S):
+            if self._unsafe:
+                # a drone that still has safelink on takes all packets of a session without it for repetitions
+                raise SilentError("no safelink")
+            if now - (self._last_answer if self._answered else self.last_packet) > (
+                SILENCE_S if self._answered else FIRST_S
+            ):
                 raise SilentError("no answer")
             if now > deadline or end.is_set():
                 raise LinkError("the connection was not set up in time")
+            if self._answered:
+                meanwhile(self)
 
     def has_variable(self, variable: str) -> bool:
         """Whether the firmware logs a variable."""
@@ -134,7 +207,8 @@ class Link:
             name: Name of the block.
             rate_hz: Rounded to the nearest possible period.
             variables: Names and types on the wire; variables that the firmware lacks are left out.
-            logged: Called on cflib's thread with the time of arrival on the monotonic clock [s] and the values.
+            logged: Called on cflib's thread with the time of arrival on the monotonic clock [s], the stamp of the drone
+                [ms, 24 bits] and the values.
         """
         from cflib.crazyflie.log import LogConfig  # noqa: PLC0415
 
@@ -144,7 +218,7 @@ class Link:
                 block.add_variable(variable, type_)
         if not block.variables:
             return
-        block.data_received_cb.add_callback(lambda _stamp, values, _block: logged(time.monotonic(), values))
+        block.data_received_cb.add_callback(lambda stamp, values, _block: logged(time.monotonic(), stamp, values))
         try:
             self.cf.log.add_config(block)
             block.start()
@@ -158,22 +232,37 @@ class Link:
         if block is not None:
             block.delete()
 
-    def send_parameter(self, parameter: str, value: float) -> None:
-        """Set a parameter without waiting for the confirmation.
+    def restart_logs(self) -> None:
+        """Create all log blocks again: the firmware removes them after a second without packets."""
+        for block in list(self._blocks.values()):
+            block.added = False
+            block.start()
+
+    def send_parameter(self, parameter: str, value: float | None) -> None:
+        """Set a parameter, or ask for its value (None), without waiting for the answer; see `parameter_answer`.
 
         Raises:
             BodyError: If the firmware has no such parameter, or a read-only one.
         """
-        try:
-            self.cf.param.set_value(parameter, value)
-        except KeyError:
-            raise BodyError(
-                f"the firmware has no parameter {parameter}: is the name right, the firmware new enough?"
-            ) from None
-        except AttributeError:
-            if self._error is not None or self.cf.link is None:
-                raise LinkError("lost") from None
-            raise BodyError(f"the parameter {parameter} cannot be set: it is read-only") from None
+        from cflib.crtp.crtpstack import CRTPPacket  # noqa: PLC0415
+
+        element = self._parameter(parameter)
+        if element is None:
+            raise BodyError(f"the firmware has no parameter {parameter}: is the name right, the firmware new enough?")
+        if value is not None and element.access:
+            raise BodyError(f"the parameter {parameter} cannot be set: it is read-only")
+        self._parameters[element.ident] = parameter, element.pytype
+        self._values.pop(parameter, None)
+        packet = CRTPPacket()
+        packet.set_header(int(Port.PARAM), crtp.PARAM_READ if value is None else crtp.PARAM_WRITE)
+        packet.data = crtp.IDENT.pack(element.ident)
+        if value is not None:
+            packet.data += struct.pack(element.pytype, float(value) if element.pytype[-1] in "fde" else int(value))
+        self.cf.send_packet(packet)
+
+    def parameter_answer(self, parameter: str) -> float | None:
+        """Value of a parameter in the answer to the last `send_parameter`; None before it."""
+        return self._values.get(parameter)
 
     def set_parameter(self, parameter: str, value: float) -> None:
         """Set a parameter and wait for the confirmation.
@@ -182,31 +271,35 @@ class Link:
             BodyError: If the firmware has no such parameter, a read-only one, or confirms another value.
             LinkError: If no confirmation comes.
         """
-        group, name = parameter.split(".", 1) if "." in parameter else (parameter, "")
-        confirmed: list[str] = []
-        received = threading.Event()
-
-        def confirm(_name: str, text: str) -> None:
-            confirmed.append(text)
-            received.set()
-
-        self.cf.param.add_update_callback(group=group, name=name, cb=confirm)
-        try:
-            self.send_parameter(parameter, value)
-            deadline = time.monotonic() + ANSWER_S
-            while not received.wait(0.02):
-                if time.monotonic() > deadline or self._error is not None:
-                    raise LinkError(f"no answer about the parameter {parameter}")
-        finally:
-            self.cf.param.remove_update_callback(group=group, name=name, cb=confirm)
-        if abs(float(confirmed[-1]) - value) > 1e-5 * max(1.0, abs(value)):  # floats travel with 24 bits
-            raise BodyError(f"the parameter {parameter} is {confirmed[-1]}, not {value}")
+        confirmed = self._ask(parameter, value)
+        if abs(confirmed - value) > 1e-5 * max(1.0, abs(value)):  # floats travel with 24 bits
+            raise BodyError(f"the parameter {parameter} is {confirmed:g}, not {value:g}")
 
     def parameter_value(self, parameter: str) -> float | None:
-        """Last known value of a parameter; None if the firmware has no such parameter."""
+        """Value of a parameter; None if the firmware has no such parameter.
+
+        Raises:
+            LinkError: If no answer comes.
+        """
+        return None if self._parameter(parameter) is None else self._ask(parameter, None)
+
+    def _parameter(self, parameter: str) -> Any:  # noqa: ANN401 - cflib's
         group, _, name = parameter.partition(".")
-        text = self.cf.param.values.get(group, {}).get(name)
-        return None if text is None else float(text)
+        return self.cf.param.toc.get_element(group, name)
+
+    def _ask(self, parameter: str, value: float | None) -> float:
+        """Answer about a parameter; the question is repeated, since a drone may lose its answers in a gap."""
+        deadline = time.monotonic() + ANSWER_S
+        again = 0.0
+        while (answer := self.parameter_answer(parameter)) is None or again == 0.0:
+            now = time.monotonic()
+            if now > deadline or self._error is not None:
+                raise LinkError(f"no answer about the parameter {parameter}")
+            if now >= again:
+                again = now + REPEAT_S
+                self.send_parameter(parameter, value)
+            time.sleep(0.005)
+        return answer
 
     def planner_reply(self, command: int) -> tuple[int, int]:
         """Number of replies to a high-level command so far, and the code of the last."""
@@ -245,9 +338,30 @@ class Link:
         if self.address.startswith("udp://"):
             self.cf.link.needs_resending = True
 
-    def _note_packet(self, _packet: object) -> None:
-        self.last_packet = time.monotonic()
-        self._answered = True
+    @property
+    def is_radio(self) -> bool:
+        """Whether every answered poll brings a packet."""
+        return self.address.startswith("radio://")
+
+    def _note_packet(self, packet: Packet) -> None:
+        now = time.monotonic()
+        self._longest_gap = max(self._longest_gap, now - self.last_packet)
+        self.last_packet = now
+        self.exchanges += 1
+        if not self._answered:  # over a radio, cflib has tried for safelink before it hands the first packet on
+            self._unsafe = self.is_radio and getattr(self.cf.link, "needs_resending", False)
+            self._answered = True
+        if (packet.port, packet.channel) != crtp.NULL:
+            self._last_answer = self.last_packet
+
+    def _note_parameter(self, packet: Packet) -> None:
+        data = bytes(packet.data)
+        begin = {crtp.PARAM_READ: 3, crtp.PARAM_WRITE: 2}.get(packet.channel)
+        if begin is None or len(data) < begin:
+            return
+        name, packing = self._parameters.get(crtp.IDENT.unpack_from(data)[0], ("", ""))
+        if name and len(data) >= begin + struct.calcsize(packing):
+            self._values[name] = float(struct.unpack_from(packing, data, begin)[0])
 
     def _note_firmware(self, packet: Packet) -> None:
         if packet.data and packet.data[0] == crtp.FIRMWARE:

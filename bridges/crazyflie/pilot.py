@@ -8,15 +8,19 @@ from math import cos, inf, isfinite, sin
 from typing import Final
 
 from agents.arrays import Array
-from agents.body.interface import TROUBLE, BodyError
+from agents.body.interface import BodyError
 from agents.protocols.crazyflie import Outside, Settings
-from bridges.crazyflie.flight import Flight, Phase, Target
+from agents.protocols.crtp import Info
+from bridges.crazyflie.flight import STUTTER_S, Flight, Phase, Target
 from bridges.crazyflie.link import Link, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
 
 NO_ANSWER_S: Final = 2.4  # without any answer for so long, no Crazyflie is there
-LOST_S: Final = 1.0  # without a packet the link is lost; the firmware cuts the motors after 2 s without setpoints
+RADIO_LOST_S: Final = 3.0  # without an answered poll the link is lost, and a new one is opened
+LOST_S: Final = 1.0  # likewise without a packet over UDP or USB
+LOGS_S: Final = 1.0  # after a longer gap the firmware has removed its log blocks
+LOGLESS_S: Final = 0.5  # without a log packet over a working link, the log blocks are created again
 LINK_GAP_S: Final = 2.0  # so long after a loss of the link, a drone that flew by streamed setpoints is down
 STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
@@ -36,13 +40,20 @@ class Pilot:
     """Thread and state of one drone."""
 
     def __init__(
-        self, name: str, address: str, settings: Settings, telemetry: Telemetry, place: tuple[Array, float]
+        self,
+        name: str,
+        address: str,
+        settings: Settings,
+        telemetry: Telemetry,
+        *,
+        place: tuple[Array, float],
+        turn: threading.Lock,
     ) -> None:
-        """`place`: start position (3,) [m] and yaw [rad]."""
+        """`place`: start position (3,) [m] and yaw [rad]; `turn`: held while a drone of the radio connects."""
         self.opened = threading.Event()  # connected and set up once; position settled, unless it comes from outside
         self.failure: BodyError | None = None  # reason why the first connection failed
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
-        self._start_pose = place
+        self._start_pose, self._turn = place, turn
         self._flight = Flight(settings, telemetry, self._pause)
         self._link: Link | None = None
         self._connection_note = "connecting"
@@ -55,6 +66,7 @@ class Pilot:
         self._convergence: Convergence | None = None
         self._settle_deadline = inf
         self._closers: list[threading.Thread] = []
+        self._logs_at = -inf  # last creation of the log blocks [s]
         period = settings.stream_hz
         if isinstance(settings.positioning, Outside):
             period = max(period, settings.positioning.rate_hz)
@@ -90,6 +102,11 @@ class Pilot:
         )
 
     @property
+    def exchanges(self) -> int:
+        """Packets received over the current link."""
+        return 0 if self._link is None else self._link.exchanges
+
+    @property
     def firmware(self) -> str | None:
         """Version of the firmware; None before the drone has said it."""
         return None if self._link is None else self._link.firmware
@@ -110,7 +127,7 @@ class Pilot:
         lost = inf
         while not self._ending.is_set() or self._flight.airborne:
             try:
-                link = self._connect()
+                link = self._connect_in_turn()
             except LinkError as error:
                 self._connection_note = str(error)
                 self._fail(error)
@@ -127,7 +144,7 @@ class Pilot:
                 self._connection_note = str(error)
                 self._fail(error)
                 self._ending.wait(RETRY_S)
-            except TROUBLE as error:  # of any kind: the robot must be landed
+            except Exception as error:  # noqa: BLE001 - of any kind: the robot must be landed
                 lost = time.monotonic()
                 what = str(error) if isinstance(error, LinkError) else f"{type(error).__name__}: {error}"
                 self._connection_note = f"link lost: {what}; connecting again"
@@ -144,6 +161,25 @@ class Pilot:
         if not self.opened.is_set():
             self.failure = BodyError(f"{self._name}: {error}")
 
+    def _connect_in_turn(self) -> Link:
+        """Connect for the first time when no other drone of the radio does; again at once, because it may fly.
+
+        Then the tables of contents are read once for all, by a drone that has the radio for itself.
+
+        Raises:
+            LinkError: See `_connect`.
+        """
+        if self.opened.is_set():
+            return self._connect()
+        self._connection_note = self._connection_note or "waits for the other drones of its radio to connect"
+        while not self._turn.acquire(timeout=RETRY_S):
+            if self._ending.is_set():
+                raise LinkError("told to end")
+        try:
+            return self._connect()
+        finally:
+            self._turn.release()
+
     def _connect(self) -> Link:
         """Open a new link, in as many attempts as the time allows.
 
@@ -155,7 +191,7 @@ class Pilot:
         while True:
             link = Link(self._address)
             try:
-                link.open(begin + self._settings.connect_s, self._ending)
+                link.open(begin + self._settings.connect_s, self._ending, self._keep_flying)
             except SilentError as error:
                 answered = answered or link.answered
                 self._discard(link)
@@ -167,6 +203,9 @@ class Pilot:
                 raise LinkError(f"{self._address}: {error}; {self._remedy()}") from None
             else:
                 return link
+
+    def _keep_flying(self, link: Link) -> None:
+        self._flight.keep_flying(time.monotonic(), link)
 
     def _remedy(self) -> str:
         if self._address.startswith("radio"):
@@ -203,16 +242,18 @@ class Pilot:
             time.sleep(0.01)
         if self._flight.resume():
             self._connection_note = "connected again, in the air"
+            if self._order is None:
+                self.give_order("land")
             return
+        if Info.CRASHED in telemetry.info and settings.recover:
+            link.cf.supervisor.send_crash_recovery_request()
         self._telemetry.board.settled[telemetry.row] = False
         for parameter, value in settings.parameters.items():
             link.set_parameter(parameter, value)
         configure(link, settings)
         for _ in range(3):
             link.cf.commander.send_notify_setpoint_stop()  # setpoints of an earlier session have muted the planner
-        if settings.positioning is None:
-            self._arrive()
-        elif isinstance(settings.positioning, Outside):
+        if isinstance(settings.positioning, Outside):
             self._convergence, self._settle_deadline = None, inf
             self._connection_note = "no position from outside yet"
             self.opened.set()
@@ -223,7 +264,8 @@ class Pilot:
     def _converge(self, link: Link) -> None:
         self._connection_note = "position estimate is settling"
         deadline = time.monotonic() + self._settings.converge_s
-        convergence = Convergence(link, *self._start_pose)
+        absolute = self._settings.positioning is not None  # a Flow deck measures velocities
+        convergence = Convergence(link, *self._start_pose, absolute=absolute)
         while not convergence.advance(time.monotonic()):
             self._check(link)
             if time.monotonic() > deadline or self._ending.is_set():
@@ -244,6 +286,7 @@ class Pilot:
         """
         due = time.monotonic()
         landed_by = inf
+        link.take_gap()
         while True:
             self._wake.wait(max(0.0, due - time.monotonic()))
             self._wake.clear()
@@ -251,6 +294,7 @@ class Pilot:
             due = max(due + self._period, now) if now >= due else due
             self._check(link)
             try:
+                self._mend_gap(link, now)
                 self._execute_order()
                 self._forward_external_pose(link, now)
                 self._flight.update_phase(now)
@@ -283,9 +327,20 @@ class Pilot:
     def _check(self, link: Link) -> None:
         if link.error is not None:
             raise LinkError(link.error)
-        silence = time.monotonic() - link.last_packet
-        if silence > LOST_S:
-            raise LinkError(f"no packet for {silence:.1f} s")
+        if link.gap > (RADIO_LOST_S if link.is_radio else LOST_S):
+            raise LinkError(f"no packet for {link.gap:.1f} s")
+        if self._telemetry.stamps.restarted:
+            raise LinkError("it was switched off and on")
+
+    def _mend_gap(self, link: Link, now: float) -> None:
+        """After a gap: hold or land, and log again. The link stays: its polls have gone on."""
+        gap = link.take_gap() if link.is_radio else 0.0
+        silent = now - max(self._telemetry.arrival, self._logs_at)
+        if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.status_hz and link.gap < LOGLESS_S):
+            self._logs_at = now
+            link.restart_logs()
+        if gap > STUTTER_S:
+            self._flight.hold_after_gap(gap)
 
     def _pause(self, seconds: float) -> None:
         """Wait in the middle of an order.
@@ -312,7 +367,7 @@ class Pilot:
         if not isinstance(system, Outside):
             return
         pose = self._external_pose
-        if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz:
+        if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz and not link.busy:
             self._external_pose, self._forwarded_at = None, now
             _, position, yaw = pose
             x, y, z = position.tolist()
@@ -323,7 +378,7 @@ class Pilot:
             if self._convergence is None and self._flight.phase is Phase.GROUND:
                 self._connection_note = "position estimate is settling"
                 start_yaw = yaw if isfinite(yaw) else self._start_pose[1]
-                self._convergence = Convergence(link, position, start_yaw)
+                self._convergence = Convergence(link, position, start_yaw, absolute=True)
                 self._settle_deadline = now + self._settings.converge_s
         placed = self._telemetry.board.settled
         if self._convergence is not None and not placed[self._telemetry.row]:

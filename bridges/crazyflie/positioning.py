@@ -17,7 +17,7 @@ from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols import crtp
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, Settings
-from bridges.crazyflie.link import Link, LinkError
+from bridges.crazyflie.link import REPEAT_S, Link, LinkError
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
 LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}
@@ -30,6 +30,8 @@ SETTLED_SPREAD: Final = 1e-3  # [m²] settled: the variances of half a second di
 SETTLED_BELOW: Final = 0.1  # [m²] and are below this
 SAMPLES: Final = 10
 VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
+
+GEOMETRY: Final = "geometry of the base stations"
 
 Three = Annotated[list[float], Meta(min_length=3, max_length=3)]
 
@@ -101,6 +103,8 @@ def configure(link: Link, settings: Settings) -> None:
     estimator = settings.estimator or (None if system is None else "kalman")
     if estimator is not None:
         link.set_parameter("stabilizer.estimator", ESTIMATORS[estimator])
+    if settings.multiranger and not link.parameter_value("deck.bcMultiranger"):
+        raise BodyError("no Multi-ranger deck found: without it all ranges are 0; is it on top, the right way round?")
     if isinstance(system, Lighthouse):
         _lighthouse(link, system)
     elif isinstance(system, Loco):
@@ -113,30 +117,46 @@ def configure(link: Link, settings: Settings) -> None:
 class Convergence:
     """Reset of the position estimator and the wait until it has settled; never blocks."""
 
-    def __init__(self, link: Link, start: Array, yaw: float) -> None:
-        """`start` (3,) [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw."""
+    def __init__(self, link: Link, start: Array, yaw: float, *, absolute: bool) -> None:
+        """`start` (3,) [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw.
+
+        `absolute`: positions are measured, so that their variance falls; a Flow deck measures velocities only.
+        """
         self.done = False  # settled
-        self._link = link
+        self._link, self._below = link, SETTLED_BELOW if absolute else np.inf
         self._variances: deque[tuple[float, ...]] = deque(maxlen=SAMPLES)
         place = {f"kalman.initial{axis}": float(value) for axis, value in zip("XYZ", start, strict=True)}
-        for name, value in (place | {"kalman.initialYaw": yaw, "kalman.resetEstimation": 1.0}).items():
-            link.send_parameter(name, value)
-        self._release: float | None = time.monotonic() + RESET_S
+        self._to_set = deque((place | {"kalman.initialYaw": yaw, "kalman.resetEstimation": 1.0}).items())
+        self._to_set.append(("kalman.resetEstimation", 0.0))
+        self._sent_at: float | None = None  # time of the last question about the first of these
 
     def advance(self, now: float) -> bool:
         """Continue at `now` on the monotonic clock [s]; True once the estimate has settled."""
-        if self._release is not None and now >= self._release:
-            self._release = None
-            self._link.send_parameter("kalman.resetEstimation", 0.0)
-            self._link.start_log("variance", VARIANCE_HZ, VARIANCES, self._store_variances)
+        while self._to_set and not self._set(now, *self._to_set[0]):
+            return False
         if not self.done and len(self._variances) == SAMPLES:
             variances = np.array(self._variances)
-            if np.ptp(variances, axis=0).max() < SETTLED_SPREAD and variances.max() < SETTLED_BELOW:
+            if np.ptp(variances, axis=0).max() < SETTLED_SPREAD and variances.max() < self._below:
                 self.done = True
                 self._link.stop_log("variance")
         return self.done
 
-    def _store_variances(self, _t: float, values: Mapping[str, float]) -> None:
+    def _set(self, now: float, name: str, value: float) -> bool:
+        """Set one parameter after the other, each confirmed; True when there is nothing to wait for."""
+        if self._sent_at is not None and self._link.parameter_answer(name) is not None:
+            if value == 1.0 and name == "kalman.resetEstimation" and now < self._sent_at + RESET_S:
+                return False
+            self._to_set.popleft()
+            self._sent_at = None
+            if not self._to_set:
+                self._link.start_log("variance", VARIANCE_HZ, VARIANCES, self._store_variances)
+            return True
+        if self._sent_at is None or now > self._sent_at + REPEAT_S:
+            self._sent_at = now
+            self._link.send_parameter(name, value)
+        return False
+
+    def _store_variances(self, _t: float, _stamp: int, values: Mapping[str, float]) -> None:
         self._variances.append(tuple(values.values()))
 
 
@@ -154,29 +174,57 @@ def _lighthouse(link: Link, system: Lighthouse) -> None:
         geometries[number] = mem.LighthouseBsGeometry.from_file_object(msgspec.to_builtins(geometry))
     for number, calibration in wanted.calibs.items():
         calibrations[number] = mem.LighthouseBsCalibration.from_file_object(msgspec.to_builtins(calibration))
+    helper = mem.LighthouseMemHelper(link.cf)
+    if (
+        link.parameter_value("lighthouse.systemType") == wanted.system_type
+        and _same_geometry(_await_answer(link, helper.read_all_geos, GEOMETRY), wanted)
+        and _same_calibration(_await_answer(link, helper.read_all_calibs, GEOMETRY), wanted)
+    ):
+        return  # each writing wears the flash memory
     # naming the version erases the stored geometry, and takes a second
     version = None if link.parameter_value("lighthouse.systemType") == wanted.system_type else wanted.system_type
     writer = LighthouseConfigWriter(link.cf, system.base_stations)
     stored = _await_answer(
         link,
         lambda done: writer.write_and_store_config(done, geos=geometries, calibs=calibrations, system_type=version),
-        "geometry of the base stations",
+        GEOMETRY,
     )
     if not stored:
         raise BodyError(f"the firmware does not know {system.base_stations} base stations: lower base_stations")
-    found = _await_answer(link, mem.LighthouseMemHelper(link.cf).read_all_geos, "geometry of the base stations")
-    for number, geometry in wanted.geos.items():
-        if number not in found or not np.allclose(found[number].origin, geometry.origin, atol=AGREE):
-            raise BodyError(
-                f"base station {number + 1} was not stored: write the geometry with the Crazyflie client once"
-            )
+    if not _same_geometry(_await_answer(link, helper.read_all_geos, GEOMETRY), wanted):
+        raise BodyError("a base station was not stored: write the geometry with the Crazyflie client once")
+
+
+def _same_geometry(found: Mapping[int, Any], wanted: StationFile) -> bool:
+    """Whether the Crazyflie has the geometry of a file, as cflib reads it."""
+    return all(
+        number in found
+        and found[number].valid
+        and np.allclose(found[number].origin, geometry.origin, atol=AGREE)
+        and np.allclose(found[number].rotation_matrix, geometry.rotation, atol=AGREE)
+        for number, geometry in wanted.geos.items()
+    )
+
+
+def _same_calibration(found: Mapping[int, Any], wanted: StationFile) -> bool:
+    """Whether the Crazyflie has the calibration of a file, as cflib reads it."""
+    return all(
+        number in found
+        and found[number].valid
+        and found[number].uid == calibration.uid
+        and all(
+            np.allclose([getattr(has, name) for name in Sweep.__struct_fields__], msgspec.structs.astuple(sweep))
+            for has, sweep in zip(found[number].sweeps, calibration.sweeps, strict=True)
+        )
+        for number, calibration in wanted.calibs.items()
+    )
 
 
 def _loco(link: Link, system: Loco) -> None:
     from cflib.crazyflie.mem import MemoryElement  # noqa: PLC0415 - an optional extra
 
     memories = link.cf.mem.get_mems(MemoryElement.TYPE_LOCO2)
-    if not link.parameter_value("deck.bcLoco") or not memories:
+    if not memories or not (link.parameter_value("deck.bcLoco") or link.parameter_value("deck.bcDWM1000")):
         raise BodyError("no Loco positioning deck found: is the deck there, the right way round?")
     link.set_parameter("loco.mode", LOCO_MODES[system.mode])
     wanted = dict(enumerate(system.anchors))

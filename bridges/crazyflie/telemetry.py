@@ -1,9 +1,14 @@
-"""Telemetry of Crazyflies, newest values only: written by cflib's threads, read by the robot's loop."""
+"""Telemetry of Crazyflies, newest values only: written by cflib's threads, read by the robot's loop.
+
+A pose is as old as the drone's own time stamp says, not as its arrival: queues on board, in the radio and in this
+computer hold packets back for seconds without losing one.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
-from math import nan, radians
+from math import exp, inf, isfinite, nan, radians
 from typing import Final
 
 import numpy as np
@@ -18,7 +23,6 @@ POSE: Final = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx"
 STATUS: Final = {
     "supervisor.info": "uint16_t",
     "pm.vbat": "FP16",
-    "pm.batteryLevel": "uint8_t",
     "pm.state": "int8_t",
     "lighthouse.status": "uint8_t",
     "sys.canfly": "uint8_t",  # these three for firmwares without a supervisor
@@ -29,10 +33,15 @@ RANGES: Final = {f"range.{side}": "uint16_t" for side in ("front", "back", "left
 BEARING: Final = np.radians([0.0, 180.0, 90.0, -90.0, 0.0])
 ELEVATION: Final = np.radians([0.0, 0.0, 0.0, 0.0, 90.0])
 OUT_OF_REACH_MM: Final = 8000.0
-FULL_V, EMPTY_V = 4.2, 3.0
+# voltages of a full and an empty cell at rest, and how much less they are in the air [V]
+FULL_V, EMPTY_V, SAG_V = 4.2, 3.5, 0.3
+SMOOTHING_S: Final = 2.0  # time constant of the voltage: a short load is no empty battery
+WRAP_MS: Final = 1 << 24  # stamps of log packets have 24 bits
+BACK_MS: Final = 1000  # a stamp that is further back comes from a drone that was switched off and on
+DRIFT: Final = 1e-4  # [s/s] largest difference between the clocks of a drone and of this computer
 INFO_TEXT: Final = {
     Info.LOCKED: "locked: switch it off and on",
-    Info.CRASHED: "crashed",
+    Info.CRASHED: "crashed: put it upright on the floor; then set recover = true, or switch it off and on",
     Info.TUMBLED: "upside down",
 }
 STATION_TEXT: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
@@ -55,12 +64,39 @@ class Board:
         self.airborne = np.zeros(rows, dtype=bool)  # motors on, as far as the bridge knows
 
 
+class StampAge:
+    """Age of packets of one drone: arrival less its stamp, less the smallest such difference so far."""
+
+    def __init__(self) -> None:
+        self.restarted = False  # the clock of the drone began anew
+        self._last: int | None = None  # stamp without its overflows [ms]
+        self._arrived = -inf
+        self._least = inf
+
+    def age(self, arrival: float, stamp: int) -> float:
+        """Age [s] of a packet with this stamp [ms, 24 bits] that arrived at `arrival` [s]."""
+        if self._last is None:
+            self._last = stamp
+        since = (stamp - self._last + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
+        if since < -BACK_MS:
+            self.restarted, self._last, self._least = True, stamp, inf
+        elif since > 0:
+            self._last += since
+        delay = arrival - 1e-3 * (self._last + min(since, 0))
+        crept = DRIFT * max(arrival - self._arrived, 0.0) if isfinite(self._arrived) else 0.0
+        self._least = min(self._least + crept, delay)
+        self._arrived = arrival
+        return delay - self._least
+
+
 class Telemetry:
     """One row of a board."""
 
     def __init__(self, board: Board, row: int, *, lighthouse: bool) -> None:
         """`lighthouse`: report the state of the base stations."""
         self.board, self.row = board, row
+        self.stamps = StampAge()
+        self.arrival = -inf  # of the last packet of a log [s, monotonic]
         self._lighthouse = lighthouse
 
     @property
@@ -88,8 +124,15 @@ class Telemetry:
         """Whether the battery is nearly empty."""
         return bool(self.board.power[self.row] >= Power.LOW)
 
+    @property
+    def pose_age(self) -> float:
+        """Age of the last pose [s]; infinity before the first."""
+        return time.monotonic() - float(self.board.pose_time[self.row])
+
     def reset_status(self) -> None:
         """Clear the status at a new connection."""
+        self.stamps = StampAge()
+        self.arrival = -inf
         self.board.status_time[self.row] = -np.inf
         self.board.info[self.row] = 0
 
@@ -110,26 +153,38 @@ class Telemetry:
             faults.append(STATION_TEXT[min(int(board.stations[row]), len(STATION_TEXT) - 1)])
         return "; ".join(text for text in faults if text)
 
-    def _pose(self, t: float, values: Mapping[str, float]) -> None:
+    def _stamped(self, t: float, stamp: int) -> float:
+        """Time [s] of the measurement of a packet that arrived at `t` [s]."""
+        self.arrival = t
+        return t - self.stamps.age(t, stamp)
+
+    def _pose(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         x, y, z, vx, vy, vz, yaw = (values.get(name, nan) for name in POSE)
         self.board.pose[self.row] = x, y, z, vx, vy, vz, radians(yaw)
-        self.board.pose_time[self.row] = t
+        self.board.pose_time[self.row] = self._stamped(t, stamp)
 
-    def _status(self, t: float, values: Mapping[str, float]) -> None:
+    def _status(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         board, row = self.board, self.row
         board.info[row] = int(values["supervisor.info"]) if "supervisor.info" in values else _info(values)
         board.power[row] = int(values.get("pm.state", Power.BATTERY))
-        level = values.get("pm.batteryLevel")
-        volts = values.get("pm.vbat", nan)
-        board.battery[row] = (volts - EMPTY_V) / (FULL_V - EMPTY_V) if level is None else 0.01 * level
-        board.volts[row] = volts
+        measured = self._stamped(t, stamp)
+        self._add_volts(values.get("pm.vbat", nan), measured - board.status_time[row])
         board.stations[row] = int(values.get("lighthouse.status", -1))
-        board.status_time[row] = t
+        board.status_time[row] = measured
 
-    def _ranges(self, t: float, values: Mapping[str, float]) -> None:
+    def _add_volts(self, volts: float, since: float) -> None:
+        """Filter the voltage `since` [s] after the last one, and estimate the charge, with the motors on or off."""
+        board, row = self.board, self.row
+        before = float(board.volts[row])
+        share = 1.0 - exp(-since / SMOOTHING_S) if isfinite(before) and isfinite(since) else 1.0
+        board.volts[row] = before + share * (volts - before) if share < 1.0 else volts
+        empty = EMPTY_V - (SAG_V if Info.FLYING in self.info else 0.0)
+        board.battery[row] = min(max((board.volts[row] - empty) / (FULL_V - EMPTY_V), 0.0), 1.0)
+
+    def _ranges(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         measured = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
         self.board.ranges[self.row] = [nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured]
-        self.board.ranges_time[self.row] = t
+        self.board.ranges_time[self.row] = self._stamped(t, stamp)
 
 
 def _info(values: Mapping[str, float]) -> Info:

@@ -1,13 +1,20 @@
-"""The Crazyflie bridge over the unmodified radio driver of cflib and a software Crazyradio."""
+"""The Crazyflie bridge over the unmodified radio driver of cflib: gaps, losses, lost answers, full queues."""
 
 import numpy as np
 import pytest
 
-from tests.bridges.crazyflie_flight import flown, truth
+from agents.protocols.crtp import Port
+from bridges.crazyflie.body import open_crazyflie
+from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
+from tests.twins.loopback import request
+from twins.devices.crazyflie.supervisor import State
 
 pytestmark = pytest.mark.system
 
 RADIO = {"link": "radio"}
+HEIGHT = 0.5
+SINKS = 0.5  # [m/s] a landing after a gap is slower, a fall from this height six times as fast
+LANDS = 1.5  # [m/s] other landings: the planner stops the motors some centimetres above the floor, as the drone lags
 
 
 @pytest.fixture(autouse=True)
@@ -16,11 +23,141 @@ def toc_cache(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
+class Descent:
+    """Fastest descent of each row [m/s], by the twin's own velocities; read at every tick of a process."""
+
+    def __init__(self, twin, process):
+        self.fastest = np.zeros(len(twin.addresses))
+        self._twin, self._tick = twin, process.tick
+        process.tick = self._ticked
+
+    def _ticked(self):
+        velocity = self._twin.device.flock.quadrotor.velocity[:, 2]
+        self.fastest = np.maximum(self.fastest, -velocity)
+        return self._tick()
+
+
+def hovering(process, rows=1, x=0.0):
+    process.setpoint = [(x, float(row), HEIGHT, 0.0) for row in range(rows)]
+    return process
+
+
+@pytest.mark.mechanism("Crazyflie bridge: radio")
 def test_flight_over_the_radio():
+    """Taken off, led to a goal and landed, without a fall at the end: the planner keeps the order to land."""
     with flown(device=RADIO) as (twin, process):
+        descent = Descent(twin, process)
         assert twin.device.lines[0].safelink
-        process.takeoff(0.4)
-        process.setpoint = [(0.2, 0.0, 0.4, 0.0)]
+        process.takeoff(HEIGHT)
+        hovering(process, x=0.2)
         process.until(lambda: abs(truth(twin)[0] - 0.2) < 0.03, "goal")
         assert np.abs(process.state.position - twin.truth()[0]).max() < 0.05
         process.land()
+        assert descent.fastest.max() < LANDS
+        assert supervised(twin) != State.LOCKED
+
+
+def test_short_gaps_are_flown_through():
+    """Gaps of 0.15 to 0.7 s: the drone holds or flies on, and then follows its setpoints again over the same link."""
+    with flown(device=RADIO) as (twin, process):
+        process.takeoff(HEIGHT)
+        descent = Descent(twin, process)
+        link = process.body._pilots[0]._link
+        for x, gap in enumerate((0.15, 0.3, 0.45, 0.7)):
+            hovering(process, x=0.1 * x).run(0.2)
+            twin.device.lines[0].silence(gap)
+            process.run(gap)
+            process.until(lambda: abs(truth(twin)[0] - 0.1 * x) < 0.03 and process.state.flying[0], "goal")  # noqa: B023
+            assert abs(truth(twin)[2] - HEIGHT) < 0.1
+        assert descent.fastest.max() < SINKS
+        assert process.body._pilots[0]._link is link
+        assert supervised(twin) == State.FLYING
+        process.cut()
+
+
+@pytest.mark.parametrize("gap", [pytest.param(0.9, marks=pytest.mark.mechanism("Crazyflie bridge: radio gap")), 1.6])
+def test_a_long_gap_ends_in_a_landing(gap):
+    with flown(device=RADIO) as (twin, process):
+        process.takeoff(HEIGHT)
+        descent = Descent(twin, process)
+        hovering(process).run(0.2)
+        twin.device.lines[0].silence(gap)
+        process.run(gap)
+        process.until(lambda: not process.state.flying[0], "landed")
+        assert "landed: no radio for" in process.state.notes[0]
+        assert truth(twin)[2] == pytest.approx(0.0, abs=0.02)
+        assert descent.fastest.max() < SINKS
+        assert supervised(twin) != State.LOCKED
+        process.until(
+            lambda: process.t - process.state.time[0] < 0.3, "logs again: the firmware has removed its blocks"
+        )
+
+
+def test_the_neighbours_of_a_drone_in_a_gap_fly_on():
+    with flown(rows=3, device=RADIO) as (twin, process):
+        process.takeoff(HEIGHT)
+        descent = Descent(twin, process)
+        hovering(process, rows=3, x=0.2).run(0.2)
+        twin.device.lines[0].silence(1.2)
+        process.until(lambda: not process.state.flying[0], "landed")
+        assert process.state.flying[1:].all()
+        assert np.abs(twin.truth()[0][1:] - [[0.2, 1.0, HEIGHT], [0.2, 2.0, HEIGHT]]).max() < 0.05
+        assert descent.fastest.max() < SINKS
+        process.cut()
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.2, 0.4])
+def test_random_losses(loss):
+    with flown(device=RADIO, loss=loss) as (twin, process):
+        descent = Descent(twin, process)
+        process.takeoff(HEIGHT)
+        hovering(process, x=0.2)
+        process.until(lambda: abs(truth(twin)[0] - 0.2) < 0.03, "goal")
+        process.land()
+        assert descent.fastest.max() < LANDS
+        assert process.state.notes[0] == ""
+
+
+class Unanswered:
+    """Loses the answers of a drone on one port."""
+
+    def __init__(self, twin, port, row=0):
+        send = twin.device.drones[row].send
+        twin.device.drones[row].send = lambda at, channel, data: None if at == port else send(at, channel, data)
+
+
+def test_a_lost_answer_is_no_refusal():
+    """Answers of the planner never come: the drone flies, follows its setpoints and lands as if they came."""
+    with flown(device=RADIO) as (twin, process):
+        descent = Descent(twin, process)
+        Unanswered(twin, Port.HIGH_LEVEL)
+        process.takeoff(HEIGHT)
+        process.run(2.0)
+        assert "refused" not in process.state.notes[0]
+        assert process.state.flying[0]
+        process.land()
+        assert descent.fastest.max() < LANDS
+        assert supervised(twin) != State.LOCKED
+
+
+def test_a_session_that_begins_while_safelink_is_on():
+    """Safelink is still on from a session that ended without a word, and the air is gone as the next begins."""
+    with flown(device=RADIO) as (twin, process):
+        process.close()
+        assert twin.device.lines[0].safelink
+        twin.device.lines[0].silence(0.5)
+        again = Process(open_crazyflie(request("crazyflie", twin.addresses)))
+        try:
+            again.takeoff(HEIGHT)
+            again.cut()
+        finally:
+            again.close()
+
+
+def test_a_radio_that_carries_too_little_is_refused():
+    device = RADIO | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
+    with (
+        pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 510 packets/s.*write log_hz = .*stream_hz"),
+        flown(rows=2, device=device, external=True, exchanges_hz=300.0),
+    ):
+        pass

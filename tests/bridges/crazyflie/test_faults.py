@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
+from agents.protocols.crazyflie import Outside, Settings, capacity, overload
 from agents.protocols.crtp import Info
 from bridges.crazyflie.body import open_crazyflie
 from bridges.crazyflie.telemetry import Board, Telemetry
@@ -183,7 +184,9 @@ def test_firmware_without_supervisor():
             blocks[name] = variables, logged
 
     telemetry.start_logging(Old(), log_hz=50.0, status_hz=10.0, ranges_hz=None)
-    blocks["status"][1](1.0, {"pm.vbat": 3.6, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
+    blocks["status"][1](
+        1.0, 0, {"pm.vbat": 3.55, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0}
+    )
     assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
     assert board.battery[0] == pytest.approx(0.5)
     assert telemetry.battery_low
@@ -200,11 +203,18 @@ def test_other_robots():
         open_crazyflie(request("tello", [RADIO.format(1)]))
 
 
+@pytest.mark.parametrize(("exchanges", "carried"), [(200.0, 200.0), (300.0, 250.0), (600.0, 420.0)])
+def test_what_a_radio_carries(exchanges, carried):
+    assert capacity(exchanges) == pytest.approx(carried)
+
+
 def test_crowded_radio():
-    """Nine robots at 50 + 10 packets per second are more than one radio carries; eight are not."""
-    for count, said in ((8, ""), (9, "radio 0: 9 robots log 540 packets/s, it carries about 500")):
-        body = open_crazyflie(request("crazyflie", [RADIO.format(row) for row in range(count)]))
-        notes = body.read(0.0).notes
-        assert len(notes) == count
-        assert all(said in note for note in notes)
-        assert ("packets/s" in notes[0]) == bool(said)
+    """Six robots at the defaults, 45 packets per second each, are more than 250; the rates that are named fit."""
+    assert overload("0", [Settings()] * 5, 250.0) == ""
+    text = overload("0", [Settings()] * 6, 250.0)
+    assert text.startswith("radio 0: 6 robots ask for 270 packets/s, up and down; it carries 250: ")
+    assert "log_hz = 16, status_hz = 4, stream_hz = 18, or plug in another radio" in text
+    assert overload("0", [Settings(log_hz=16, status_hz=4, stream_hz=18)] * 6, 250.0) == ""
+    with_positions = overload("0", [Settings(positioning=Outside())] * 8, 250.0)
+    assert "520 packets/s" in with_positions
+    assert "positioning.rate_hz = 9" in with_positions

@@ -9,6 +9,7 @@ from agents.body.interface import UNANSWERED
 from agents.protocols.crazyflie import Settings
 from agents.protocols.crtp import Info
 from bridges.crazyflie import flight as module
+from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.telemetry import Board, Telemetry
 
@@ -21,11 +22,15 @@ class Air:
 
     def __init__(self, monkeypatch, **chosen):
         self.now, self.sent = 100.0, []
-        monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+        for each in (module, telemetry_module):
+            monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.board = Board(1)
         self.telemetry = Telemetry(self.board, 0, lighthouse=False)
         self.flight = Flight(Settings(**chosen), self.telemetry, self.pause)
-        self.flight.link = types.SimpleNamespace(cf=self, error=None, planner_reply=lambda _command: (0, 0))
+        self.flight.link = types.SimpleNamespace(
+            cf=self, error=None, busy=False, planner_reply=lambda command: self.replies.get(command, (0, 0))
+        )
+        self.replies = {}
         self.supervisor = self.commander = self.high_level_commander = self
         self.flying, self.info = True, Info.ARMED | Info.CAN_FLY
 
@@ -47,7 +52,7 @@ class Air:
         end = self.now + seconds
         while self.now < end:
             self.now += 0.02
-            self.board.status_time[0] = self.now
+            self.board.status_time[0] = self.board.pose_time[0] = self.now
             self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
             self.flight.set_target(self.now, PLACE)
             self.flight.update_phase(self.now)
@@ -116,3 +121,89 @@ def test_one_that_stands_is_not_locked(monkeypatch):
     air.pass_(0.1)
     air.flight.stop()
     assert air.sent == []
+
+
+def test_a_drone_that_flies_without_an_order_is_landed_and_not_cut(monkeypatch):
+    """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
+    air = Air(monkeypatch)
+    air.board.pose[0] = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
+    air.pass_(0.1)
+    assert air.flight.phase is Phase.LANDING
+    assert air.flight.airborne
+    assert air.times("land")
+    assert not air.times("send_emergency_stop")
+
+
+def test_a_take_off_without_an_answer_goes_on(monkeypatch):
+    air = Air(monkeypatch)
+    air.board.settled[:], air.flying = True, False
+    air.pass_(0.1)
+    air.flight.takeoff(0.5)
+    assert air.flight.phase is Phase.CLIMBING
+    air.pass_(1.0)
+    assert air.flight.trouble == ""
+    air.pass_(3.0)  # its motors never turn
+    assert air.flight.phase is Phase.GROUND
+    assert air.flight.trouble == "its motors do not turn"
+
+
+def test_no_setpoint_follows_an_order_to_land(air):
+    """A setpoint makes the planner forget the landing: then the notice that setpoints end would stop the motors."""
+    air.flight.link.planner_reply = lambda command: (len(air.times("land")), 0)
+    air.flight.land()
+    whats = [what for _, what in air.sent]
+    after = whats[len(whats) - whats[::-1].index("land") :]
+    assert set(after) == {"send_notify_setpoint_stop"}
+
+
+@pytest.mark.parametrize(("gap", "phase"), [(0.3, Phase.FLYING), (0.7, Phase.FLYING), (0.9, Phase.LANDING)])
+def test_after_a_gap(air, gap, phase):
+    air.sent.clear()
+    air.flight.hold_after_gap(gap)
+    whats = [what for _, what in air.sent]
+    assert air.flight.phase is phase
+    if phase is Phase.FLYING:
+        assert whats[0] == "go_to"  # before the notice, without which the planner is not followed
+        assert set(whats[1:]) == {"send_notify_setpoint_stop"}
+        air.sent.clear()
+        air.pass_(1.5)
+        assert air.times("send_position_setpoint") == []
+        air.pass_(1.0)
+        assert air.times("send_position_setpoint")
+
+
+def test_setpoints_of_old_poses_are_ignored(air):
+    air.board.pose_time[0] = air.now - 0.4
+    air.flight.set_target(air.now, (1.0, 0.2, 0.5, 0.0))
+    air.flight._stream(air.now + 1.0)
+    assert air.flight._target == PLACE
+
+
+@pytest.mark.parametrize("info", [Info.CRASHED, Info.TUMBLED])
+def test_a_crashed_drone_is_not_recovered_by_a_take_off(monkeypatch, info):
+    air = Air(monkeypatch)
+    air.board.settled[:], air.flying, air.info = True, False, Info.ARMED | info
+    air.pass_(0.1)
+    air.flight.takeoff(0.5)
+    assert air.flight.phase is Phase.GROUND
+    assert "no take-off" in air.flight.trouble
+    assert air.sent == []
+
+
+def test_armed_is_not_yet_able_to_fly(monkeypatch):
+    """Motors that are checked after arming: no take-off before the supervisor permits it, and one request to arm."""
+    air = Air(monkeypatch)
+    air.board.settled[:], air.flying, air.info = True, False, Info.ARMED
+    air.pass_(0.1)
+    pause = air.pause
+
+    def spun_up(seconds):
+        pause(seconds)
+        if air.now > 101.5:
+            air.board.info[0] = int(Info.ARMED | Info.CAN_FLY)
+
+    air.flight._pause = spun_up
+    air.flight.takeoff(0.5)
+    assert air.flight.phase is Phase.CLIMBING
+    assert min(air.times("takeoff")) > 101.5
+    assert air.times("send_arming_request") == []
