@@ -1,1 +1,1 @@
-"""What one robot decides and says: the pure, row-wise decision, and the process around it."""
+"""Robots: the pure, row-wise decision, the process around it, and the network between them."""

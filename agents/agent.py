@@ -193,7 +193,7 @@ class Agent:
     # ------------------------------------------------------------------ the decision
 
     def step(self, t: float, state: BodyState) -> Actions:
-        """One tick at time `t` [s] of the process's clock."""
+        """Decide one tick at time `t` [s] of the process's clock."""
         return self.act(t, state, self.transmit(t, state))
 
     def transmit(self, t: float, state: BodyState) -> Transmission:
@@ -381,5 +381,5 @@ def _perception(assignment: Assignment) -> Perception | None:
     avoidance = assignment.avoidance
     if avoidance is None:
         return None
-    kinds, speakers, limits = assignment.kinds, assignment.robot_kinds, assignment.limits
-    return Perception(kinds, speakers, assignment.links, limits, avoidance.clearance, assignment.avoids)
+    kinds, others, limits = assignment.kinds, assignment.robot_kinds, assignment.limits
+    return Perception(kinds, others, assignment.links, limits, avoidance.clearance, assignment.avoids)

@@ -42,7 +42,7 @@ STANDSTILL_S: Final = 1.0  # how long `close` waits until stopped robots are mea
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
 
-class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ExternalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The `device` of a robot with an external body: no settings."""
 
 
@@ -71,7 +71,7 @@ class ExternalBody:
         """
         for name, device in zip(request.names, request.device, strict=True):
             try:
-                msgspec.convert(dict(device), Settings)
+                msgspec.convert(dict(device), ExternalSettings)
             except msgspec.ValidationError as error:
                 raise BodyError(f"{name}: device: {error}; an external body has no settings") from None
         rows = len(request.names)

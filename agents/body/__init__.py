@@ -1,4 +1,4 @@
-"""What a robot is made of: its kind and limits, and the one seam between the decision and hardware or a twin.
+"""Bodies of robots: kinds, limits, and the interface between the decision and hardware or a twin.
 
 May import plugins, network keys, arrays.
 """

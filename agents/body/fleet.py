@@ -48,13 +48,13 @@ class Fleet:
         return BodyState(**merged)
 
     def _merged(self, name: str, parts: Sequence[tuple[Index, Any]]) -> Any:  # noqa: ANN401 - the type of that field
-        """One field of the state of all rows, from bodies of which some may lack it."""
+        """A field of the state of all rows, from bodies of which some may lack it."""
         if name == "rays":
             return Rays.joined(parts)
         if name == "notes":
             notes = [""] * self._rows
-            for group, said in parts:
-                for row, note in zip(group, said, strict=False):
+            for group, own in parts:
+                for row, note in zip(group, own, strict=False):
                     notes[row] = note
             return tuple(notes) if any(notes) else ()
         first = next((value for _, value in parts if value is not None), None)

@@ -83,7 +83,7 @@ class BodyRequest:
 
 @dataclass(frozen=True)
 class RangeScan:
-    """One sweep of a robot's range sensors."""
+    """Sweep of a robot's range sensors."""
 
     time: float  # [s] of the measurement, on the clock of `Body.read`
     bearing: Array  # (m,) from the robot's nose, to the left [rad]
@@ -183,7 +183,7 @@ class Body(Protocol):
         ...
 
     def command(self, setpoint: Array) -> None:
-        """One setpoint (n, 4) per row: x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; rows of NaN are left alone."""
+        """Command setpoints (n, 4): x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; rows of NaN are left alone."""
         ...
 
     def takeoff(self, rows: Index, height: Array) -> None:
@@ -216,12 +216,12 @@ class Inspectable(Protocol):
     """A body that knows more of its devices than their state; the method is optional for bodies."""
 
     def inspect(self, row: int) -> Inspection:
-        """What is known of the device of a row: firmware, volts, load of its radio. Never blocks, moves nothing."""
+        """Facts about the device of a row: firmware, volts, load of its radio. Never blocks, moves nothing."""
         ...
 
 
 def inspect(body: Body, row: int) -> Inspection:
-    """What a body knows of the device of a row; nothing of one that cannot be inspected."""
+    """Facts about the device of a row; none for a body that cannot be inspected."""
     return body.inspect(row) if isinstance(body, Inspectable) else Inspection()
 
 

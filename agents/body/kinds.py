@@ -11,7 +11,7 @@ Takes = Literal["position", "velocity", "twist"]
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of robot."""
+    """Kind of robot."""
 
     name: str  # as in the experiment file
     takes: Takes  # the setpoint that its body takes

@@ -62,8 +62,8 @@ class Shadowed:
         if self._trouble:
             for row in self._rows.tolist():
                 notes[row] = "; ".join(part for part in (notes[row], self._trouble) if part)
-        said = tuple(notes) if any(notes) else ()
-        return replace(state, shadow_position=position, shadow_yaw=yaw, notes=said)
+        shown = tuple(notes) if any(notes) else ()
+        return replace(state, shadow_position=position, shadow_yaw=yaw, notes=shown)
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`."""

@@ -53,9 +53,9 @@ class Perception:
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)
         self._receiver = links.receiver
-        speaks = [robot_kinds[sender] for sender in links.sender.tolist()]
-        self._their_radius, self._their_lag = _column(speaks, "radius"), _column(speaks, "lag")
-        self._their_height = _column(speaks, "height")
+        senders = [robot_kinds[sender] for sender in links.sender.tolist()]
+        self._their_radius, self._their_lag = _column(senders, "radius"), _column(senders, "lag")
+        self._their_height = _column(senders, "height")
         self._rays: Rays | None = None
         self._points = _Points.nothing()
 

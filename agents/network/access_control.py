@@ -30,13 +30,13 @@ PASSED: Final = (
 class Grant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Rights of an identity: key expressions by verb."""
 
-    say: list[str] = []  # publish (PUT only: DELETE is never allowed)
-    hear: list[str] = []  # subscribe, and ask for the last value that a publisher keeps
+    publish: list[str] = []  # publish (PUT only: DELETE is never allowed)
+    subscribe: list[str] = []  # subscribe, and ask for the last value that a publisher keeps
     answer: list[str] = []  # declare a queryable
-    # receive queries on this wildcard, which others may send; a reply stays within `say` and `answer`
-    reached: list[str] = []
-    ask: list[str] = []  # query
-    be: list[str] = []  # hold a liveliness token
+    # receive queries on this wildcard, which others may send; a reply stays within `publish` and `answer`
+    queried: list[str] = []
+    query: list[str] = []  # query
+    tokens: list[str] = []  # hold a liveliness token
     watch: list[str] = []  # subscribe to liveliness tokens
 
     def joined(self, other: Grant) -> Grant:
@@ -73,23 +73,23 @@ def _joined(one: Mapping[str, Grant], other: Mapping[str, Grant]) -> dict[str, G
 
 def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...], list[str]]]:
     """Flow, kinds of messages and keys of each allowance."""
-    said, heard = _kept(grant.say), _kept(grant.hear)
-    yield "ingress", ("put", "reply"), [*grant.say, *said]
-    yield "ingress", ("declare_queryable", "liveliness_token"), said
-    yield "egress", ("query",), said
-    yield "ingress", ("declare_subscriber",), [*grant.hear, *heard]
-    yield "ingress", ("query", "liveliness_query", "declare_liveliness_subscriber"), heard
-    yield "egress", ("put", "reply"), [*grant.hear, *heard]
-    yield "egress", ("liveliness_token",), heard
+    kept, wanted = _kept(grant.publish), _kept(grant.subscribe)
+    yield "ingress", ("put", "reply"), [*grant.publish, *kept]
+    yield "ingress", ("declare_queryable", "liveliness_token"), kept
+    yield "egress", ("query",), kept
+    yield "ingress", ("declare_subscriber",), [*grant.subscribe, *wanted]
+    yield "ingress", ("query", "liveliness_query", "declare_liveliness_subscriber"), wanted
+    yield "egress", ("put", "reply"), [*grant.subscribe, *wanted]
+    yield "egress", ("liveliness_token",), wanted
     yield "ingress", ("declare_queryable", "reply"), grant.answer
-    yield "egress", ("query",), [*grant.answer, *grant.reached]
-    yield "ingress", ("query",), grant.ask
-    yield "egress", ("reply",), grant.ask
-    yield "ingress", ("liveliness_token",), grant.be
+    yield "egress", ("query",), [*grant.answer, *grant.queried]
+    yield "ingress", ("query",), grant.query
+    yield "egress", ("reply",), grant.query
+    yield "ingress", ("liveliness_token",), grant.tokens
     yield "ingress", ("liveliness_query", "declare_liveliness_subscriber"), grant.watch
     yield "egress", ("liveliness_token",), grant.watch
     # a publisher that knows of no subscriber sends nothing: all learn the subscriptions, not the values
-    everything = [f"{realm}/**", *_kept([f"{realm}/**"]), *grant.say, *said, *grant.ask]
+    everything = [f"{realm}/**", *_kept([f"{realm}/**"]), *grant.publish, *kept, *grant.query]
     yield "egress", ("declare_subscriber", "declare_queryable"), everything
     yield "ingress", ("declare_queryable", "reply"), [OWN_ADMIN]
     yield "egress", ("query",), [ADMIN]
@@ -162,8 +162,8 @@ def _rules(name: str, grant: Grant, realm: str) -> Iterator[dict[str, Any]]:
 
 def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
     """The rules of a router that is linked with another: messages that either has let in pass, on keys of any right."""
-    anybody = reduce(Grant.joined, (*rights.robots.values(), *rights.roles.values()), Grant())
-    granted = {key for verb in Grant.__struct_fields__ for key in getattr(anybody, verb)}
+    union = reduce(Grant.joined, (*rights.robots.values(), *rights.roles.values()), Grant())
+    granted = {key for verb in Grant.__struct_fields__ for key in getattr(union, verb)}
     foreign = sorted(key for key in granted if not key.startswith((f"{rights.realm}/", "@/**")))
     keys = [f"{rights.realm}/**", *foreign]
     yield {

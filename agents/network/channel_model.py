@@ -83,7 +83,7 @@ class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 @dataclass(frozen=True)
 class Outage:
-    """From `begin` to `end` [s] after the common start nothing passes on the `links` (E,)."""
+    """Outage of `links` (E,) from `begin` to `end` [s] after the common start."""
 
     begin: float
     end: float
@@ -201,7 +201,7 @@ class Channel:
             self._flying.append(msgspec.structs.replace(poses, arrival=arrival))
 
     def due(self, t: float) -> PoseTable | None:
-        """What gets through by `t` [s], in order of arrival."""
+        """Poses that get through by `t` [s], in order of arrival."""
         if not self._flying:
             return None
         pool = self._pool()
@@ -269,7 +269,7 @@ class Channel:
         return passes, took
 
     def _queued(self, poses: PoseTable, begun: Mask) -> tuple[Array, Mask]:
-        """How long poses wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
+        """Times that poses wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
 
         Raises:
             ValueError: If their sizes are not given.

@@ -176,19 +176,16 @@ def bare(endpoints: Sequence[str]) -> list[str]:
     return [endpoint.partition(OWNER)[0] for endpoint in lab.bare(endpoints)]
 
 
-def near(endpoints: Sequence[str], hears: Mapping[str, set[str]], names: Sequence[str]) -> list[str]:
+def near(endpoints: Sequence[str], senders: Mapping[str, set[str]], names: Sequence[str]) -> list[str]:
     """Endpoints of a mesh for robots that share a process: their own, their neighbours', and those of services.
 
-    Args:
-        endpoints: Of all members.
-        hears: Neighbours of each robot of the experiment.
-        names: The robots of the process.
+    `senders` are the neighbours of each robot of the experiment, `names` the robots of the process.
     """
     if not is_mesh(endpoints):
         return list(endpoints)
-    wanted = {*names, *(speaker for name in names for speaker in hears[name])}
-    wanted |= {other for other, heard in hears.items() if heard & set(names)}
-    return [each for each in endpoints if not hears.keys() & set(owners(each)) or wanted & set(owners(each))]
+    wanted = {*names, *(sender for name in names for sender in senders[name])}
+    wanted |= {other for other, own in senders.items() if own & set(names)}
+    return [each for each in endpoints if not senders.keys() & set(owners(each)) or wanted & set(owners(each))]
 
 
 def from_here(endpoint: str) -> str:

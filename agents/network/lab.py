@@ -108,10 +108,10 @@ def require(folder: Path, names: Sequence[str]) -> None:
     Raises:
         LabError: If some cannot be used here: the first, or all that are missing.
     """
-    gone = [name for name in names if not (folder / f"{name}.pem").exists()]
-    if len(gone) > 1:
-        remedy = f"`zenpark keys issue {folder} {' '.join(gone)}`"
-        raise LabError(f"{folder} has no certificates of {', '.join(gone)}: {remedy}")
+    missing = [name for name in names if not (folder / f"{name}.pem").exists()]
+    if len(missing) > 1:
+        remedy = f"`zenpark keys issue {folder} {' '.join(missing)}`"
+        raise LabError(f"{folder} has no certificates of {', '.join(missing)}: {remedy}")
     for name in names:
         files(folder, name)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from math import inf, isfinite, remainder, tau
-from typing import Final, Literal, TypeVar
+from typing import ClassVar, Final, Literal, TypeVar
 
 import msgspec
 
@@ -51,10 +51,12 @@ class Pose(Message, frozen=True, omit_defaults=True):
     yaw: float | None = None  # [rad]
 
 
-class Heard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PoseReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A neighbour's pose as a robot received it."""
 
-    speaker: str  # the neighbour
+    RECORDED_AS: ClassVar[str] = "Heard"
+
+    sender: str = msgspec.field(name="speaker")
     seq: int
     stamp: float  # [s] UTC of the measurement
     arrived: float  # [s] UTC of the reception
@@ -92,11 +94,13 @@ class State(Message, frozen=True, omit_defaults=True):
     error: float | None = None  # [m] Σ|d − distance| over the links of the robot, by its own knowledge
     true_position: Vector | None = None  # [m] of a twin
     true_yaw: float | None = None  # [rad] of a twin
-    heard: list[Heard] = []  # poses of neighbours since the last state
+    # poses of neighbours since the last state
+    received: list[PoseReceipt] = msgspec.field(name="heard", default_factory=list)
     attitude: Setpoint | None = None  # quaternion w, x, y, z, of bodies that measure more than yaw
     shadow_position: Vector | None = None  # [m] of the twin beside a real robot
     shadow_yaw: float | None = None  # [rad]
-    followed: list[GoalReceipt] = []  # goals since the last state
+    # goals since the last state
+    goal_receipts: list[GoalReceipt] = msgspec.field(name="followed", default_factory=list)
 
 
 class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -117,7 +121,7 @@ class Status(Message, frozen=True):
     body: str  # report of the body
     battery: float | None  # charge, 0 to 1
     sent: int  # poses
-    heard: int  # poses of neighbours
+    received: int = msgspec.field(name="heard")  # poses of neighbours
     lost: dict[str, int]  # by neighbour: samples that never arrived, by their sequence numbers
     dropped: dict[str, int]  # by neighbour, if any: samples that the modelled channel dropped
     malformed: int  # refused payloads
@@ -175,7 +179,7 @@ class CentreState(Message, frozen=True):
     decisions: int
     missed: int  # decisions that were skipped because they were late
     goals: int  # sent
-    heard: dict[str, int]  # poses
+    received: dict[str, int] = msgspec.field(name="heard")  # poses
     lost: dict[str, int]  # by their sequence numbers
     dropped: dict[str, int]  # by the modelled channel
     malformed: int
@@ -196,7 +200,7 @@ class Command(Message, frozen=True):
 
 
 class Ranges(Message, frozen=True):
-    """One sweep of the range sensors of a robot."""
+    """Sweep of the range sensors of a robot."""
 
     robot: str
     stamp: float  # [s] UTC
@@ -276,7 +280,7 @@ class Order(Message, frozen=True):
 
 
 class Inspection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What a robot's process knows of its device before a run; None: this kind of body does not tell."""
+    """Facts about a robot's device before a run; None: this kind of body has none."""
 
     firmware: str | None = None  # version as the device reports it, such as "2025.02"
     volts: float | None = None  # [V] of the battery now
@@ -401,13 +405,13 @@ def position(robot: str, stamp: float, place: Sequence[float], yaw: float) -> Po
 def payloads(state: State, encoding: Encoding) -> Iterator[bytes]:
     """The payloads of telemetry: several if the received poses are too long for one; each then has a part of them."""
     payload = encode(state, encoding)
-    heard, followed = len(state.heard), len(state.followed)
-    if len(payload) <= MAX_PAYLOAD or heard + followed < 2:
+    received, receipts = state.received, state.goal_receipts
+    if len(payload) <= MAX_PAYLOAD or len(received) + len(receipts) < 2:
         yield payload
         return
-    i, j = (heard + 1) // 2, followed // 2
-    yield from payloads(msgspec.structs.replace(state, heard=state.heard[:i], followed=state.followed[:j]), encoding)
-    yield from payloads(msgspec.structs.replace(state, heard=state.heard[i:], followed=state.followed[j:]), encoding)
+    i, j = (len(received) + 1) // 2, len(receipts) // 2
+    for part in ((received[:i], receipts[:j]), (received[i:], receipts[j:])):
+        yield from payloads(msgspec.structs.replace(state, received=part[0], goal_receipts=part[1]), encoding)
 
 
 def encode(message: Message, encoding: Encoding = "json") -> bytes:
@@ -441,14 +445,14 @@ def read_stop(payload: bytes, mime: str) -> Stop:
 
     Sender and reason are read as far as possible, on one line of at most `MAX_WORDS` characters each.
     """
-    said: object = None
+    decoded: object = None
     with suppress(Exception):  # unreadable is a stop as well
-        said = (msgspec.msgpack if mime.startswith(MSGPACK) else msgspec.json).decode(payload[:MAX_PAYLOAD])
+        decoded = (msgspec.msgpack if mime.startswith(MSGPACK) else msgspec.json).decode(payload[:MAX_PAYLOAD])
     who, reason = "", payload[:MAX_PAYLOAD].decode(errors="replace")
-    if isinstance(said, str):
-        reason = said
-    elif isinstance(said, dict) and not said.keys().isdisjoint(Stop.__struct_fields__):
-        who, reason = (text if isinstance(text := said.get(field), str) else "" for field in Stop.__struct_fields__)
+    if isinstance(decoded, str):
+        reason = decoded
+    elif isinstance(decoded, dict) and not decoded.keys().isdisjoint(Stop.__struct_fields__):
+        who, reason = (text if isinstance(text := decoded.get(field), str) else "" for field in Stop.__struct_fields__)
     return Stop(_shown(who) or UNKNOWN, _shown(reason))
 
 

@@ -47,8 +47,8 @@ def hang_up(session: zenoh.Session) -> int:
     """
     own = {str(link.src).partition("/")[2] for link in session.info.links()}
     ended = 0
-    with ExitStack() as seen:
-        found = [seen.enter_context(each) for each in _connections()]
+    with ExitStack() as opened:
+        found = [opened.enter_context(each) for each in _connections()]
         peers = {each.getpeername() for each in found if _address(each) in own}
         for each in found:
             if each.getpeername() in peers:
@@ -177,14 +177,14 @@ def open_session(
             rights=rights if ends.listen else None,
         )
     )
-    gone = stop or threading.Event()
+    ended = stop or threading.Event()
     deadline = time.monotonic() + (min(wait_s, ENDPOINT_FREE_S) if ends.listen else wait_s)
     while True:
         try:
             with prompt_threads():
                 session = zenoh.open(chosen)
         except zenoh.ZError as error:
-            if time.monotonic() < deadline and not gone.wait(RETRY_S):
+            if time.monotonic() < deadline and not ended.wait(RETRY_S):
                 continue
             if ends.listen:
                 raise EndpointError(
@@ -192,20 +192,20 @@ def open_session(
                     "the network already, end it first; or give it another endpoint in network.addresses"
                 ) from None
         else:
-            if not ends.visits or _gathered(session, len(ends.connect), gather_s, gone, deadline):
+            if not ends.visits or _gathered(session, len(ends.connect), gather_s, ended, deadline):
                 return session
             session.close()  # type: ignore[no-untyped-call]
         raise Unreachable(_silence(endpoints, identity or name)) from None
 
 
-def _gathered(session: zenoh.Session, members: int, gather_s: float, gone: threading.Event, deadline: float) -> bool:
+def _gathered(session: zenoh.Session, members: int, gather_s: float, ended: threading.Event, deadline: float) -> bool:
     """Waits until a visitor is linked with all members of a mesh, or, after a while, with some."""
     begun = time.monotonic()
     while (linked := len(session.info.transports())) < members:
         now = time.monotonic()
         if linked and now - begun > gather_s:
             return True
-        if now > deadline or gone.wait(LINK_S):
+        if now > deadline or ended.wait(LINK_S):
             return linked > 0
     return True
 

@@ -152,10 +152,10 @@ def missed(last: int, seq: int, since: float, rate: float) -> int:
         rate: Largest rate of poses [1/s]. It limits the result: one forged number must not become a hundred million
             lost poses.
     """
-    return min(seq - last - 1 if seq > last else seq - 1, said_within(since, rate))
+    return min(seq - last - 1 if seq > last else seq - 1, most_poses(since, rate))
 
 
-def said_within(since: float, rate: float) -> int:
+def most_poses(since: float, rate: float) -> int:
     """Largest number of poses in `since` [s] at `rate` [1/s]; UTC stamps are exact to a microsecond."""
     return math.ceil(since * rate - 1e-3)
 

@@ -144,7 +144,7 @@ class Barrier(Avoidance, frozen=True):
         return rows, _scaled(velocity, own.speed[rows], normal, bound, place)
 
     def _aside(self, own: OwnState, near: Nearby, normal: Array) -> Array:
-        """Where each row gives way to, per m/s that a thing bars (K, 2): to its right, seen toward the thing.
+        """Evasion of each row, per m/s that a thing bars (K, 2): to its right, seen toward the thing.
 
         One that comes faster than the row can flee will not mind it: there it is the side of its way where the row is.
         """

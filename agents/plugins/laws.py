@@ -155,7 +155,7 @@ def _by_bearing(offset: Array, links: Links) -> Array:
 
 
 def _beside(offset: Array, links: Links) -> Array:
-    """From the nearest point of the ray along the bearing to x (E, 3); seen from above where the bearing is."""
+    """Vectors (E, 3) from the nearest point of the ray along the bearing to x; seen from above where the bearing is."""
     bearing = _given(links.bearing, links)
     flat = np.isnan(bearing[:, 2]) & np.isfinite(bearing[:, 0])
     if flat.any():

@@ -177,7 +177,7 @@ class Lemniscate(Parameters, frozen=True):
 
 @dataclass(frozen=True)
 class Leg:
-    """From `at` on [s of the experiment], follow `planner`."""
+    """Leg of an itinerary: follow `planner` from `at` on [s of the experiment]."""
 
     at: float
     planner: Planner

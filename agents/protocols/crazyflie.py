@@ -58,8 +58,8 @@ class Outside(Part, frozen=True, tag_field="system", tag="external"):
     attitude_sigma: Positive = 0.05  # standard deviation of the attitude [rad]
 
 
-class Settings(Part, frozen=True):
-    """Settings of one Crazyflie."""
+class CrazyflieSettings(Part, frozen=True):
+    """CrazyflieSettings of one Crazyflie."""
 
     # `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal
     control: Literal["position", "velocity", "high-level"] = "position"
@@ -120,13 +120,13 @@ def dongle_of(address: str) -> str:
     return address.split("/")[2] if address.startswith("radio://") else ""
 
 
-def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
+def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> CrazyflieSettings:
     """The settings of the robot `name`; `external` if its position comes from outside.
 
     Raises:
         BodyError: If they make no sense.
     """
-    read = settings(Settings, name, device)
+    read = settings(CrazyflieSettings, name, device)
     if isinstance(read.positioning, Outside) and not external:
         raise BodyError(f'{name}: positioning system "external" needs position = "external" in the robot\'s table')
     if external and read.positioning is None:
@@ -134,7 +134,7 @@ def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> Settings:
     return read
 
 
-def radio_loads(addresses: Sequence[str], each: Sequence[Settings]) -> list[float | None]:
+def radio_loads(addresses: Sequence[str], each: Sequence[CrazyflieSettings]) -> list[float | None]:
     """Packets per second of all robots on the radio of each address; None without a radio."""
     radios = [dongle_of(address) for address in addresses]
     load: dict[str, float] = {}
@@ -148,7 +148,7 @@ def capacity(exchanges_hz: float) -> float:
     return max(min(PACKETS_PER_RADIO, exchanges_hz), MEASURED_SHARE * exchanges_hz)
 
 
-def fitting_rates(each: Settings, share: float) -> str:
+def fitting_rates(each: CrazyflieSettings, share: float) -> str:
     """The rates of a robot, lowered to this share of the packets, as its `device` table has them."""
     period = ceil(100.0 / (share * each.log_hz))
     lowered = {
@@ -162,7 +162,7 @@ def fitting_rates(each: Settings, share: float) -> str:
     return text
 
 
-def overload(radio: str, each: Sequence[Settings], carried_hz: float) -> str:
+def overload(radio: str, each: Sequence[CrazyflieSettings], carried_hz: float) -> str:
     """Reason why robots with these settings ask too much of a radio, and the rates that fit; empty if they do not."""
     asked = sum(settings_.packets_hz for settings_ in each)
     if asked <= carried_hz:

@@ -68,7 +68,7 @@ PARK: Final[dict[str, ParkServer]] = {
 NEWEST: Final = "2025-05"
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class Khepera4Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """The `device` table of a Khepera IV."""
 
     server: Server | None = None  # what runs on the robot; None: found out where `p` tells, else refused

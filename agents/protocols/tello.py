@@ -24,7 +24,7 @@ STICK_SPEED: Final = 1.0  # [m/s] at full deflection; measured on the wire only,
 STICK_TURN: Final = math.radians(100.0)  # [rad/s] at full deflection, likewise
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """The `device` table of a Tello."""
 
     silence_s: float = 1.0  # [s] without a state line after which the drone counts as lost; it comes at 10 Hz

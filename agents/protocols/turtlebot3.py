@@ -36,7 +36,7 @@ ABSENT_V: Final = 7.0  # at this and below the node says that there is no batter
 _NAMESPACE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TurtleBot3Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The `device` table of a TurtleBot3. Robot and twin read the same one, so that a switch changes nothing else."""
 
     distro: Distro = "jazzy"  # ROS 2 distribution of the robot; what its address says counts more
@@ -68,7 +68,7 @@ class Address:
         return f"{self.style}://{self.namespace}?{domain}distro={self.distro}"
 
 
-def address(name: str, text: str, chosen: Settings) -> Address:
+def address(name: str, text: str, chosen: TurtleBot3Settings) -> Address:
     """The address of a robot.
 
     Raises:
@@ -93,7 +93,7 @@ def address(name: str, text: str, chosen: Settings) -> Address:
     return Address(style, namespace, distro, int(domain))  # type: ignore[arg-type]
 
 
-def twin(name: str, chosen: Settings) -> Address:
+def twin(name: str, chosen: TurtleBot3Settings) -> Address:
     """The address of a robot's protocol twin: its own name is the namespace."""
     return Address(chosen.style, re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII), chosen.distro, chosen.domain)
 

@@ -18,29 +18,19 @@ LONGEST: Final = 4096  # of a line [bytes]
 
 
 class Lifeline:
-    """Watches a file descriptor in a daemon thread and sets `lost` when the launcher is gone.
+    """Watches a file descriptor in a daemon thread; the owner reacts to a loss: a robot lands first."""
 
-    The owner reacts: a robot lands first.
-
-    Args:
-        lost: Set once, after `reason` was.
-        timeout_s: Silence [s] that counts as loss.
-        fd: File descriptor; standard input if left out.
-        told: Called in that thread with each line that is no heartbeat.
-    """
+    reason: str | None  # of the loss; set before `lost`
 
     def __init__(
         self,
-        lost: threading.Event,
-        timeout_s: float = SILENCE_S,
-        fd: int = 0,
-        told: Callable[[bytes], None] | None = None,
+        lost: threading.Event,  # set once when the launcher is gone
+        timeout_s: float = SILENCE_S,  # silence [s] that counts as loss
+        fd: int = 0,  # standard input
+        on_line: Callable[[bytes], None] | None = None,  # called in that thread with each line that is no heartbeat
     ) -> None:
-        self.reason: str | None = None
-        self._lost = lost
-        self._timeout_s = timeout_s
-        self._fd = fd
-        self._told = told
+        self.reason = None
+        self._lost, self._timeout_s, self._fd, self._on_line = lost, timeout_s, fd, on_line
         self._rest = b""
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
 
@@ -64,15 +54,15 @@ class Lifeline:
                 data = os.read(self._fd, LONGEST)
                 if not data:
                     return "the starter is gone"
-                if self._told is not None:
-                    self._pass_on(data, self._told)
+                if self._on_line is not None:
+                    self._pass_on(data, self._on_line)
         except OSError as error:
             return f"the lifeline broke: {error.strerror}"
         return f"nothing from the starter for {self._timeout_s:g} s"
 
-    def _pass_on(self, data: bytes, told: Callable[[bytes], None]) -> None:
+    def _pass_on(self, data: bytes, on_line: Callable[[bytes], None]) -> None:
         *lines, rest = (self._rest + data).split(b"\n")
         self._rest = rest[-LONGEST:]
         for line in lines:
             if line:
-                told(line)
+                on_line(line)

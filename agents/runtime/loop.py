@@ -70,10 +70,10 @@ class Runtime:
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
-        self._looked = np.inf  # [s] last run of the process, on `_CLOCK`
+        self._awake_at = np.inf  # [s] last run of the process, on `_CLOCK`
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names])
         self._hands_off = False  # another process drives the bodies, or may do so
-        self._told: Callable[[], str | None] = lambda: None
+        self._reason_to_end: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
         self._began = setup.clock.utc()
@@ -93,7 +93,7 @@ class Runtime:
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
-        rope = Lifeline(lost, told=self._setup.clock.follow)
+        rope = Lifeline(lost, on_line=self._setup.clock.follow)
         if self._setup.lifeline:
             rope.start()
         asked = threading.Event()
@@ -117,17 +117,17 @@ class Runtime:
             out.callback(self._order_down, self._body.stop, STOPPED_S)
             out.callback(self._come_down)
             self._join(session)
-            self._loop(lambda: rope.reason if lost.is_set() else self._told_to_end(asked.is_set()))
+            self._loop(lambda: rope.reason if lost.is_set() else self._reason(asked.is_set()))
         return 0
 
     def _let_go(self) -> None:
         if not self._hands_off:
             self._body.close()
 
-    def _told_to_end(self, asked: bool) -> str | None:
+    def _reason(self, asked: bool) -> str | None:
         if asked:
             return "told to end"
-        return "told to leave" if len(self._leaving) == len(self._names) else None
+        return "ordered to leave" if len(self._leaving) == len(self._names) else None
 
     def _come_down(self) -> None:
         """Lands robots that still fly after an error, before the motors are switched off."""
@@ -220,15 +220,15 @@ class Runtime:
 
         Raises:
             NameTaken: If another process has taken one of them.
-            network.Unreachable: If the process was told to end, and no router has said so within `ANSWER_S`.
+            network.Unreachable: If the process was told to end, and no router has answered within `ANSWER_S`.
         """
-        last, self._looked = self._looked, time.clock_gettime(_CLOCK)
-        if self._looked - last < STOOD_S or self._watchdog.tripped:  # a hanging loop is the business of the watchdog
+        last, self._awake_at = self._awake_at, time.clock_gettime(_CLOCK)
+        if self._awake_at - last < STOOD_S or self._watchdog.tripped:  # a hanging loop is the business of the watchdog
             return False
-        woke, self._hands_off = self._looked, True
+        woke, self._hands_off = self._awake_at, True
         self._ownership.begin(self._session)
         while not self._mine():
-            if self._looked - woke > ANSWER_S and self._told() is not None:
+            if self._awake_at - woke > ANSWER_S and self._reason_to_end() is not None:
                 names = ", ".join(self._names)
                 raise network.Unreachable(
                     f"{names}: told to end after it stood still, and no router answers who owns the name now; its body "
@@ -236,7 +236,7 @@ class Runtime:
                 )
             self._watchdog.beat()
             time.sleep(self._dt)
-            self._looked = time.clock_gettime(_CLOCK)
+            self._awake_at = time.clock_gettime(_CLOCK)
         self._hands_off = False
         return True
 
@@ -273,7 +273,7 @@ class Runtime:
             counts=self._counts,
             malformed=self._malformed,
             ranged=[source == "body" for source in ranging],
-            followed=None if self._goals is None else self._goals.news,
+            receipts=None if self._goals is None else self._goals.news,
         )
         self._be_there()
 
@@ -308,13 +308,13 @@ class Runtime:
         self.agent.health.mark_resumed(self._next, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
-    def _listen(self, t: float) -> None:
+    def _receive(self, t: float) -> None:
         """Receives all since the last tick."""
         agent = self.agent
-        outside = agent.health
-        outside.offline_since = self._cut_off_since(t)
+        health = agent.health
+        health.offline_since = self._cut_off_since(t)
         for _, there in self._conductor.changes():
-            outside.conductor_lost_since = np.inf if there else min(outside.conductor_lost_since, t)
+            health.conductor_lost_since = np.inf if there else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
@@ -384,7 +384,7 @@ class Runtime:
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
 
     def _inspect(self, row: int, t: float) -> messages.Inspection:
-        """What is known of the device of a row, with its last state."""
+        """Facts about the device of a row, with its last state."""
         known, state = inspect(self._body, row), self._state
         if state is None:
             return known
@@ -407,8 +407,8 @@ class Runtime:
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
-        self._joined, self._told = True, stopping
-        self._looked = time.clock_gettime(_CLOCK)
+        self._joined, self._reason_to_end = True, stopping
+        self._awake_at = time.clock_gettime(_CLOCK)
         self._watchdog.start()
         self._go_round(zero, stopping)
 
@@ -456,7 +456,7 @@ class Runtime:
 
     def _tick(self, t: float) -> None:
         begun = self.agent.decisions > 0
-        self._listen(t)
+        self._receive(t)
         state = self._body.read(t)
         self._airborne = some(state.flying)
         if (located := self._located) is not None:
@@ -510,15 +510,15 @@ class Runtime:
 
     def _act(self, actions: Actions) -> None:
         """Commands the body, motors-off first."""
-        duties = actions.commands
+        commands = actions.commands
         stale = self._make_sure()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
-        if duties is not None:
-            told = ((self._body.stop, duties.stop), (self._body.land, duties.land))
-            call_all(partial(order, rows) for order, rows in told if len(rows))
-            if len(duties.takeoff) and not overruled:
+        if commands is not None:
+            orders = ((self._body.stop, commands.stop), (self._body.land, commands.land))
+            call_all(partial(order, rows) for order, rows in orders if len(rows))
+            if len(commands.takeoff) and not overruled:
                 self._airborne = True
-                self._body.takeoff(duties.takeoff, self._assignment.hover[duties.takeoff])
+                self._body.takeoff(commands.takeoff, self._assignment.hover[commands.takeoff])
         if not overruled and not stale:
             self._body.command(actions.setpoint)
 

@@ -14,7 +14,7 @@ SOON_S: Final = 3600.0  # a common start further ahead results from a wrong cloc
 LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")
-PAUSED: Final = "told to hold"
+PAUSED: Final = "ordered to hold"
 
 Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the value of a parameter
 
@@ -42,7 +42,7 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
         case "resume":
             return _resume(agent, row), None
         case "leave":
-            agent.lifecycle.land(row, "told to leave")
+            agent.lifecycle.land(row, "ordered to leave")
         case "land":
             agent.lifecycle.land(row, LAND)
         case "stop":

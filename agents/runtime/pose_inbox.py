@@ -266,7 +266,7 @@ def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> Pos
 class PoseInbox(ModelledInbox):
     """Poses of all neighbours of the rows of a process."""
 
-    news: list[deque[messages.Heard]]  # (n) newest received poses of each row, for telemetry, which empties them
+    news: list[deque[messages.PoseReceipt]]  # (n) newest received poses of each row, for telemetry, which empties them
     received: list[int]  # (n) received poses of each row
 
     def __init__(
@@ -291,7 +291,7 @@ class PoseInbox(ModelledInbox):
             conditions or Conditions.ideal(len(links)), agent.neighbours,
             reach=reach, rate=agent.assignment.body_hz / agent.assignment.pose_every,
         )  # fmt: skip
-        self.news = [deque[messages.Heard](maxlen=NEWS) for _ in agent.assignment.names]
+        self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
         self.received = [0] * len(agent.assignment.names)
 
     def deliver(self, t: float, utc: float) -> None:
@@ -310,6 +310,6 @@ class PoseInbox(ModelledInbox):
         for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
             row, name = self._ends[link]
             self.news[row].append(
-                messages.Heard(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
+                messages.PoseReceipt(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
             )
             self.received[row] += 1

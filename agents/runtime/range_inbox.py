@@ -24,13 +24,13 @@ def message(robot: str, utc: float, scan: RangeScan) -> messages.Ranges:
     )
 
 
-def replace_rows(own: Rays | None, heard: Rays | None, rows: Index) -> Rays | None:
+def replace_rows(own: Rays | None, received: Rays | None, rows: Index) -> Rays | None:
     """The readings of the bodies, with those of `rows` replaced by received ones, or removed."""
     if own is None:
-        return heard
+        return received
     kept = ~np.isin(own.row, rows)
     parts = [Rays(own.row[kept], own.time[kept], own.bearing[kept], own.elevation[kept], own.distance[kept])]
-    parts += [heard] if heard is not None else []
+    parts += [received] if received is not None else []
     columns = ("row", "time", "bearing", "elevation", "distance")
     row, time, bearing, elevation, distance = (np.concatenate([getattr(rays, c) for rays in parts]) for c in columns)
     if not len(row):

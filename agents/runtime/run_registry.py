@@ -48,7 +48,7 @@ class Run(msgspec.Struct, frozen=True):
 
     @property
     def where(self) -> str:
-        """Its routers, for people."""
+        """Routers, for people."""
         return "a mesh" if topology.is_mesh(self.endpoints) else ", ".join(topology.bare(self.endpoints))
 
     @property

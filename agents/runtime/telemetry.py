@@ -73,7 +73,7 @@ class Telemetry:
         counts: Counts,
         malformed: Callable[[], int],
         ranged: Sequence[bool],
-        followed: Sequence[deque[messages.GoalReceipt]] | None = None,
+        receipts: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
         """Declares the publishers.
 
@@ -86,7 +86,7 @@ class Telemetry:
             counts: Kept by the runtime.
             malformed: Number of payloads that were refused, other than poses.
             ranged: (n) rows whose bodies measure ranges: those of the others come from the network already.
-            followed: Goals received by each row since the last state, removed here; None: no row is guided.
+            receipts: Goals received by each row since the last state, removed here; None: no row is guided.
         """
         self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
         self._encoding = encoding
@@ -99,18 +99,18 @@ class Telemetry:
             for name, own in zip(names, ranged, strict=True)
         ]
         self.utc = self.due = 0.0
-        self._followed = [deque[messages.GoalReceipt]() for _ in names] if followed is None else followed
-        self._told = 0
+        self._receipts = [deque[messages.GoalReceipt]() for _ in names] if receipts is None else receipts
+        self._seq = 0
         self._scanned = [-inf] * len(names)
         self._origin: list[messages.Setpoint | None] = [None] * len(names)
-        self._said: list[messages.Status | None] = [None] * len(names)
+        self._last: list[messages.Status | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
 
     def send_states(self, state: BodyState, actions: Actions, t: float) -> None:
         """Sends the state of every row, also of one whose position is unknown."""
-        self._told += 1
+        self._seq += 1
         agent = self._agent
         position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
         goal, setpoint, error = agent.goal.tolist(), actions.setpoint.tolist(), agent.error.tolist()
@@ -118,7 +118,7 @@ class Telemetry:
         for row, name in enumerate(self._names):
             message = messages.State(
                 name,
-                self._told,
+                self._seq,
                 self.utc + t,
                 WORDS[phase[row]],
                 messages.vector(position[row]),
@@ -133,12 +133,12 @@ class Telemetry:
                 _known_row(state.attitude, row),
                 _known_row(state.shadow_position, row),
                 _known_row(state.shadow_yaw, row),
-                list(self._followed[row]),
+                list(self._receipts[row]),
             )
             for payload in messages.payloads(message, self._encoding):
                 self._states[row].put(payload)
             self._neighbours.news[row].clear()
-            self._followed[row].clear()
+            self._receipts[row].clear()
 
     def send_ranges(self, state: BodyState) -> None:
         """Sends new range readings of the rows that measure them."""
@@ -189,7 +189,7 @@ class Telemetry:
                 body=state.notes[row] if state is not None and state.notes else "",
                 battery=battery if isfinite(battery) else None,
                 sent=counts.sent[row],
-                heard=self._neighbours.received[row],
+                received=self._neighbours.received[row],
                 lost={sender.name: sender.lost for sender in mine},
                 dropped=self._dropped_of(row),
                 stale={sender.name: sender.stale for sender in mine if sender.stale},
@@ -210,7 +210,7 @@ class Telemetry:
                 hazard=agent.hazards.worst(row),
                 incidents=list(self._incidents[row]),
             )
-            self._said[row] = status
+            self._last[row] = status
             self._statuses[row].put(messages.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
@@ -227,13 +227,13 @@ class Telemetry:
             print(f"{self._names[row]}: {incident.text}", flush=True)
         happened.clear()
 
-    def repeat_statuses(self, why: str, stamp: float) -> None:
-        """Repeats the last statuses with the reason `why`; from any thread, while the loop hangs."""
-        for publisher, status in zip(self._statuses, self._said, strict=True):
+    def repeat_statuses(self, reason: str, stamp: float) -> None:
+        """Repeats the last statuses with another `reason`; from any thread, while the loop hangs."""
+        for publisher, status in zip(self._statuses, self._last, strict=True):
             if status is not None:
                 phase = "landing" if status.phase in UNDER_WAY else status.phase
-                said = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=why)
-                publisher.put(messages.encode(said, self._encoding))
+                repeated = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=reason)
+                publisher.put(messages.encode(repeated, self._encoding))
 
     def _dropped_of(self, row: int) -> dict[str, int]:
         """Samples for a row that the modelled channel dropped, by neighbour."""
@@ -245,7 +245,7 @@ class Telemetry:
 
 
 def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
-    """One row of an optional column of the body's state, for a message; None if unknown."""
+    """A row of an optional column of the body's state, for a message; None if unknown."""
     if column is None or not np.isfinite(column[row]).all():
         return None
     value = column[row].tolist()

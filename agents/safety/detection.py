@@ -171,8 +171,8 @@ class Detector:
         self, neighbours: NeighbourStates, rows: RowStatus, health: ProcessHealth, seen: list[Observation]
     ) -> None:
         """Rows without a new pose of every alive neighbour, or a new goal, since the process was suspended."""
-        heard, links = neighbours.poses, self._assignment.links
-        silent = (heard.stamp < health.resumed_at) & np.isfinite(heard.stamp) & np.isinf(heard.lost_since)
+        poses, links = neighbours.poses, self._assignment.links
+        silent = (poses.stamp < health.resumed_at) & np.isfinite(poses.stamp) & np.isinf(poses.lost_since)
         waits = np.zeros(len(self._flies), dtype=bool)
         waits[links.receiver[silent]] = True
         if rows.goal_stamp is not None:
@@ -283,7 +283,7 @@ class Detector:
         if rows.without_neighbours is not None and some(rows.without_neighbours):
             seen.append(
                 Observation(
-                    Cause.ALONE, rows.without_neighbours & rows.cruising, lambda row: names(row) or "none was heard"
+                    Cause.ALONE, rows.without_neighbours & rows.cruising, lambda row: names(row) or "none was received"
                 )
             )
 

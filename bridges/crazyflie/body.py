@@ -25,7 +25,7 @@ from agents.protocols.crazyflie import (
     radio_loads,
 )
 from bridges.crazyflie.link import prepare
-from bridges.crazyflie.pilot import Pilot
+from bridges.crazyflie.pilot import CrazyfliePilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this
@@ -63,7 +63,7 @@ class CrazyflieBody:
         in_turn = max((len(on_it) for on_it in self._radios.values()), default=1)
         self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0 * in_turn
         self._pilots = [
-            Pilot(
+            CrazyfliePilot(
                 name,
                 where,
                 each,

@@ -17,9 +17,9 @@ from typing import Final
 
 from agents.body.interface import UNANSWERED
 from agents.body.kinds import CRAZYFLIE
-from agents.protocols.crazyflie import Settings
+from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, Status
-from bridges.crazyflie.link import Link
+from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.telemetry import Telemetry
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
@@ -68,9 +68,9 @@ AIRBORNE: Final = (Phase.CLIMBING, Phase.FLYING, Phase.LANDING, Phase.STOPPING)
 class Flight:
     """Flight control of one Crazyflie over its current link; called by its pilot's thread only, except `set_target`."""
 
-    def __init__(self, settings: Settings, telemetry: Telemetry, pause: Pause) -> None:
+    def __init__(self, settings: CrazyflieSettings, telemetry: Telemetry, pause: Pause) -> None:
         """`pause` waits for some seconds; it raises when the link is lost or a stop is ordered."""
-        self.link: Link  # current connection; a new one after a loss
+        self.link: CrazyflieLink  # current connection; a new one after a loss
         self.phase = Phase.GROUND
         self.trouble = ""  # last fault, for users; empty if none
         self._settings, self._telemetry, self._pause = settings, telemetry, pause
@@ -166,7 +166,7 @@ class Flight:
             return
         self._stream(now)
 
-    def keep_flying(self, now: float, link: Link) -> None:
+    def keep_flying(self, now: float, link: CrazyflieLink) -> None:
         """Stream the last setpoint over a link that is still being set up: the firmware does not wait for that."""
         if self.phase is Phase.FLYING:
             self.link = link

@@ -109,7 +109,7 @@ def _plain(table: Any) -> Any:  # noqa: ANN401 - cflib's
     return table
 
 
-class Link:
+class CrazyflieLink:
     """Connection to one Crazyflie; `prepare` must have been called."""
 
     def __init__(self, address: str) -> None:
@@ -167,7 +167,7 @@ class Link:
         waiting = getattr(self.cf.link, "out_queue", None)
         return waiting is not None and bool(waiting.full())
 
-    def open(self, deadline: float, end: threading.Event, meanwhile: Callable[[Link], None]) -> None:
+    def open(self, deadline: float, end: threading.Event, meanwhile: Callable[[CrazyflieLink], None]) -> None:
         """Connect; give up at `deadline` on the monotonic clock [s], or at `end`.
 
         `meanwhile` is called again and again once packets are exchanged.

@@ -9,10 +9,10 @@ from typing import Final
 
 from agents.arrays import Array
 from agents.body.interface import BodyError
-from agents.protocols.crazyflie import Outside, Settings
+from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
 from bridges.crazyflie.flight import STUTTER_S, Flight, Phase, Target
-from bridges.crazyflie.link import Link, LinkError, SilentError
+from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
 
@@ -36,14 +36,14 @@ class OrderReplaced(RuntimeError):
     """A stop has replaced the current order."""
 
 
-class Pilot:
+class CrazyfliePilot:
     """Thread and state of one drone."""
 
     def __init__(
         self,
         name: str,
         address: str,
-        settings: Settings,
+        settings: CrazyflieSettings,
         telemetry: Telemetry,
         *,
         place: tuple[Array, float],
@@ -55,7 +55,7 @@ class Pilot:
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
         self._start_pose, self._turn = place, turn
         self._flight = Flight(settings, telemetry, self._pause)
-        self._link: Link | None = None
+        self._link: CrazyflieLink | None = None
         self._connection_note = "connecting"
         self._order: Order | None = None
         self._lock = threading.Lock()
@@ -161,7 +161,7 @@ class Pilot:
         if not self.opened.is_set():
             self.failure = BodyError(f"{self._name}: {error}")
 
-    def _connect_in_turn(self) -> Link:
+    def _connect_in_turn(self) -> CrazyflieLink:
         """Connect for the first time when no other drone of the radio does; again at once, because it may fly.
 
         Then the tables of contents are read once for all, by a drone that has the radio for itself.
@@ -180,7 +180,7 @@ class Pilot:
         finally:
             self._turn.release()
 
-    def _connect(self) -> Link:
+    def _connect(self) -> CrazyflieLink:
         """Open a new link, in as many attempts as the time allows.
 
         Raises:
@@ -189,7 +189,7 @@ class Pilot:
         begin = time.monotonic()
         answered = False
         while True:
-            link = Link(self._address)
+            link = CrazyflieLink(self._address)
             try:
                 link.open(begin + self._settings.connect_s, self._ending, self._keep_flying)
             except SilentError as error:
@@ -204,7 +204,7 @@ class Pilot:
             else:
                 return link
 
-    def _keep_flying(self, link: Link) -> None:
+    def _keep_flying(self, link: CrazyflieLink) -> None:
         self._flight.keep_flying(time.monotonic(), link)
 
     def _remedy(self) -> str:
@@ -216,13 +216,13 @@ class Pilot:
             return "is the drone plugged in, switched on, and permitted (udev)?"
         return "is the simulation running there?"
 
-    def _discard(self, link: Link) -> None:
+    def _discard(self, link: CrazyflieLink) -> None:
         """Close a link in a thread of its own: closing takes a second."""
         closer = threading.Thread(target=link.close, name=f"closing {self._name}", daemon=True)
         closer.start()
         self._closers = [other for other in self._closers if other.is_alive()] + [closer]
 
-    def _prepare(self, link: Link) -> None:
+    def _prepare(self, link: CrazyflieLink) -> None:
         """Start the logs; set parameters and positioning, unless the drone is in the air.
 
         Raises:
@@ -261,7 +261,7 @@ class Pilot:
             self._converge(link)
             self._arrive()
 
-    def _converge(self, link: Link) -> None:
+    def _converge(self, link: CrazyflieLink) -> None:
         self._connection_note = "position estimate is settling"
         deadline = time.monotonic() + self._settings.converge_s
         absolute = self._settings.positioning is not None  # a Flow deck measures velocities
@@ -278,7 +278,7 @@ class Pilot:
         self._connection_note = ""
         self.opened.set()
 
-    def _serve(self, link: Link) -> None:
+    def _serve(self, link: CrazyflieLink) -> None:
         """Loop of the thread, until `close` or the loss of the link.
 
         Raises:
@@ -324,7 +324,7 @@ class Pilot:
         finally:
             self._flight.publish_airborne()
 
-    def _check(self, link: Link) -> None:
+    def _check(self, link: CrazyflieLink) -> None:
         if link.error is not None:
             raise LinkError(link.error)
         if link.gap > (RADIO_LOST_S if link.is_radio else LOST_S):
@@ -332,7 +332,7 @@ class Pilot:
         if self._telemetry.stamps.restarted:
             raise LinkError("it was switched off and on")
 
-    def _mend_gap(self, link: Link, now: float) -> None:
+    def _mend_gap(self, link: CrazyflieLink, now: float) -> None:
         """After a gap: hold or land, and log again. The link stays: its polls have gone on."""
         gap = link.take_gap() if link.is_radio else 0.0
         silent = now - max(self._telemetry.arrival, self._logs_at)
@@ -361,7 +361,7 @@ class Pilot:
                 return
             time.sleep(min(until - now, self._period))
 
-    def _forward_external_pose(self, link: Link, now: float) -> None:
+    def _forward_external_pose(self, link: CrazyflieLink, now: float) -> None:
         """Send external poses to the estimator on board at the rate set; start and end its convergence."""
         system = self._settings.positioning
         if not isinstance(system, Outside):

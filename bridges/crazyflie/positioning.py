@@ -16,8 +16,8 @@ from msgspec import Meta
 from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols import crtp
-from agents.protocols.crazyflie import Lighthouse, Loco, Outside, Settings
-from bridges.crazyflie.link import REPEAT_S, Link, LinkError
+from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside
+from bridges.crazyflie.link import REPEAT_S, CrazyflieLink, LinkError
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
 LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}
@@ -92,7 +92,7 @@ def stations(path: str, count: int) -> StationFile:
     return read
 
 
-def configure(link: Link, settings: Settings) -> None:
+def configure(link: CrazyflieLink, settings: CrazyflieSettings) -> None:
     """Choose the estimator and set up the positioning system.
 
     Raises:
@@ -117,7 +117,7 @@ def configure(link: Link, settings: Settings) -> None:
 class Convergence:
     """Reset of the position estimator and the wait until it has settled; never blocks."""
 
-    def __init__(self, link: Link, start: Array, yaw: float, *, absolute: bool) -> None:
+    def __init__(self, link: CrazyflieLink, start: Array, yaw: float, *, absolute: bool) -> None:
         """`start` (3,) [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw.
 
         `absolute`: positions are measured, so that their variance falls; a Flow deck measures velocities only.
@@ -160,7 +160,7 @@ class Convergence:
         self._variances.append(tuple(values.values()))
 
 
-def _lighthouse(link: Link, system: Lighthouse) -> None:
+def _lighthouse(link: CrazyflieLink, system: Lighthouse) -> None:
     from cflib.crazyflie import mem  # noqa: PLC0415 - an optional extra
     from cflib.localization.lighthouse_config_manager import LighthouseConfigWriter  # noqa: PLC0415
 
@@ -220,7 +220,7 @@ def _same_calibration(found: Mapping[int, Any], wanted: StationFile) -> bool:
     )
 
 
-def _loco(link: Link, system: Loco) -> None:
+def _loco(link: CrazyflieLink, system: Loco) -> None:
     from cflib.crazyflie.mem import MemoryElement  # noqa: PLC0415 - an optional extra
 
     memories = link.cf.mem.get_mems(MemoryElement.TYPE_LOCO2)
@@ -246,7 +246,7 @@ def _loco(link: Link, system: Loco) -> None:
         raise BodyError("no anchor knows its position: write positioning.anchors = [[x, y, z], ...]")
 
 
-def _anchors(link: Link, memory: Any) -> dict[int, tuple[float, float, float]]:  # noqa: ANN401 - cflib's
+def _anchors(link: CrazyflieLink, memory: Any) -> dict[int, tuple[float, float, float]]:  # noqa: ANN401 - cflib's
     """Positions [m] that the anchors report."""
     listed = _await_answer(link, memory.update_id_list, "list of anchors")
     if listed.nr_of_anchors == 0:
@@ -255,7 +255,7 @@ def _anchors(link: Link, memory: Any) -> dict[int, tuple[float, float, float]]: 
     return {number: anchor.position for number, anchor in read.anchor_data.items() if anchor.is_valid}
 
 
-def _await_answer(link: Link, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
+def _await_answer(link: CrazyflieLink, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
     """Call `ask` with a callback, and return the callback's argument.
 
     Raises:

@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.protocols.crtp import MM, Info, Power
-from bridges.crazyflie.link import Link
+from bridges.crazyflie.link import CrazyflieLink
 
 POSE: Final = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")} | {
     "stateEstimate.yaw": "FP16"  # two bytes are left of 26: a pose is one packet
@@ -136,7 +136,7 @@ class Telemetry:
         self.board.status_time[self.row] = -np.inf
         self.board.info[self.row] = 0
 
-    def start_logging(self, link: Link, *, log_hz: float, status_hz: float, ranges_hz: float | None) -> None:
+    def start_logging(self, link: CrazyflieLink, *, log_hz: float, status_hz: float, ranges_hz: float | None) -> None:
         """Start the log blocks that fill the board."""
         link.start_log("pose", log_hz, POSE, self._pose)
         link.start_log("status", status_hz, STATUS, self._status)

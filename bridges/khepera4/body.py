@@ -16,7 +16,7 @@ from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState,
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.drivers import awake
-from bridges.khepera4.link import Address, Link
+from bridges.khepera4.link import Address, Khepera4Link
 
 OPEN_S: Final = 3.0  # deadline of the first odometry
 
@@ -27,12 +27,14 @@ class KheperaBody:
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names
         self._addresses = [Address.parse(*row) for row in zip(request.names, request.addresses, strict=True)]
-        self._settings = [settings(protocol.Settings, *row) for row in zip(request.names, request.device, strict=True)]
+        self._settings = [
+            settings(protocol.Khepera4Settings, *row) for row in zip(request.names, request.device, strict=True)
+        ]
         self._claims = Claims(request.names, [address.device for address in self._addresses])
         self._start = np.column_stack([request.start[:, :2], request.yaw])
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._names))
-        self._links: list[Link] = []
+        self._links: list[Khepera4Link] = []
         self._read_at = -math.inf  # [s, `awake`] the state on which the next command is decided
 
     def open(self) -> None:
@@ -41,7 +43,7 @@ class KheperaBody:
         for name, address, device, (x, y, yaw) in zip(
             self._names, self._addresses, self._settings, self._start.tolist(), strict=True
         ):
-            self._links.append(Link(name, address, device, (x, y, yaw)))
+            self._links.append(Khepera4Link(name, address, device, (x, y, yaw)))
             self._links[-1].start()
         deadline, pause = time.monotonic() + OPEN_S, threading.Event()
         while time.monotonic() < deadline and any(
@@ -122,18 +124,18 @@ class KheperaBody:
         self._claims.release()
 
     @staticmethod
-    def _note(link: Link, now: float) -> str:
+    def _note(link: Khepera4Link, now: float) -> str:
         unanswered = UNANSWERED if link.unanswered(now) else ""
         return "; ".join(part for part in (unanswered, KheperaBody._trouble(link, now)) if part)
 
     @staticmethod
-    def _trouble(link: Link, now: float) -> str:
+    def _trouble(link: Khepera4Link, now: float) -> str:
         if link.trouble and link.odometry.stamp > -math.inf:
             return f"silent for {now - link.odometry.stamp:.1f} s: {link.trouble}"
         return link.trouble or (f"battery at {link.battery:.0%}: too low to drive" if link.battery_empty else "")
 
     @staticmethod
-    def _scan(link: Link, now: float, t: float) -> RangeScan | None:
+    def _scan(link: Khepera4Link, now: float, t: float) -> RangeScan | None:
         if link.scan is None:
             return None
         stamp, bearing, distance = link.scan

@@ -116,7 +116,7 @@ class Driver(Protocol):
 class Park:
     """A server of Robotic Park that obeys `d`; what else it does is in `protocol.PARK`."""
 
-    def __init__(self, wire: Wire, chosen: protocol.Settings, server: protocol.ParkServer) -> None:
+    def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, server: protocol.ParkServer) -> None:
         self._wire, self.server = wire, server
         self.ranged, self.patience_s = bool(chosen.ranges), chosen.silence_s
         self._number = re.compile(rf"[-+]?\d+\.\d{{{server.decimals}}}")
@@ -225,7 +225,7 @@ class GoalPark(Park):
     its loop drives again.
     """
 
-    def __init__(self, wire: Wire, chosen: protocol.Settings, server: protocol.ParkServer) -> None:
+    def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings, server: protocol.ParkServer) -> None:
         super().__init__(wire, chosen, server)
         self._theta = 0.0  # [rad] heading by the server's count
         self._placed = -math.inf  # [s] when the server was told its position
@@ -285,7 +285,7 @@ class GoalPark(Park):
             odometer.steps(self._speed[0] * since, self._speed[1] * since, time.monotonic())
 
 
-def identify(wire: Wire, chosen: protocol.Settings, server: str | None) -> Park:
+def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> Park:
     """Stop a park robot, and find out or make sure by the answer to `p` which `server` runs on it.
 
     Raises:
@@ -327,7 +327,7 @@ def _shown(answer: bytes) -> str:
 class KTeam:
     """K-Team's `kh4server`."""
 
-    def __init__(self, wire: Wire, chosen: protocol.Settings) -> None:
+    def __init__(self, wire: Wire, chosen: protocol.Khepera4Settings) -> None:
         self._wire = wire
         self.ranged, self.patience_s = chosen.ranges is not False, chosen.silence_s
 

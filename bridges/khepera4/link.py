@@ -75,7 +75,7 @@ class Address:
             )
         return cls(kteam, host, port or protocol.PARK_PORT, "", server)
 
-    def server_of(self, robot: str, chosen: protocol.Settings) -> str | None:
+    def server_of(self, robot: str, chosen: protocol.Khepera4Settings) -> str | None:
         """The server on the robot by its address and its `device` table; None if neither names one.
 
         Raises:
@@ -137,11 +137,11 @@ class Odometry:
     velocity: tuple[float, float] = (math.nan, math.nan)  # [m/s]
 
 
-class Link:
+class Khepera4Link:
     """Thread of one robot. Odometry and setpoint are exchanged as whole objects, so neither side waits."""
 
     def __init__(
-        self, name: str, address: Address, chosen: protocol.Settings, start: tuple[float, float, float]
+        self, name: str, address: Address, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
     ) -> None:
         self.odometry = Odometry()
         self.scan: tuple[float, Array, Array] | None = None  # monotonic time [s], bearings [rad], distances [m]

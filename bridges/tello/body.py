@@ -25,7 +25,7 @@ from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import FRESH_S, TROUBLE, BodyError, BodyRequest, BodyState, call_all, settings
 from agents.protocols import tello as protocol
-from bridges.tello.pilot import Duty, Pilot, Vendor
+from bridges.tello.pilot import Duty, TelloPilot, Vendor
 
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
 
@@ -36,7 +36,9 @@ class TelloBody:
     def __init__(self, request: BodyRequest) -> None:
         self._names, self._kinds = request.names, request.kinds
         self._endpoints = [protocol.endpoint(*row) for row in zip(request.names, request.addresses, strict=True)]
-        self._settings = [settings(protocol.Settings, *row) for row in zip(request.names, request.device, strict=True)]
+        self._settings = [
+            settings(protocol.TelloSettings, *row) for row in zip(request.names, request.device, strict=True)
+        ]
         for row, name in enumerate(self._names):
             if not request.external[row]:
                 raise BodyError(f'{name}: a Tello does not measure its position: write position = "external"')
@@ -47,7 +49,7 @@ class TelloBody:
         self._start_yaw = request.yaw
         self._external = External(rows)
         self._rows = np.arange(rows)
-        self._pilots: list[Pilot] = []
+        self._pilots: list[TelloPilot] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._last_read = -math.inf
@@ -62,7 +64,7 @@ class TelloBody:
             self._claims.release()
             raise
         self._pilots = [
-            Pilot(make(*place), kind, chosen)
+            TelloPilot(make(*place), kind, chosen)
             for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
         ]
         self._ending.clear()

@@ -53,10 +53,10 @@ class Duty(Enum):
     CUT = "motors off"
 
 
-class Pilot:
+class TelloPilot:
     """One drone: duty, commands sent, state received. Times are monotonic [s]."""
 
-    def __init__(self, drone: Vendor, kind: Kind, chosen: protocol.Settings) -> None:
+    def __init__(self, drone: Vendor, kind: Kind, chosen: protocol.TelloSettings) -> None:
         self._drone, self._kind, self._settings = drone, kind, chosen
         self.duty = Duty.REST
         self.state_received = -math.inf  # time of the last state; -inf before the first

@@ -39,7 +39,7 @@ class Robot:
         name, kind = request.names[row], request.kinds[row]
         if kind.name != "turtlebot3":
             raise BodyError(f"{name} is a {kind.name}; '{request.addresses[row]}' drives a turtlebot3")
-        chosen = settings(turtlebot3.Settings, name, request.device[row])
+        chosen = settings(turtlebot3.TurtleBot3Settings, name, request.device[row])
         where = turtlebot3.address(name, request.addresses[row], chosen)
         self.name, self.address, self.settings = name, where, chosen
         self.endpoints = (chosen.endpoint,) if chosen.endpoint else request.endpoints

@@ -68,11 +68,11 @@ def _rights(experiment: Experiment) -> Rights:
         own = [keys.below(name) for name in group]
         foreign, tokens = _ros_keys(group, experiment)
         grant = Grant(
-            say=[*own, *foreign],
-            hear=[*inputs, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
+            publish=[*own, *foreign],
+            subscribe=[*inputs, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
             answer=own,
-            reached=[keys.pose("*"), keys.order("*")],
-            be=[*own, *tokens],
+            queried=[keys.pose("*"), keys.order("*")],
+            tokens=[*own, *tokens],
             watch=[
                 *own,
                 *(keys.lives(keys.alive(other)) for other in others),
@@ -97,42 +97,47 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
     goals = _each(plan.guided, keys.goal)
     foreign, tokens = _ros_keys(names, experiment)
     everything = [keys.everything]
-    observer = Grant(hear=everything, ask=[keys.pose("*"), ADMIN], watch=everything)
+    observer = Grant(subscribe=everything, query=[keys.pose("*"), ADMIN], watch=everything)
     return {
         "observer": observer,
-        "recorder": Grant(hear=everything, watch=everything, be=[keys.recorder]),
+        "recorder": Grant(subscribe=everything, watch=everything, tokens=[keys.recorder]),
         "operator": Grant(
-            say=[keys.estop, keys.below("run")],
-            hear=everything,
-            ask=[keys.order("*"), keys.world_order, keys.run_order, *observer.ask],
+            publish=[keys.estop, keys.below("run")],
+            subscribe=everything,
+            query=[keys.order("*"), keys.world_order, keys.run_order, *observer.query],
             answer=[keys.run_order],
-            be=[keys.below("run")],
+            tokens=[keys.below("run")],
             watch=everything,
         ),
         "world": Grant(
-            say=[keys.below("world"), keys.event, *_each(far, keys.position, keys.truth), *_each(ranged, keys.ranges)],
-            hear=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
+            publish=[
+                keys.below("world"),
+                keys.event,
+                *_each(far, keys.position, keys.truth),
+                *_each(ranged, keys.ranges),
+            ],
+            subscribe=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
             answer=[keys.world_order],
-            be=[keys.below("world")],
+            tokens=[keys.below("world")],
             watch=[keys.lives(keys.alive("*")), keys.below("world")],
         ),
-        "positioning": Grant(say=_each(located, keys.position), watch=_each(measured, keys.alive)),
+        "positioning": Grant(publish=_each(located, keys.position), watch=_each(measured, keys.alive)),
         "twin": Grant(
-            say=[*_each(twins, keys.truth), *foreign],
-            hear=[*_each(measured, keys.truth), *foreign],
-            be=tokens,
+            publish=[*_each(twins, keys.truth), *foreign],
+            subscribe=[*_each(measured, keys.truth), *foreign],
+            tokens=tokens,
             watch=[*_each(measured, keys.alive), *tokens],
         ),
         "centre": Grant(
-            say=[keys.centre, *goals],
-            hear=[keys.pose("*"), keys.status("*")],
-            be=[keys.lives(keys.centre_alive)],
+            publish=[keys.centre, *goals],
+            subscribe=[keys.pose("*"), keys.status("*")],
+            tokens=[keys.lives(keys.centre_alive)],
             watch=[keys.lives(keys.alive("*")), keys.lives(keys.centre_alive)],
         ),
         "ros2": Grant(
-            say=[*goals, *foreign],
-            hear=[keys.state("*"), keys.status("*"), *foreign],
-            be=tokens,
+            publish=[*goals, *foreign],
+            subscribe=[keys.state("*"), keys.status("*"), *foreign],
+            tokens=tokens,
             watch=[keys.alive("*"), keys.centre_alive, *tokens],
         ),
     }
@@ -165,7 +170,7 @@ def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
     body = registry.body_name(robot.body)
     if body not in (*ROS, ROS_TWIN):
         return None
-    chosen = settings(turtlebot3.Settings, name, robot.device)
+    chosen = settings(turtlebot3.TurtleBot3Settings, name, robot.device)
     if chosen.endpoint is not None:
         return None
     return turtlebot3.twin(name, chosen) if body == ROS_TWIN else turtlebot3.address(name, robot.body, chosen)

@@ -46,6 +46,11 @@ class Codec(Generic[S]):
     decode: Callable[[bytes], S]  # the way back; raises `Undecodable`
 
 
+def type_name(kind: type[msgspec.Struct]) -> str:
+    """Name of the message type of a struct: its own, or the one that recordings have always had."""
+    return getattr(kind, "RECORDED_AS", kind.__name__)
+
+
 @cache
 def codec(kind: type[S]) -> Codec[S]:
     """The message type of a struct.
@@ -63,7 +68,7 @@ def codec(kind: type[S]) -> Codec[S]:
     encode, decode = writer.functions(rebuilt)
     first, *others = writer.definitions.items()
     texts = [first[1], *(f"MSG: {name}\n{text}" for name, text in others)]
-    return Codec(f"{PACKAGE}/msg/{kind.__name__}", SEPARATOR.join(texts), encode, decode)
+    return Codec(f"{PACKAGE}/msg/{type_name(kind)}", SEPARATOR.join(texts), encode, decode)
 
 
 SEPARATOR: Final = "=" * 80 + "\n"
@@ -117,12 +122,12 @@ class _Writer:
         assert isinstance(info, mi.StructType)
         if not info.fields:
             raise TypeError(f"{kind.__name__} has no fields; a ROS message needs at least one")
-        made, own = self._name("T", kind), f"{PACKAGE}/{kind.__name__}"
+        made, own = self._name("T", kind), f"{PACKAGE}/{type_name(kind)}"
         self.definitions[own] = self.definitions.get(own, "")  # before those inside it
         parts, lines = [], []
         for field in info.fields:
-            where, inner = f"{kind.__name__}.{field.name}", f"{value}.{field.name}"
-            if not FIELD.fullmatch(field.name):
+            where, inner, name = f"{kind.__name__}.{field.name}", f"{value}.{field.name}", field.encode_name
+            if not FIELD.fullmatch(name):
                 raise TypeError(f"{where}: ROS wants lower_snake_case")
             match field.type:
                 case mi.DictType(key_type=mi.StrType() as key, value_type=mi.IntType() as number):
@@ -131,11 +136,11 @@ class _Writer:
                         self._sequence(number, f"{inner}.values()", where),
                     )
                     parts.append(f"{field.name}=dict(zip({keys}, {values}))")
-                    lines += [f"string[] {field.name}_keys", f"int64[] {field.name}_values"]
+                    lines += [f"string[] {name}_keys", f"int64[] {name}_values"]
                 case _:
                     rebuilt, ros = self._visit(field.type, inner, where)
                     parts.append(f"{field.name}={rebuilt}")
-                    lines.append(f"{ros} {field.name}")
+                    lines.append(f"{ros} {name}")
         self.definitions[own] = "\n".join(lines) + "\n"
         return f"{made}({', '.join(parts)})"
 
@@ -143,7 +148,7 @@ class _Writer:
         """Puts the expression `value`; returns the expression that rebuilds it, and its type in ROS."""
         match kind:
             case mi.StructType(cls=cls):
-                return self.struct(cls, value), f"{PACKAGE}/{cls.__name__}"
+                return self.struct(cls, value), f"{PACKAGE}/{type_name(cls)}"
             case mi.StrType():
                 return self._text(value), "string"
             case mi.BoolType() | mi.IntType() | mi.FloatType():

@@ -93,14 +93,14 @@ class Correction:
         Goals are stamped by the central controller, which runs on the conductor's machine.
         """
         received = [
-            replace(each, stamp=self(each.speaker, each.stamp), arrived=self(state.robot, each.arrived))
-            for each in state.heard
+            replace(each, stamp=self(each.sender, each.stamp), arrived=self(state.robot, each.arrived))
+            for each in state.received
         ]
         receipts = [
             replace(each, pose=self(state.robot, each.pose), acted=self(state.robot, each.acted))
-            for each in state.followed
+            for each in state.goal_receipts
         ]
-        return replace(state, stamp=self(state.robot, state.stamp), heard=received, followed=receipts)
+        return replace(state, stamp=self(state.robot, state.stamp), received=received, goal_receipts=receipts)
 
     def status(self, status: Status) -> Status:
         """A status with its stamp and its start corrected."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.arrays import Index
 from agents.network.messages import Status
-from agents.network.validation import missed, said_within
+from agents.network.validation import missed, most_poses
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
@@ -60,7 +60,7 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
     recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
     before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
     number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
-    return max(0, min(last.sent - number, said_within(last.stamp - stamp, rate)))
+    return max(0, min(last.sent - number, most_poses(last.stamp - stamp, rate)))
 
 
 def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:

@@ -300,11 +300,11 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
     pairs = zip(ends.receiver.tolist(), ends.sender.tolist(), strict=True)
     links = {(receiver, names[sender]): link for link, (receiver, sender) in enumerate(pairs)}
     rows = [
-        (links[row, each.speaker], each.seq, each.stamp, each.arrived, *each.position, *each.velocity, math.nan, 0)
+        (links[row, each.sender], each.seq, each.stamp, each.arrived, *each.position, *each.velocity, math.nan, 0)
         for row, own in enumerate(states)
         for state in own
-        for each in state.heard
-        if (row, each.speaker) in links
+        for each in state.received
+        if (row, each.sender) in links
     ]
     return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
 
@@ -318,7 +318,7 @@ def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], 
         (each.acted, row, each.pose, each.seq, each.stamp)
         for row, own in enumerate(states)
         for state in own
-        for each in state.followed
+        for each in state.goal_receipts
     )
     acted = _table([(row, seq, stamp, at, *NOWHERE, *NOWHERE, math.nan, 0) for at, row, _, seq, stamp in receipts])
     pose = np.array([pose for _, _, pose, *_ in receipts], dtype=float).reshape(-1, 1) - start

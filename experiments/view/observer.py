@@ -162,8 +162,8 @@ class Observer:
             if self._keys.whose(key) == state.robot:
                 report = self._report(state.robot)
                 report.state, report.known = state, True
-                for each in state.heard:
-                    report.delay[each.speaker] = each.arrived - each.stamp
+                for each in state.received:
+                    report.delay[each.sender] = each.arrived - each.stamp
 
     def watch_ranges(self, *, wanted: bool) -> None:
         """Receives range readings, or receives them no more."""

@@ -85,7 +85,7 @@ def centre_report(goals: Goals, names: Sequence[str], duration: float) -> messag
         decisions=len(np.unique(goals.sent.stamp)),
         missed=0,
         goals=len(goals.sent),
-        heard=dict(zip(names, goals.received.tolist(), strict=True)),
+        received=dict(zip(names, goals.received.tolist(), strict=True)),
         lost=dict.fromkeys(names, 0),
         dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
         malformed=0,
@@ -257,20 +257,22 @@ class Logbook:
                         messages.heading(true_yaw[row]),
                         received.get((k, row), []),
                         **{what: each and _known(each[row]) for what, each in zip(OPTIONAL, more, strict=True)},
-                        followed=receipts.get((k, row), []),
+                        goal_receipts=receipts.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
                 ],
             )
 
-    def _received_by_sample(self) -> dict[tuple[int, int], list[messages.Heard]]:
+    def _received_by_sample(self) -> dict[tuple[int, int], list[messages.PoseReceipt]]:
         names, got = self._log.names, self._received
         sample = np.searchsorted(self._log.time, got.arrival - ROUNDING_S)
         receiver, sender = self._links.receiver[got.link], self._links.sender[got.link]
-        found: dict[tuple[int, int], list[messages.Heard]] = {}
+        found: dict[tuple[int, int], list[messages.PoseReceipt]] = {}
         columns = (sample, receiver, sender, got.seq, got.stamp, got.arrival, got.position, got.velocity)
         for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
-            news = messages.Heard(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
+            news = messages.PoseReceipt(
+                names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves)
+            )
             found.setdefault((k, row), []).append(news)
         return found
 
@@ -292,7 +294,7 @@ class Logbook:
                     body="",
                     battery=None,
                     sent=int(sent[done][row]),
-                    heard=int(received[done][row]),
+                    received=int(received[done][row]),
                     lost={log.names[s]: 0 for s in self._links.sender[mine].tolist()},
                     dropped={log.names[s]: n for s, n in each if n},
                     malformed=0,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from agents.network.messages import Contact, Event, Heard, ObstaclePose, Pose, State, Status, WorldState
+from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
 from experiments.definition.experiment import Experiment, Formation, Rates, Robot
 from experiments.recording.writer import Recording
 
@@ -52,7 +52,7 @@ def status(
         body="",
         battery=None,
         sent=sent,
-        heard=0,
+        received=0,
         lost=lost or {},
         dropped=dropped or {},
         malformed=0,
@@ -123,10 +123,10 @@ def whole_run():
     for k in range(11):
         at = k / 10
         pose_heard = ((at - 0.05, 0.0, 0.0), (1.0, 0.0, 0.0))
-        heard = [Heard("TB01", k, START + at - 0.05, START + at - 0.04, *pose_heard)] if k else []
+        heard = [PoseReceipt("TB01", k, START + at - 0.05, START + at - 0.04, *pose_heard)] if k else []
         messages += [
             state("TB01", k + 1, at, at, true_position=(at, 0.0, 0.01), true_yaw=0.1),
-            state("CF01", k + 1, at, -at, heard=heard),
+            state("CF01", k + 1, at, -at, received=heard),
             pose("TB01", k + 1, at, at),
         ]
     return [

@@ -14,9 +14,9 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
     """By the name of its key what a robot says, with stamps so far ahead of now [s]."""
     now = time.time() + ahead
     place, rest = (-0.5, -0.4, 0.0), (0.0, 0.0, 0.0)
-    heard = messages.Heard("KH02", seq, now, now, place, rest)
+    heard = messages.PoseReceipt("KH02", seq, now, now, place, rest)
     status = messages.Status(
-        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, heard=2,
+        robot=robot, stamp=now, phase="running", reason="", body="", battery=0.5, sent=seq, received=2,
         lost={"KH01": 1}, dropped={"KH02": 1}, malformed=0, refused=0, ticks=5, missed=1,
         decisions=2, interventions=0, avoided=0, late_s=0.001, started=now - 1.0, missing=["KH02"],
         pid=1, cpu_s=0.1, rss_mb=60.0, hazard="hold: ordered to hold",
@@ -32,7 +32,7 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
         "pose": [messages.Pose(robot, seq + k, now + 0.01 * k, place, rest, 0.1) for k in range(2)],
         "state": [
             messages.State(robot, seq, now, "running", place, rest, 0.1, place, (0.1, 0.2, 0.0, 0.0), 0.1, place,
-            0.1, [heard], followed=[messages.GoalReceipt(seq, now, now, now)]),
+            0.1, [heard], goal_receipts=[messages.GoalReceipt(seq, now, now, now)]),
             messages.State(robot, seq, now, "idle", place, rest, 0.1, None, None, 0.1, attitude=(1.0, 0.0, 0.0, 0.0)),
         ],
         "status": [status],
@@ -60,7 +60,7 @@ def of_all() -> dict[str, list[object]]:
     )  # fmt: skip
     centre = messages.CentreState(
         stamp=now, robots=["KH01"], missing=["KH02"], load=0.1, late_s=0.001, decisions=5, missed=1, goals=5,
-        heard={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
+        received={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     orders = [
         messages.WorldOrder("pause"), messages.WorldOrder("resume"), messages.WorldOrder("step", steps=3),

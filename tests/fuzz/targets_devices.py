@@ -97,11 +97,11 @@ def khepera_bridge() -> Iterator[Target]:
         odometer = Odometer(0.0, 0.0, 0.0)
         driver: Park | KTeam
         if which[:1] == b"k":
-            driver = KTeam(line, khepera4.Settings())
+            driver = KTeam(line, khepera4.Khepera4Settings())
         else:
             gap, khepera4.GAP_S = khepera4.GAP_S, 0.0  # type: ignore[misc]  # without the pauses
             try:
-                driver = identify(line, khepera4.Settings(), named.get(which[:1]))
+                driver = identify(line, khepera4.Khepera4Settings(), named.get(which[:1]))
                 driver.begin()
                 driver.drive(0.1, 0.2)
                 driver.move(odometer)

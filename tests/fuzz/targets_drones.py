@@ -159,8 +159,8 @@ class Drone:
 def tello_pilot() -> Iterator[Target]:
     """A drone's state lines and answers: state and answer with a zero byte between them."""
     from agents.body.kinds import KINDS  # noqa: PLC0415
-    from agents.protocols.tello import Settings  # noqa: PLC0415
-    from bridges.tello.pilot import Pilot  # noqa: PLC0415
+    from agents.protocols.tello import TelloSettings  # noqa: PLC0415
+    from bridges.tello.pilot import TelloPilot  # noqa: PLC0415
 
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
         sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.body`
@@ -179,7 +179,7 @@ def tello_pilot() -> Iterator[Target]:
 
     def make():
         drone = Drone()
-        pilot = Pilot(drone, KINDS["tello"], Settings())
+        pilot = TelloPilot(drone, KINDS["tello"], TelloSettings())
         pilot.position = (0.0, 0.0, 0.5)
         now = 100.0
 

@@ -349,7 +349,7 @@ def words() -> Iterator[Target]:
     from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
     from twins.devices.device import Faults  # noqa: PLC0415
 
-    kinds = (crazyflie.Settings, khepera4.Settings, tello.Settings, turtlebot3.Settings)
+    kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
 
     def device(text: str) -> None:
         table = msgspec.json.decode(text) if text.count("[") + text.count("{") < 500 else {}
@@ -368,7 +368,7 @@ def words() -> Iterator[Target]:
             "crazyflie": lambda text: crazyflie.address("R1", text),
             "khepera": lambda text: Address.parse("R1", text),
             "tello": lambda text: tello.endpoint("R1", text),
-            "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.Settings()),
+            "turtlebot": lambda text: turtlebot3.address("R1", text, turtlebot3.TurtleBot3Settings()),
             "vicon": parse_server,
             "faults": lambda text: msgspec.json.decode(text, type=Faults),
             "device": device,

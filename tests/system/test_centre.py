@@ -120,10 +120,12 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     at = time.time() + 0.3
     for name in watcher.status:
         assert watcher.order(name, messages.Order("start", at=at)).ok
-    watcher.until(lambda: watcher.state["KH01"].phase == "running" and watcher.state["KH01"].followed, "it is guided")
+    watcher.until(
+        lambda: watcher.state["KH01"].phase == "running" and watcher.state["KH01"].goal_receipts, "it is guided"
+    )
 
     refused = watcher.status["KH01"].malformed
-    late = watcher.state["KH01"].followed[-1]
+    late = watcher.state["KH01"].goal_receipts[-1]
     assert 0.0 < late.acted - late.pose < 0.5
     now = time.time()
     nonsense = (
@@ -147,7 +149,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
         reports.extend(
             messages.decode(each.payload.to_bytes(), str(each.encoding), messages.CentreState) for each in came
         )
-        return bool(reports) and reports[-1].heard["KH01"] > 0  # the first may be from before the run
+        return bool(reports) and reports[-1].received["KH01"] > 0  # the first may be from before the run
 
     watcher.until(reported, "the centre says how it is, and that it hears KH01")
     assert (reports[-1].robots, reports[-1].missing) == (["TB01", "KH01", "KH02"], [])
@@ -177,7 +179,9 @@ def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
     flight.children()["router"].kill()
     flight.until_said(r"router conductor: the router ended \(killed by SIGKILL\); started again")
     again = time.time()
-    watcher.until(lambda: watcher.state["KH01"].followed and watcher.state["KH01"].stamp > again, "it is guided again")
+    watcher.until(
+        lambda: watcher.state["KH01"].goal_receipts and watcher.state["KH01"].stamp > again, "it is guided again"
+    )
     with network.open_session([flight.endpoint()], name="KH02") as session:
         before = watcher.status["KH01"].malformed
 

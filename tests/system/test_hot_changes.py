@@ -124,7 +124,7 @@ def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     watcher = lab.watcher
     said = lab.zenpark("pause", "CF01")
     assert (said.returncode, said.stdout) == (0, "CF01: holds where it is\n"), said.stderr
-    watcher.until(lambda: watcher.status["CF01"].reason == "told to hold", "its status says so")
+    watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
     assert lab.running("KH01", "KH02", "CF01")
     assert lab.change("resume", "CF01").done == {"CF01": "goes on"}
     watcher.until(lambda: watcher.status["CF01"].reason == "", "it goes on")
@@ -133,7 +133,7 @@ def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     assert "removed" in lab.change("remove", "KH02").done["KH02"]
     watcher.until(lambda: "KH02" not in watcher.alive, "its process is over")
     watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
-    assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "told to leave")
+    assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
     assert lab.running("KH01", "CF01"), "the others go on"
     assert "removed" in lab.change("pause", "KH02").refused["KH02"]
     assert "takes part" in lab.change("add", "KH02").done["KH02"], "who was removed may come back"

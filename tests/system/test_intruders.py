@@ -286,7 +286,7 @@ def test_samples_that_are_said_again_are_not_believed_again(laboratory: Laborato
     after = laboratory.statuses()
     for name in ("KH02", "CF01"):
         said = sum(after[other].sent - flight.before[other].sent for other in FLOWN if other != name)
-        twice = after[name].heard - flight.before[name].heard - said
+        twice = after[name].received - flight.before[name].received - said
         assert twice < 120 < 20 * len(taken), "each once, give or take the age of a status"
 
 

@@ -156,8 +156,8 @@ def test_robots_go_on_with_their_new_files_where_those_are_put(laboratory: Labor
     laboratory.fly()
     authority.revoke(laboratory.folder, ["KH01", "KH03"])
     watcher = laboratory.watcher
-    before = {name: status.heard for name, status in laboratory.statuses().items()}
-    watcher.until(lambda: all(watcher.status[name].heard > before[name] + 100 for name in before), "all hear again")
+    before = {name: status.received for name, status in laboratory.statuses().items()}
+    watcher.until(lambda: all(watcher.status[name].received > before[name] + 100 for name in before), "all hear again")
     for name, status in laboratory.statuses().items():
         assert status.phase == "running", (name, status.reason)
     assert watcher.order("CF01", messages.Order("land")).ok

@@ -90,7 +90,7 @@ def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
         before = watcher.status["CF01"].pid
         again = fly(stack, router, "triangle", "CF01")
         watcher.until(lambda: watcher.status["CF01"].pid not in (before,) and watcher.phase("CF01") == "ready", "back")
-        assert watcher.status["CF01"].heard >= 2
+        assert watcher.status["CF01"].received >= 2
         watcher.until(lambda: not watcher.status["KH01"].missing, "it is heard again")
         assert again.process.poll() is None
 

@@ -169,7 +169,7 @@ class Observer:
         for truth in self._truths.read():
             self.invariants.place(truth.robot, truth.position)
         for state in self._states.read():
-            self.received_at |= {(state.robot, pose.speaker): now for pose in state.heard}
+            self.received_at |= {(state.robot, pose.sender): now for pose in state.received}
             if state.true_position is not None:
                 self.invariants.place(state.robot, state.true_position)
         for command in self._commands.read():

@@ -50,7 +50,7 @@ class Receiver:
         self.status |= {status.robot: status for status in self._statuses.read()}
         for state in self._states.read():
             if state.phase == "running":
-                self.delays[state.robot] += [pose.arrived - pose.stamp for pose in state.heard]
+                self.delays[state.robot] += [pose.arrived - pose.stamp for pose in state.received]
 
     def sampled(self, row: Row) -> Row:
         """The row of a process with the counters of its robots, whose delays begin anew; others stay as they are."""

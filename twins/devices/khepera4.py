@@ -299,7 +299,7 @@ class KheperaDevice:
 
     def __init__(self, request: DeviceRequest) -> None:
         body, self._faults = request.body, request.faults
-        chosen = [settings(protocol.Settings, *row) for row in zip(body.names, body.device, strict=True)]
+        chosen = [settings(protocol.Khepera4Settings, *row) for row in zip(body.names, body.device, strict=True)]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
         self._model = Differential(body.kinds, body.start, body.yaw, self._dt)

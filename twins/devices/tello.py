@@ -113,7 +113,7 @@ class TelloDevice:
         body = request.body
         count = len(body.names)
         for name, table in zip(body.names, body.device, strict=True):
-            settings(protocol.Settings, name, table)
+            settings(protocol.TelloSettings, name, table)
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
         self._model = Quadrotor(body.kinds, body.start, body.yaw, self._dt)

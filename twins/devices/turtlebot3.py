@@ -24,7 +24,7 @@ from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
-from agents.protocols.turtlebot3 import Address, Settings
+from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
 from twins.devices.device import Device, DeviceRequest, Faults
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
@@ -95,7 +95,7 @@ class TurtleBot3Twin:
             for row, name in enumerate(body.names):
                 if body.kinds[row].name != "turtlebot3":
                     raise BodyError(f"{name} is a {body.kinds[row].name}, this is the twin of a turtlebot3")
-                chosen = settings(Settings, name, body.device[row])
+                chosen = settings(TurtleBot3Settings, name, body.device[row])
                 where = turtlebot3.twin(name, chosen)
                 endpoints = (chosen.endpoint,) if chosen.endpoint else body.endpoints
                 which = (endpoints, where.style, where.distro, where.domain)
@@ -283,7 +283,9 @@ class TurtleBot3Twin:
             self._publish(row.battery, row.types, message, t)
 
 
-def _row(participant: Participant, where: Address, chosen: Settings, start: tuple[float, float, float]) -> _Row:
+def _row(
+    participant: Participant, where: Address, chosen: TurtleBot3Settings, start: tuple[float, float, float]
+) -> _Row:
     """The node of one robot."""
     kind = turtlebot3.command_type(where.distro, chosen.stamped)
     node = participant.node("turtlebot3_node", where.namespace)

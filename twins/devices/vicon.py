@@ -264,6 +264,18 @@ class TwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     faults: Annotated[str, Meta(title="JSON", description="such as '{\"occluded_from_s\": 5}'")] = "{}"
 
 
+def parse_address(text: str) -> tuple[str, int]:
+    """Host and port of "HOST:PORT".
+
+    Raises:
+        ValueError: If it is none.
+    """
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and int(port) < 65536):
+        raise ValueError(f"'{text}' is not HOST:PORT, such as 127.0.0.1:801")
+    return host, int(port)
+
+
 def run(launch: TwinLaunch) -> int:
     """Runs the twin until a signal, or until its lifeline is lost and the robots are gone; returns the exit code.
 
@@ -271,9 +283,7 @@ def run(launch: TwinLaunch) -> int:
         ValueError: If its address or its faults are malformed.
         Unreachable: If no router answers.
     """
-    host, _, port = launch.listen.rpartition(":")
-    if not (host and port.isascii() and port.isdigit() and int(port) < 65536):
-        raise ValueError(f"'{launch.listen}' is not HOST:PORT, such as 127.0.0.1:801")
+    host, port = parse_address(launch.listen)
     faults = msgspec.json.decode(launch.faults, type=Faults)
     stop, lost = threading.Event(), threading.Event()
     if launch.lifeline:
@@ -292,7 +302,7 @@ def run(launch: TwinLaunch) -> int:
                 rng=rng,
                 faults=faults,
                 host=host,
-                port=int(port),
+                port=port,
             )
         except OSError as error:
             raise ValueError(f"cannot listen on {launch.listen}: {error.strerror}; choose another port") from None

@@ -14,7 +14,7 @@ from experiments.real_time.hosts.launcher import Launcher, Process
 
 @dataclass(frozen=True)
 class CaseContext:
-    """One case of a run, where its files go, and the means to run it."""
+    """Case of a run, the place of its files, and the means to run it."""
 
     experiment: Experiment  # overrides applied
     case: str  # its name, with which the names of its processes and files begin

@@ -1,7 +1,7 @@
-"""The processes of one case: recorder, stand-ins for hardware, robots, and the router that all of them meet at.
+"""Processes of one case: recorder, stand-ins for hardware, robots, routers.
 
-Robots are started on the machines that the file says, or by others; all else runs on the launcher's, whose clock is the
-one of the experiment.
+Robots are started on the machines that the file names, or by others; all else runs on the launcher's, whose clock is
+that of the experiment.
 """
 
 from __future__ import annotations
@@ -25,19 +25,17 @@ from experiments.real_time.conductor.support import Servants
 from experiments.real_time.hosts.hosts import STATION
 from experiments.real_time.hosts.launcher import LAND_S, Process
 
-ALONE_S: Final = 3.0  # a robot that joins a run under way does not wait longer for neighbours that say nothing
+ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
 
 
 @dataclass(frozen=True)
 class Death:
-    """A process has ended that should not have: what it was, whom it concerns, what is done.
+    """Unexpected end of a process."""
 
-    `kind` is "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol
-    twin), or what was started again.
-    """
-
+    # "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or the role of
+    # a process that was started again
     kind: str
-    source: str
+    source: str  # robot or host concerned, or "conductor"
     text: str
 
 
@@ -45,7 +43,7 @@ class CaseProcesses:
     """Starts, watches and ends the processes of one case."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Nothing is started yet."""
+        """Start nothing yet."""
         self._context = context
         self._launcher = context.launcher
         self._groups: dict[str, list[str]] = {}  # by process, without the case
@@ -76,7 +74,7 @@ class CaseProcesses:
         self._centre = self._servants.start_centre()
 
     def adopt(self, there: Iterable[str]) -> list[str]:
-        """Robots that are `there` are nobody's to start, nor are those of hosts without address; returns them all."""
+        """Adopt robots that are `there`, and those of hosts without address, which are not started; returns all."""
         self.adopted = {*there, *self.away}
         return sorted(self.adopted)
 
@@ -89,13 +87,10 @@ class CaseProcesses:
                 self._start(missing, self._addressed, self._reached)
 
     def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
-        """Start the process of some robots while the run is under way.
+        """Start the process of the robots `names` while the run is under way.
 
-        They are told to be ready without neighbours that say nothing, which may be out of the run as well.
-
-        Args:
-            names: All robots of a process, of which none runs.
-            bodies: What has become of them: other robots, which have these names from now on.
+        They are ready without silent neighbours, which may be out of the run as well. `bodies` are other robots, which
+        have these names from now on.
         """
         robots = {**self._reached.robots, **(bodies or {})}
         for name in bodies or {}:
@@ -105,28 +100,28 @@ class CaseProcesses:
         self._reached = msgspec.structs.replace(self._reached, robots=robots)
         begin = msgspec.structs.replace(self._reached.start, missing="go-on", deadline_s=ALONE_S)
         safety = msgspec.structs.replace(self._reached.safety, start_within=0.0)  # it begins where it came down
-        told = msgspec.structs.replace(self._reached, start=begin, safety=safety)
-        fresh = self._joining.with_suffix(".new")  # who is just being started reads the one or the other
-        fresh.write_bytes(write_json(told))
+        joining = msgspec.structs.replace(self._reached, start=begin, safety=safety)
+        fresh = self._joining.with_suffix(".new")  # a process that is just starting reads the one or the other
+        fresh.write_bytes(write_json(joining))
         fresh.replace(self._joining)
         self.adopted -= {*names}
-        self._start(names, self._joining, told)
+        self._start(names, self._joining, joining)
 
-    def _start(self, names: Sequence[str], file: Path, told: Experiment) -> None:
+    def _start(self, names: Sequence[str], file: Path, experiment: Experiment) -> None:
         group = self._group(names[0])
         station, process = self._context.hosts.station_of(names[0]), self._process(group)
         if station is not None:
-            told_case = document.case_document(told)
-            self._abroad[f"{station.name}/{group}"] = station.start(process, names, told_case, self._launcher)
+            case = document.case_document(experiment)
+            self._abroad[f"{station.name}/{group}"] = station.start(process, names, case, self._launcher)
         else:
             self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
 
     def robot(self, name: str) -> Robot:
-        """A robot as it is now: another one may have its name, and its body an address that the file does not know."""
+        """The robot of a name now: it may be another one, at an address that the file does not know."""
         return self._reached.robots[name]
 
     def place(self, name: str, robot: Robot | None = None) -> Array:
-        """Where a robot is put (2,) [m], or where `robot` would be under its name."""
+        """Start of a robot (2,) [m], or of `robot` under its name."""
         robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
         position, _ = bodies.scattered_poses(
             msgspec.structs.replace(self._reached, robots=robots), [name], self._context.experiment.seed
@@ -134,7 +129,7 @@ class CaseProcesses:
         return np.asarray(position[0, :2])
 
     def companions(self, name: str) -> list[str]:
-        """The robots of the same process, itself among them."""
+        """Robots of the same process, itself included."""
         return list(self._groups[self._group(name)])
 
     def runs(self, name: str) -> bool:
@@ -146,13 +141,13 @@ class CaseProcesses:
         self._launcher.release(self._process(self._group(name)))
 
     def kill(self, name: str) -> None:
-        """End the process of a robot that follows nothing else."""
+        """Kill the process of a robot that ignores its lifeline."""
         self._launcher.kill(self._process(self._group(name)))
 
     def end(self) -> None:
         """End all but the router: robots land first, and the recorder sees it."""
         self.end_robots()
-        self._launcher.end(self._centre, grace_s=2.0)  # its last word is recorded
+        self._launcher.end(self._centre, grace_s=2.0)  # its last report is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
         self._launcher.end(self._standins, grace_s=2.0)
 
@@ -161,7 +156,7 @@ class CaseProcesses:
         self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
 
     def deaths(self) -> Iterator[Death]:
-        """What has died since the last call; router, world, centre and positioning are started again, a few times."""
+        """Processes that ended since the last call; router, world, centre and positioning restart, a few times."""
         for process in self._launcher.died():
             again = self._servants.again(process)
             if again is not None:
@@ -180,7 +175,7 @@ class CaseProcesses:
                     yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
 
     def output(self) -> Iterator[tuple[str, str]]:
-        """What processes on other machines have printed since the last call: where, and the line."""
+        """Lines that processes on other machines have printed since the last call, each with its place."""
         for place, process in self._abroad.items():
             for line in process.news():
                 yield place, line
@@ -209,5 +204,5 @@ class CaseProcesses:
 
 
 def _because(process: Process) -> str:
-    """Its last words, behind a colon."""
+    """Last line of its output, behind a colon."""
     return "".join(f": {line}" for line in process.tail().strip().splitlines()[-1:])

@@ -31,7 +31,7 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.conductor.run_view import Shown
-from experiments.real_time.conductor.support import divided
+from experiments.real_time.conductor.support import make_routers
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE
@@ -39,13 +39,12 @@ from experiments.recording.run_folder import SOURCE
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How an experiment is put on, as far as its file leaves that open."""
+    """Options of a run that its file leaves open."""
 
-    cases: Sequence[str] = ()  # which of its cases; all if none is named
-    # what every robot is put into instead of the body that the file gives it: "twin", "world", or "protocol" for its
-    # real bridge and a protocol twin
+    cases: Sequence[str] = ()  # names of its cases; all if none is named
+    # body of every robot instead of the file's: "twin", "world", or "protocol" for its real bridge and a protocol twin
     bodies: str | None = None
-    here: bool = False  # whether all robots run on this machine, whatever the file says of hosts
+    here: bool = False  # whether all robots run on this machine, whatever hosts the file has
     lab: str | None = None  # folder of certificates, instead of the file's
     identity: str = "operator"  # whose certificate the conductor shows, in a lab: an operator's
 
@@ -65,16 +64,16 @@ def conduct(
 
     Args:
         read: The experiment.
-        folder: Where recordings and logs go; it exists.
-        staging: What the file leaves open.
+        folder: For recordings and logs; it exists.
+        staging: Options that the file leaves open.
         show: Shows the progress.
-        interrupted: Asked whether the user wants to end: everybody lands, and what was recorded is kept.
-        emergency: Hears emergency stops; after one no further case begins.
+        interrupted: Whether the user wants to end: all robots land, and what was recorded is kept.
+        emergency: Receives emergency stops; after one no further case begins.
         launching: Makes the launcher of the processes, given the folder of their logs.
-        tell: Takes what the user should know before it begins.
+        tell: Receives notes for the user before the start.
 
     Returns:
-        The recordings of the cases that have begun, and what the reader should know.
+        The recordings of the cases that have begun, and notes for the reader.
 
     Raises:
         LabError: If a certificate is missing.
@@ -173,12 +172,12 @@ def staged(
     )  # fmt: skip
     with run_registry.registered(me) as unlisted, launching(folder / "logs") as launcher:
         tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
-        for router in divided(listening, network.routers) if own_router else ():
+        for router in make_routers(listening, network.routers) if own_router else ():
             router.start(launcher, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
-        # of a mesh nobody is there yet: only the session of each case hears it there
+        # a mesh has no members yet: only the session of each case receives stops there
         keys = Keys(network.realm)
-        hears = (
+        stops = (
             nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
         )
 
@@ -198,7 +197,7 @@ def staged(
             )
 
         stage = Stage(context)
-        with hears:
+        with stops:
             yield stage
         stage.left += hosts.sweep()
 
@@ -206,11 +205,11 @@ def staged(
 def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
     """Robots of some cases by name, with the address of those that are hardware, and the host on which they run."""
     found: dict[str, str] = {}
-    stood_in = {"twin", bodies.WORLD, "external", *plugins.names(plugins.DEVICES)}
+    simulated = {"twin", bodies.WORLD, "external", *plugins.names(plugins.DEVICES)}
     for case in cases:
         hosts = {robot: host for host, each in case.hosts.items() for robot in each.robots}
         for name, robot in case.robots.items():
-            if plugins.body_name(robot.body) in stood_in:
+            if plugins.body_name(robot.body) in simulated:
                 found.setdefault(name, "")
             else:
                 device = f" {json.dumps(robot.device, sort_keys=True)}" if robot.device else ""
@@ -219,12 +218,12 @@ def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
 
 
 def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
-    """What there is to say of runs that are up beside one and have robots of the same names.
+    """Notes on other runs that are up and have robots of the same names.
 
     Raises:
         DocumentError: If a robot of the run is hardware that another one has.
     """
-    said = []
+    notes = []
     for other in others:
         if (other.pid, other.born) == (me.pid, me.born) or not other.alive:
             continue
@@ -244,8 +243,8 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
                 ]
             )  # fmt: skip
         if same := sorted(me.robots.keys() & other.robots.keys()):
-            said.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
-    return said
+            notes.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
+    return notes
 
 
 def _has(other: run_registry.Run, name: str, body: str) -> bool:
@@ -258,12 +257,12 @@ def _has(other: run_registry.Run, name: str, body: str) -> bool:
 def write_rights(
     cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
 ) -> Path | None:
-    """Who may do what, as a file for the router; None without a lab.
+    """Rights of all identities, as a file for the router; None without a lab.
 
     Robots on hosts have their certificates there, and need none here.
 
     Raises:
-        LabError: If a certificate is missing, or somebody else's.
+        LabError: If a certificate is missing, or of another role.
     """
     of = lab_of(endpoints)
     if of is None:
@@ -274,7 +273,7 @@ def write_rights(
     if role != "operator":
         raise LabError(f"{operator} is {role} in the lab, and gives no orders: choose an operator with --as")
     made = access_rights.rights(cases)
-    rules(made, known)  # what is wrong with it is said now, and not by a router that does not start
+    rules(made, known)  # errors are raised now, not by a router that does not start
     file = folder / "rights.json"
     file.write_bytes(msgspec.json.format(msgspec.json.encode(made), indent=1))
     return file

@@ -26,8 +26,8 @@ from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 
 POLL_S: Final = 0.05
-TARDY_S: Final = 0.05  # who begins later than this after the common start is named
-GO_ON_S: Final = 5.0  # robots count the deadline from when they run, which is later than the conductor
+TARDY_S: Final = 0.05  # robots that begin later than this after the common start are reported
+GO_ON_S: Final = 5.0  # robots start later than the conductor, and count the deadline from then
 
 ADOPT_S: Final = 0.5
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
@@ -36,12 +36,12 @@ LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 
 
 class RunFailed(RuntimeError):
-    """A run that could not begin, with what is missing and what to do."""
+    """A run that could not begin, with reason and remedy."""
 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """How a case ended."""
+    """End of a case."""
 
     recording: Path
     interrupted: bool
@@ -105,24 +105,24 @@ class Conductor:
                     for each in trouble:
                         self._view.report("clock", "conductor", each)
         except RunFailed as failure:
-            self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: say it now
+            self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: show it now
             self._progress.events.append(messages.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
             self._show(self._progress)
             raise
         finally:
             self._processes.end()
-        lost = tuple(name for name, seen in self._robots.items() if seen.left_because == "lost")
+        lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
         return CaseResult(self._context.recording, self._context.ended(), start, ready, lost)
 
     def _adopt(self) -> None:
-        """Find robots that were started by hand or at boot, which nobody needs to start.
+        """Adopt robots that were started by hand or at boot.
 
         Raises:
             RunFailed: If one of them has flown already.
         """
         away = self._processes.away
-        if self._experiment.network.connect is not None or away:  # a router of our own has nobody else
-            self._progress.phase = "looking who is there"
+        if self._experiment.network.connect is not None or away:  # a router of our own has no other robots
+            self._progress.phase = "looking for robots"
             began = time.monotonic()
             while (past := time.monotonic() - began) < ADOPT_S or (self._flown() and past < LEAVE_S):
                 self._update()
@@ -132,14 +132,14 @@ class Conductor:
                 f"{', '.join(flown)}: on the network already, and {self._robots[flown[0]].phase}; a robot that was "
                 "started by hand flies once: end its process and start it again, next time with --once"
             )
-        there = {name for name, seen in self._robots.items() if seen.alive}
+        there = {name for name, view in self._robots.items() if view.alive}
         for name in self._processes.adopt(there):
-            said = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
-            self._view.report("adopted", name, f"{said}; not started from here")
+            state = f"is there already, {self._robots[name].phase}" if name in there else f"is started on {away[name]}"
+            self._view.report("adopted", name, f"{state}; not started from here")
 
     def _flown(self) -> list[str]:
         """Robots that are there and have flown, or do."""
-        return [name for name, seen in self._robots.items() if seen.alive and seen.reached("airborne")]
+        return [name for name, view in self._robots.items() if view.alive and view.reached("airborne")]
 
     # ------------------------------------------------------------------ phases
 
@@ -158,10 +158,10 @@ class Conductor:
             if self._context.ended():
                 return False
             meanwhile()
-            late = [name for name, seen in self._robots.items() if not (seen.reached(phase) or seen.gone)]
-            gone = [name for name, seen in self._robots.items() if seen.left_because == "lost"]
-            if gone and self._experiment.start.missing == "abort":
-                raise RunFailed(self._excuse(gone, "could not start"))
+            late = [name for name, view in self._robots.items() if not (view.reached(phase) or view.gone)]
+            lost = [name for name, view in self._robots.items() if view.left_because == "lost"]
+            if lost and self._experiment.start.missing == "abort":
+                raise RunFailed(self._excuse(lost, "could not start"))
             if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
@@ -173,7 +173,7 @@ class Conductor:
             time.sleep(POLL_S)
 
     def _take_off(self) -> bool:
-        """Orders all to climb, those who were not ready just then again when they are; False if interrupted.
+        """Order all robots to climb, those that were not ready again when they are; False if interrupted.
 
         Raises:
             RunFailed: As `_until`.
@@ -188,19 +188,19 @@ class Conductor:
         return self._until("airborne", CLIMB_S, meanwhile=again)
 
     def _patience(self) -> float:
-        """How long to wait until all are ready [s]: robots that go on without a neighbour say so after the deadline."""
+        """Limit for all robots to be ready [s]: robots that go on without a neighbour report it after the deadline."""
         begin = self._experiment.start
         return begin.deadline_s + (GO_ON_S if begin.missing == "go-on" else 0.0)
 
     def _start(self) -> float:
-        """One start time for all, in UTC; returns it."""
-        for name, seen in self._robots.items():
-            if not (seen.gone or AHEAD_S < seen.behind < BEHIND_S):
+        """Order the common start; returns its time [s, UTC]."""
+        for name, view in self._robots.items():
+            if not (view.gone or AHEAD_S < view.behind < BEHIND_S):
                 remedy = "set it (NTP), or let zenpark start the robot: [hosts]"
                 self._view.report(
-                    "clock", name, f"its clock is {-seen.behind:+.2f} s off and it will start so; {remedy}"
+                    "clock", name, f"its clock is {-view.behind:+.2f} s off and it will start so; {remedy}"
                 )
-        there = [name for name, seen in self._robots.items() if seen.reached("airborne") and not seen.gone]
+        there = [name for name, view in self._robots.items() if view.reached("airborne") and not view.gone]
         at = self._clock.utc() + start_lead_s(len(there))
         self._view.report("start", "conductor", "common start", stamp=at)
         self._order(messages.Order("start", at=at), there)
@@ -221,45 +221,45 @@ class Conductor:
             self._update()
             self._view.report_drift(*self._drift.news())
             self._progress.elapsed = now - start
-            self._tell_tardy(start)
+            self._report_tardy(start)
             self._start_late(start)
             while reached + 1 < len(times) and now - start >= times[reached + 1]:
                 reached += 1
                 self._progress.phase = names[reached]
                 self._view.report("phase", "conductor", names[reached], stamp=start + times[reached])
             busy = self._changes.under_way
-            left = [seen for name, seen in self._robots.items() if not seen.gone and name not in busy]
-            if all(seen.reached("landing") for seen in left) and (left or not busy):
+            left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
+            if all(view.reached("landing") for view in left) and (left or not busy):
                 return
             time.sleep(POLL_S)
 
     def _start_late(self, start: float) -> None:
-        """Repeats the start to robots that still wait: a busy machine may have lost the order, or its answer."""
+        """Repeat the start to robots that still wait: a busy machine may have lost the order, or its answer."""
         now, busy = self._clock.utc(), self._changes.under_way
         late = [
             name
-            for name, seen in self._robots.items()
-            if seen.status is not None and seen.status.phase == "airborne" and seen.status.stamp > start + LATE_S
-            if not seen.gone and name not in busy
+            for name, view in self._robots.items()
+            if view.status is not None and view.status.phase == "airborne" and view.status.stamp > start + LATE_S
+            if not view.gone and name not in busy
         ]
         if late and now > self._repeat_at:
             self._repeat_at = now + LATE_S
             for name in late:
-                self._view.report("late", name, "still waits for the start; told again")
+                self._view.report("late", name, "still waits for the start; ordered again")
             self._view.order(late, messages.Order("start", at=start))
 
-    def _tell_tardy(self, start: float) -> None:
-        """Names robots that were told of the common start and began after it."""
+    def _report_tardy(self, start: float) -> None:
+        """Report robots that began after the common start."""
         for name in list(self._starting):
-            seen = self._robots[name]
-            if seen.began is None and not seen.gone and name not in self._changes.under_way:
+            view = self._robots[name]
+            if view.began is None and not view.gone and name not in self._changes.under_way:
                 continue
             self._starting.remove(name)
-            if seen.began is not None and (tardy := seen.began - start) > TARDY_S:
+            if view.began is not None and (tardy := view.began - start) > TARDY_S:
                 self._view.report("late", name, f"began {tardy:.2f} s after the common start")
 
     def _land(self) -> None:
-        """Everybody down."""
+        """Land all robots."""
         self._view.refuse_joining()
         self._changes.close()
         self._progress.phase = "stopped" if self._context.emergency else "landing"
@@ -267,14 +267,14 @@ class Conductor:
             self._view.report("stop", "conductor", f"{self._context.emergency.words}; the run ends here")
         how = "emergency stop" if self._context.emergency else "interrupted" if self._context.ended() else ""
         self._view.report("phase", "conductor", "landing" + (f" ({how})" if how else ""))
-        if any(not (seen.gone or seen.reached("landing")) for seen in self._robots.values()):
+        if any(not (view.gone or view.reached("landing")) for view in self._robots.values()):
             self._order(messages.Order("land"))
         deadline = time.monotonic() + LAND_S
         while time.monotonic() < deadline:
             self._update()
             if all(
-                seen.gone or seen.reached("done") or seen.phase in ("starting", "idle")
-                for seen in self._robots.values()
+                view.gone or view.reached("done") or view.phase in ("starting", "idle")
+                for view in self._robots.values()
             ):
                 break
             time.sleep(POLL_S)
@@ -289,47 +289,47 @@ class Conductor:
         self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
 
     def _update(self) -> None:
-        """Take in what has happened since the last update."""
-        view, now = self._view, self._clock.utc()
-        for name in view.update():
+        """Receive all since the last update."""
+        now, report = self._clock.utc(), self._view.report
+        for name in self._view.update():
             self._miss(name)
         for death in self._processes.deaths():
             if death.kind == "lost" and self._changes.expects(death.source, death.text):
                 continue
-            view.report(death.kind, death.source, death.text)
+            report(death.kind, death.source, death.text)
             if death.kind == "recorder":
-                view.recording_begun = True  # nothing to wait for
+                self._view.recording_begun = True  # nothing to wait for
             elif death.kind == "lost":
                 self._robots[death.source].alive = False
                 self._changes.mark_lost(death.source)
         self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
-        for name, seen in self._robots.items():
-            if seen.left_because == "lost" and seen.alive and seen.status is not None and now - seen.status.stamp < 1.0:
-                self._come_back(name, seen)
+        for name, view in self._robots.items():
+            if view.left_because == "lost" and view.alive and view.status is not None and now - view.status.stamp < 1.0:
+                self._come_back(name, view)
         self._changes.advance()
         self._show(self._progress)
 
     def _miss(self, name: str) -> None:
-        """The token of an adopted robot has vanished for good: all that is known of its end."""
+        """Report an adopted robot whose token has vanished for good."""
         if name not in self._processes.adopted or self._changes.expects(name, "it is gone"):
             return
-        if not self._robots[name].reached("landing"):  # who is down before the others takes its token back
+        if not self._robots[name].reached("landing"):  # a robot that is down before the others undeclares its token
             self._view.report("lost", name, "is not on the network any more")
             self._changes.mark_lost(name)
 
-    def _come_back(self, name: str, seen: RobotView) -> None:
-        """It was only away, or somebody started it again."""
+    def _come_back(self, name: str, view: RobotView) -> None:
+        """Take back a robot that was only away, or was started again."""
         if name in self._changes.under_way:
             return
-        seen.left_because = ""
-        joins = "" if seen.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
+        view.left_because = ""
+        joins = "" if view.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
         self._view.report("back", name, f"alive again{joins}")
         if not self._processes.runs(name):
             self._processes.adopted.add(name)
 
     def _order(self, order: messages.Order, to: Sequence[str] | None = None) -> list[str]:
         """Give an order to all robots that are left, or to some of them; report and return those that refused."""
-        left = [name for name, seen in self._robots.items() if not (seen.gone or seen.status is None)]
+        left = [name for name, view in self._robots.items() if not (view.gone or view.status is None)]
         replies = self._view.order([name for name in left if to is None or name in to], order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
         for name, reason in refused.items():
@@ -339,12 +339,12 @@ class Conductor:
     # ------------------------------------------------------------------ words
 
     def _count(self, phase: str) -> int:
-        return sum(seen.reached(phase) for seen in self._robots.values())
+        return sum(view.reached(phase) for view in self._robots.values())
 
     def _why(self, name: str) -> str:
         status = self._robots[name].status
         if status is None:
-            return "its process says nothing yet"
+            return "no status of its process yet"
         return status.reason or f"it is {status.phase}"
 
     def _excuse(self, names: Sequence[str], what: str) -> str:

@@ -1,7 +1,7 @@
-"""Robots that are paused, taken out, started again, replaced or added while the run goes on.
+"""Hot changes: robots are paused, removed, restarted, replaced or added while the run goes on.
 
-The conductor answers orders on a key of its own. What an order asks for takes seconds: each change is a generator that
-goes on by one look at a time, so that the conductor waits for nobody.
+The conductor answers orders on a key of its own. A change takes seconds: it is a generator that advances one step at a
+time, so that the conductor never waits.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from experiments.real_time.conductor.replacement import Refused, in_the_way
 from experiments.real_time.conductor.run_view import FROZEN_S, NetworkView
 from experiments.real_time.hosts.launcher import LAND_S
 
-CLIMB_S: Final = 15.0  # a robot that is not up after this will not come up
-READY_S: Final = 5.0  # a robot counts the deadline of the file from when it runs, which is later
-ROOM_S: Final = 20.0  # so long a robot waits until its place is free, where nobody waits for an answer
-RESTARTS: Final = 3  # a robot that is lost more often is not helped by starting it again
+CLIMB_S: Final = 15.0  # limit for a robot to climb
+READY_S: Final = 5.0  # a robot starts later, and counts the deadline of the file from then
+ROOM_S: Final = 20.0  # limit for the place of a robot to become free, where no operator waits for an answer
+RESTARTS: Final = 3  # a robot that is lost more often is not helped by a restart
 MOST: Final = 100  # orders at once
-INSIST_S: Final = 5.0  # so long an order is repeated that a robot does not follow,
-AGAIN_S: Final = 0.5  # this often
+INSIST_S: Final = 5.0  # an order that a robot refuses is repeated for this long,
+AGAIN_S: Final = 0.5  # with this period
 
-Steps = Generator[None, None, str]  # what was done, at its end
+Steps = Generator[None, None, str]  # returns the result, in words
 
 
 @dataclass
@@ -46,7 +46,7 @@ class _Asked:
 
 @dataclass
 class _Change:
-    """What goes on with robots of one process, and for whom."""
+    """Change of robots of one process, and its order."""
 
     names: tuple[str, ...]
     steps: Steps
@@ -74,11 +74,11 @@ class HotChanges:
         return {name for change in self._changes for name in change.names}
 
     def begin(self, start: float) -> None:
-        """From now on orders are taken; the common start was, or is, at `start` [s, UTC]."""
+        """Accept orders from now on; the common start is at `start` [s, UTC]."""
         self._start = start
 
     def close(self) -> None:
-        """No more orders; what is under way is given up, and all land."""
+        """Accept no more orders and give up changes under way: all land."""
         self._start = None
         for change in self._changes:
             change.steps.close()
@@ -96,7 +96,7 @@ class HotChanges:
         return self._robots[name].gone
 
     def mark_lost(self, name: str) -> None:
-        """A robot is lost; what the file says of that is done."""
+        """Follow the file's policy for a robot that is lost."""
         self._robots[name].left_because = "lost"
         policy = self._experiment.on_loss
         names = self._processes.companions(name)
@@ -136,7 +136,7 @@ class HotChanges:
         self._begin(_Asked(order, query))
 
     def _refusals(self, order: messages.RunOrder) -> Iterator[str]:
-        """Why nothing at all is done."""
+        """Reasons to refuse the whole order."""
         known = self._robots
         if unknown := next((name for name in order.robots if name not in known), None):
             yield f"no robot '{unknown[:50]}' in this run; {did_you_mean(unknown[:50], known)}"
@@ -156,16 +156,17 @@ class HotChanges:
             yield "replace one robot at a time, or leave it to the spares of the file"
 
     def _begin(self, asked: _Asked) -> None:
-        """One change for all robots of a process that are named."""
+        """Begin one change for all named robots of each process."""
         left = list(dict.fromkeys(asked.order.robots))
         if asked.query is not None:
             self._pending.append(asked)
-        who = asked.order.who[:50] or "somebody"
+        who = asked.order.who[:50]
+        operator = who if who and who.isprintable() else "an operator"
         while left:
             names = tuple(name for name in left if name in self._processes.companions(left[0]))
             left = [name for name in left if name not in names]
             for name in names:
-                self._view.report(asked.order.order, name, f"asked by {who if who.isprintable() else 'somebody'}")
+                self._view.report(asked.order.order, name, f"asked by {operator}")
             change = _Change(names, self._steps(asked.order, names), asked)
             if busy := sorted(self.under_way & {*names}):
                 self._answer(change, refused=f"{', '.join(busy)}: is being changed already; wait for that")
@@ -194,11 +195,12 @@ class HotChanges:
     # ------------------------------------------------------------------ what is done
 
     def _steps(self, order: messages.RunOrder, names: tuple[str, ...]) -> Steps:
+        """The change that an order asks for."""
         match order.order:
             case "pause":
-                return self._tell(names, messages.Order("hold"), "holds where it is")
+                return self._order(names, messages.Order("hold"), "holds where it is")
             case "resume":
-                return self._tell(names, messages.Order("resume"), "goes on")
+                return self._order(names, messages.Order("resume"), "goes on")
             case "remove":
                 return self._remove(names)
             case "replace":
@@ -206,7 +208,7 @@ class HotChanges:
             case _:
                 return self._let_in(names, order)
 
-    def _tell(self, names: Sequence[str], order: messages.Order, done: str) -> Steps:
+    def _order(self, names: Sequence[str], order: messages.Order, done: str) -> Steps:
         yield from ()
         for name in names:
             if self._robots[name].gone:
@@ -221,7 +223,7 @@ class HotChanges:
         return "removed: it is down, and the others go on"
 
     def _leave(self, names: Sequence[str]) -> Generator[None]:
-        """Robots land, and are gone from the network; their process ends if no other robot needs it."""
+        """Robots land and leave the network; their process ends if no other robot needs it."""
         there = [name for name in names if self._robots[name].alive or self._processes.runs(name)]
         self._leaving |= {*there}
         for name, reply in self._view.order(there, messages.Order("leave")).items():
@@ -234,7 +236,7 @@ class HotChanges:
         while still := [name for name in there if self._robots[name].alive or self._process_must_end(name, names)]:
             past = time.monotonic() - began
             if past > LAND_S and any(name in self._processes.adopted for name in still):
-                raise Refused(f"{', '.join(still)}: told to land, but is still there after {LAND_S:g} s")
+                raise Refused(f"{', '.join(still)}: ordered to land, but still there after {LAND_S:g} s")
             if not killed and (past > LAND_S or (past > FROZEN_S and all(map(self._frozen, still)))):
                 killed = True
                 for name in still:
@@ -246,7 +248,7 @@ class HotChanges:
         for name in names:
             self._robots[name].left_because = "removed"
             self._robots[name].forget_process()
-        self._leaving -= {*names}  # the next process that ends is another one
+        self._leaving -= {*names}  # the next end of a process is that of another one
 
     def _process_must_end(self, name: str, names: Sequence[str]) -> bool:
         """Whether a robot's process is still there although it has no other robots that stay."""
@@ -258,7 +260,7 @@ class HotChanges:
         return status is None or self._view.clock.utc() - status.stamp > FROZEN_S
 
     def _let_in(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
-        """Restart, or add: who is there by hand is only told to join, everybody else is started."""
+        """Restart, or add: robots that were started by hand only get orders to join, all others are started."""
         robots, processes = self._robots, self._processes
         asked = time.monotonic()
         by_hand = all(robots[name].alive and not processes.runs(name) for name in names)
@@ -289,19 +291,19 @@ class HotChanges:
         name = names[0]
         if len(self._processes.companions(name)) > 1:
             raise Refused(f"{name} shares its process with others: restart them together instead")
-        next_one, whose = self._spares.successor(name, self._processes.robot(name), order)
+        next_one, spare = self._spares.successor(name, self._processes.robot(name), order)
         if next_one.body == replacement.TWIN:
             places = {name: tuple(self._processes.place(name, next_one))}
             yield from self._room(places, ROOM_S if order.who == "on_loss" else 0.0, body_stays=True)
         yield from self._leave(names)
         self._processes.start_again(names, {name: next_one})
-        if whose is not None:
-            self._spares.used[whose] = name
+        if spare is not None:
+            self._spares.used[spare] = name
         yield from self._join(names)
-        return f"{whose or next_one.body} has its name and takes part after {time.monotonic() - asked:.1f} s"
+        return f"{spare or next_one.body} has its name and takes part after {time.monotonic() - asked:.1f} s"
 
     def _join(self, names: Sequence[str]) -> Generator[None]:
-        """From a process that has just begun to one that takes part: ready, up, and on with the others."""
+        """Robots whose process has just begun join the run: ready, airborne, running."""
         robots = self._robots
         for name in names:
             robots[name].left_because = ""
@@ -323,7 +325,7 @@ class HotChanges:
             raise
 
     def _insist(self, names: Sequence[str], order: messages.Order) -> Generator[None]:
-        """An order that may be repeated: a robot may not be ready just then, and a busy machine lose an answer."""
+        """Repeat an order until it is accepted: a robot may not be ready yet, and a busy machine lose an answer."""
         began, left = time.monotonic(), list(names)
         while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
             asked = time.monotonic()
@@ -340,7 +342,7 @@ class HotChanges:
                 raise Refused(f"{ended}: {self._ended[ended]}")
             if time.monotonic() - began > limit_s:
                 status = self._robots[late[0]].status
-                why = "its process says nothing" if status is None else status.reason or f"it is {status.phase}"
+                why = "no status of its process" if status is None else status.reason or f"it is {status.phase}"
                 raise Refused(f"{', '.join(late)}: not {phase} after {limit_s:g} s: {why}")
             yield
 
@@ -362,12 +364,9 @@ class HotChanges:
     def _room(
         self, places: dict[str, tuple[float, ...]], patience_s: float, *, body_stays: bool = False
     ) -> Generator[None]:
-        """Wait until the places where robots begin are free.
+        """Wait for at most `patience_s` [s] until the `places`, x, y [m], where robots begin are free.
 
-        Args:
-            places: Where, x, y [m], by robot.
-            patience_s: For so long [s].
-            body_stays: Whether the body that a name had lies in the way as any other.
+        `body_stays` as of `in_the_way`.
         """
         began = time.monotonic()
         while True:

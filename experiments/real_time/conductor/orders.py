@@ -30,7 +30,7 @@ R = TypeVar("R", messages.Reply, messages.WorldReply, messages.RunReply)
 
 
 def start_lead_s(robots: int) -> float:
-    """How far ahead of the order a common start of so many robots lies [s]."""
+    """Time from the order to the common start of `robots` robots [s]."""
     return LEAD_S + LEAD_EACH_S * robots
 
 
@@ -75,14 +75,14 @@ def send_run_order(
 
 
 def _read(asked: Iterable[zenoh.Reply], kind: type[R]) -> tuple[R | None, str]:
-    """The reply, or why there is none; empty if nobody said anything."""
+    """The reply, or the reason why there is none; empty without any answer."""
     why = ""
     for reply in asked:
         if reply.ok is not None:
             try:
                 return messages.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), kind), ""
             except messages.Malformed as error:
-                why = f"it answered nonsense: {error}"
+                why = f"malformed reply: {error}"
         elif reply.err is not None:
             why = reply.err.payload.to_bytes().decode(errors="replace")
     return None, why

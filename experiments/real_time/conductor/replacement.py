@@ -1,4 +1,4 @@
-"""Who takes over the name of a robot: a spare of the experiment file, or another body."""
+"""Replacement of a robot under its name: by a spare of the experiment file, or by another body."""
 
 from __future__ import annotations
 
@@ -17,26 +17,24 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.real_time.conductor.run_view import RobotView
 
 TWIN: Final = "twin"  # a body that is there as long as its process
-OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # what a spare brings along
+OF_BODY: Final = ("body", "start", "hover", "position", "device", "sensors", "ranges")  # fields of a spare
 
 
 class Refused(RuntimeError):
-    """A change that is not made, with why and what to do instead."""
+    """A change that is not made, with reason and remedy."""
 
 
 class Spares:
-    """The spares of an experiment.
+    """Spares of an experiment."""
 
-    Attributes:
-        used: Those that have taken over a name, and which.
-    """
+    used: dict[str, str]  # names that they have taken over, by spare
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
-        self.used: dict[str, str] = {}
+        self.used = {}
 
     def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
-        """The robot that is called `name` from now on, and which spare it is, if it is one.
+        """The robot with the name `name` from now on, and the name of the spare, if it is one.
 
         Raises:
             Refused: If there is no such spare or body, or it cannot be what `robot` was.
@@ -96,20 +94,15 @@ MARGIN_M: Final = 0.1  # free space around a robot that begins to move
 
 
 def in_the_way(
-    name: str, place: Sequence[float], robots: Mapping[str, Robot], seen: Mapping[str, RobotView], *, body_stays: bool
+    name: str, place: Sequence[float], robots: Mapping[str, Robot], views: Mapping[str, RobotView], *, body_stays: bool
 ) -> str:
-    """Who is too near to a place for a robot to begin there, however high; empty if nobody is.
+    """Refusal of `place`, x, y [m], for the robot `name` to begin there, whatever its height; empty if it is free.
 
-    Args:
-        name: Of the robot.
-        place: x, y [m].
-        robots: As they are now.
-        seen: Where they were last.
-        body_stays: Whether the body that had this name lies in the way as any other.
+    `body_stays`: the body that had this name lies in the way as any other.
     """
     radius = KINDS[robots[name].kind].radius
-    for other, known in seen.items():
-        vanished = robots[other].body == TWIN and not known.alive  # it was but a part of its process
+    for other, known in views.items():
+        vanished = robots[other].body == TWIN and not known.alive  # it was a part of its process
         if known.place is None or vanished or (other == name and (known.alive or not body_stays)):
             continue
         gap = math.dist(known.place[:2], place[:2]) - radius - KINDS[robots[other].kind].radius

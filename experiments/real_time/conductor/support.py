@@ -1,4 +1,4 @@
-"""What stands in for hardware in a run: the world, protocol twins for robots that ask for one, and who measures."""
+"""Support processes of a run: world, protocol twins, motion capture, routers, central controller; their restarts."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ VICON: Final = "vicon://"
 
 
 class StandInError(RuntimeError):
-    """A protocol twin or a positioning system that did not start, with what it said."""
+    """A protocol twin or a positioning system that did not start, with its output."""
 
 
 @dataclass(frozen=True)
 class StandIns:
-    """What was started."""
+    """Stand-ins that were started."""
 
     experiment: Experiment  # with the addresses at which robots are
     names: tuple[str, ...]  # of the processes
-    # the process that says where robots are, by name, and what starts it again; None: there is none
+    # name of the process that publishes positions, and the call that starts it again; None: there is none
     positioning: tuple[str, Callable[[], Process]] | None
 
 
 def start(context: CaseContext) -> StandIns:
-    """Start the stand-ins that the experiment asks for, and fill in at which address each robot is.
+    """Start the stand-ins that the experiment asks for, and fill in the addresses of its robots.
 
     Raises:
         StandInError: If one does not start in time.
@@ -101,7 +101,7 @@ def _start_positioning(
 
 
 def _announced(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
-    """Wait until a process has printed so many lines of a form; the two groups of each."""
+    """Wait until a process has printed `count` lines of a form; returns the two groups of each."""
     deadline = time.monotonic() + READY_S
     while True:
         found = dict(re.findall(pattern, process.log.read_text(errors="replace"), re.MULTILINE))
@@ -109,17 +109,17 @@ def _announced(process: Process, pattern: str, count: int, interrupted: Callable
             return found
         if interrupted() or not process.alive or time.monotonic() > deadline:
             what = "was interrupted" if interrupted() else f"did not start ({process.exit})"
-            raise StandInError(f"{process.name} {what}: {process.tail() or 'it said nothing'}")
+            raise StandInError(f"{process.name} {what}: {process.tail() or 'no output'}")
         time.sleep(POLL_S)
 
 
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
-STARTS: Final = 4  # who dies more often is not helped by starting it again
+STARTS: Final = 4  # a process that dies more often is not helped by another start
 
 
 @dataclass
 class _Servant:
-    """What to start, and what becomes of the robots meanwhile, or when it is given up."""
+    """Supervised process; texts for the robots' state meanwhile, and when it is given up."""
 
     start: Callable[[], object]
     meanwhile: str = ": robots hold until then"
@@ -131,7 +131,7 @@ class Servants:
     """Supervised processes of one case: routers, world, central controller, motion capture."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Others start the router and the world for the first time; `start_centre` starts the central controller."""
+        """Start nothing: routers and world are started by others, the central controller by `start_centre`."""
         self._context = context
         count = context.experiment.network.routers
         self._known = {
@@ -140,7 +140,7 @@ class Servants:
                 ": all go on at another meanwhile" if count > 1 else "",
                 ": no other takes its place" if count > 1 else ": the robots hold, and land at the end",
             )
-            for each in divided(context.hosts.routers, count)
+            for each in make_routers(context.hosts.routers, count)
         } | {context.process("world"): _Servant(partial(start_world, context))}
         self._centre: tuple[str, ...] = ()
         if Plan(context.experiment).guided:
@@ -152,7 +152,7 @@ class Servants:
 
     def keep(self, name: str, start: Callable[[], object]) -> None:
         """Supervise motion capture as well: robots without a position hold, and drones land."""
-        hold = ": robots that do not know where they are hold, drones land"
+        hold = ": robots without a position hold, drones land"
         self._known[name] = _Servant(start, hold, hold)
 
     def start_centre(self) -> tuple[str, ...]:
@@ -178,15 +178,15 @@ class Servants:
 
 @dataclass(frozen=True)
 class Router:
-    """A router of our own."""
+    """Router of a run."""
 
     name: str  # of its process
     listen: Sequence[str]  # where it listens
-    # the routers before it, which it seeks for as long as it lives, so that any two are linked once
+    # routers before it, which it connects to for as long as it lives, so that any two are linked once
     link: Sequence[str] = ()
 
     def start(self, launcher: Launcher, rights: Path | None = None) -> None:
-        """Start it; it outlives a killed launcher by as long as robots take to land. In a lab it enforces `rights`."""
+        """Start the router; it outlives a killed launcher until robots have landed. In a lab it enforces `rights`."""
         listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
         link = [part for endpoint in self.link for part in ("--connect", endpoint)]
         enforced = [] if rights is None else ["--rights", str(rights)]
@@ -200,8 +200,8 @@ def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | No
     Router(ROUTER, endpoints).start(launcher, rights)
 
 
-def divided(endpoints: Sequence[str], count: int) -> list[Router]:
-    """So many routers, with these endpoints in turn."""
+def make_routers(endpoints: Sequence[str], count: int) -> list[Router]:
+    """`count` routers, with these endpoints in turn."""
     made: list[Router] = []
     for number in range(count):
         link = [topology.from_here(before.listen[0]) for before in made]

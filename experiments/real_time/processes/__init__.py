@@ -1,1 +1,1 @@
-"""What each started process runs: robot, recorder, world, centre, protocol twins."""
+"""Processes of a run: robot, recorder, world, central controller, protocol twins."""

@@ -165,7 +165,7 @@ class CentreProcess:
             decisions=self.centre.decisions,
             missed=self._missed,
             goals=self._sent,
-            heard={sender.name: int(self._received[row]) for row, sender in senders.items()},
+            received={sender.name: int(self._received[row]) for row, sender in senders.items()},
             lost={sender.name: sender.lost for sender in senders.values()},
             dropped={sender.name: int(self._poses.dropped[row]) for row, sender in senders.items()},
             malformed=sum(inbox.malformed for inbox in self._statuses.values()) + self._poses.malformed,

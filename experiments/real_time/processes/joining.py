@@ -1,4 +1,4 @@
-"""How a process of an experiment reads its case and joins its network; and robots that join whatever is run next.
+"""Start of a process of an experiment: it reads its case and joins the network; robots may join the next run.
 
 A robot that was started by hand or at boot has no lifeline on standard input; the token of the conductor, which
 publishes the experiment that is run, stands for it.
@@ -36,7 +36,7 @@ LOOK_S: Final = 0.1
 
 
 class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
-    """How a process of an experiment is started."""
+    """Command line of a process of an experiment."""
 
     file: Annotated[str, msgspec.Meta(description="experiment file, or name in the catalogue")]
     case: Annotated[str | None, msgspec.Meta(description="which case of the file; the first if left out")] = None
@@ -113,13 +113,7 @@ def joined(
 
 
 def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Document:
-    """Waits for a run that has robots of these names, and returns its experiment.
-
-    Args:
-        session: To listen on.
-        keys: Of the realm.
-        names: Of the robots.
-    """
+    """Waits for a run that has robots of these names, and returns its experiment."""
     subscriber = pubsub.pose_subscriber(session, keys.experiment, 1)
     pause = threading.Event()
     while True:

@@ -78,7 +78,7 @@ class DeviceProcess:
                 now = time.monotonic() - zero
                 if now >= due:
                     self._device.advance(now)
-                    self._tell(clock.at(zero + now))
+                    self._publish(clock.at(zero + now))
                     due = max(due + self._dt, now - 10.0 * self._dt)  # after a suspension lost time is not caught up
                     if self._farewell.over() if self._farewell is not None else self._lost.is_set():
                         return
@@ -93,7 +93,7 @@ class DeviceProcess:
             if number not in waiting.get_map():
                 waiting.register(sock, selectors.EVENT_READ)
 
-    def _tell(self, stamp: float) -> None:
+    def _publish(self, stamp: float) -> None:
         position, yaw = self._device.truth()
         for name, publisher, where, toward in zip(
             self._names, self._truths, position.tolist(), yaw.tolist(), strict=False

@@ -48,7 +48,7 @@ class Recorder:
         self._session = session
         self._arrival = Clock()
         self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
-        self._told: dict[str, int] = {}
+        self._reported: dict[str, int] = {}
         self._alive: set[str] = set()
         self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in TOPICS]
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
@@ -93,9 +93,9 @@ class Recorder:
             RecordingError: If it cannot be written.
         """
         for key, (count, why) in list(self._unread.items())[:NAMED]:
-            before = self._told.get(key, 0)
+            before = self._reported.get(key, 0)
             if not before or (last and count != before):
-                self._told[key] = count
+                self._reported[key] = count
                 text = f"could not read {count} {'message' if count == 1 else 'messages'} on {key}: {why}"
                 self._recording.write(messages.Event(self._arrival.utc(), "unread", "recorder", text))
 

@@ -252,7 +252,7 @@ def _ready(experiment: Experiment, population: Population, endpoints: Sequence[s
     parted: tuple[list[str], list[str]] = ([], [])
     for name, here in zip(population.names, population.carried.tolist(), strict=True):
         parted[0 if here else 1].append(name)
-    carried, mirrored = (", ".join(names) or "nobody" for names in parted)
+    carried, mirrored = (", ".join(names) or "none" for names in parted)
     return (
         f"world ready: {registry.split(experiment.world.engine)[0]} at {experiment.rates.body_hz:g} Hz "
         f"carries {carried}; mirrors {mirrored}; realm {experiment.network.realm} at {', '.join(endpoints)}"

@@ -93,7 +93,7 @@ class Exchange:
         self._begun = inf
         self._ticks = 0
         self._names: tuple[str, ...] = ()
-        self._quiet = self._heard = np.zeros(0)
+        self._quiet = self._received_at = np.zeros(0)
         self._place, self._velocity, self._yaw = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
         self.update_rows()
 
@@ -111,11 +111,11 @@ class Exchange:
         # begin of the silence of each row; infinity: it needs no command
         self._quiet, quiet = np.full(rows, inf), self._quiet
         # time and pose of the last state of each mirrored row
-        self._heard, heard = np.full(rows, -inf), self._heard
+        self._received_at, received_at = np.full(rows, -inf), self._received_at
         self._place, place = np.full((rows, 3), np.nan), self._place
         self._velocity, velocity = np.zeros((rows, 3)), self._velocity
         self._yaw, yaw = np.zeros(rows), self._yaw
-        self._quiet[now], self._heard[now] = quiet[was], heard[was]
+        self._quiet[now], self._received_at[now] = quiet[was], received_at[was]
         self._place[now], self._velocity[now], self._yaw[now] = place[was], velocity[was], yaw[was]
         self._names = names
         self._held = np.zeros(rows, dtype=bool)
@@ -193,7 +193,7 @@ class Exchange:
                 self._done[command.robot] = command.seq
                 self._obey(row, command, t)
         if len(self._mirrored):
-            self._look_around(t)
+            self._update_poses(t)
         for status in self._statuses.read():
             self._update_start(status, t)
 
@@ -270,7 +270,7 @@ class Exchange:
                 f"it, or add it with `zenpark world-order spawn {name}`",
             )
 
-    def _look_around(self, t: float) -> None:
+    def _update_poses(self, t: float) -> None:
         """Updates the poses of mirrored robots."""
         changed = False
         for row, inbox in self._mirrors.values():
@@ -278,9 +278,9 @@ class Exchange:
             if state is not None and state.position is not None:
                 self._place[row], self._velocity[row] = state.position, state.velocity or messages.STILL
                 self._yaw[row] = state.yaw or 0.0
-                self._heard[row] = t
+                self._received_at[row] = t
                 changed = True
-            elif t - self._heard[row] > GONE_S and np.isfinite(self._place[row, 0]):
+            elif t - self._received_at[row] > GONE_S and np.isfinite(self._place[row, 0]):
                 self._place[row] = np.nan
                 changed = True
         if changed:

@@ -59,7 +59,7 @@ def test_sessions_of_a_lab_show_certificates_and_ask_for_them(folder):
         assert part in tls
 
 
-RIGHTS = Rights("park", {"CF01": Grant(say=["park/CF01/**"])}, {})
+RIGHTS = Rights("park", {"CF01": Grant(publish=["park/CF01/**"])}, {})
 
 
 @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447", "tls/lab.example.org:7447"])

@@ -16,10 +16,10 @@ from agents.network.messages import (
     CentreState,
     Event,
     Goal,
-    Heard,
     Malformed,
     Order,
     Pose,
+    PoseReceipt,
     Reply,
     State,
     Status,
@@ -34,7 +34,7 @@ number = st.floats(allow_nan=False, allow_infinity=False)
 vector = st.tuples(number, number, number)
 count = st.integers(0, 2**53)
 word = st.text(max_size=12)
-heard = st.builds(Heard, word, count, number, number, vector, vector)
+heard = st.builds(PoseReceipt, word, count, number, number, vector, vector)
 messages = st.one_of(
     st.builds(Pose, word, count, number, vector, vector, number),
     st.builds(
@@ -67,7 +67,7 @@ def test_round_trip(encoding, message):
 
 def test_a_status_survives_both_encodings():
     status = Status(
-        robot="CF01", stamp=1.5, phase="running", reason="", body="locked", battery=None, sent=1, heard=2,
+        robot="CF01", stamp=1.5, phase="running", reason="", body="locked", battery=None, sent=1, received=2,
         lost={"KH01": 3}, dropped={"KH01": 2}, malformed=0, refused=0, ticks=5, missed=1,
         decisions=2, interventions=0, avoided=0, late_s=0.001, started=0.5,
         missing=["KH02"], pid=1, cpu_s=0.1, rss_mb=60.0,
@@ -189,15 +189,15 @@ def test_malformed(payload, mime):
 
 def test_the_largest_honest_state_fits():
     neighbours = [
-        Heard(f"Robot{k:03}", 12345, 1.7e9 + k, 1.7e9 + k, (-0.123456, -1.234567, 0.123456), (-0.123456,) * 3)
+        PoseReceipt(f"Robot{k:03}", 12345, 1.7e9 + k, 1.7e9 + k, (-0.123456, -1.234567, 0.123456), (-0.123456,) * 3)
         for k in range(100)
     ]
     state = State(
-        "Robot000", 12345, 1.7e9, "running", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, None, None, 0.0, heard=neighbours
+        "Robot000", 12345, 1.7e9, "running", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, None, None, 0.0, received=neighbours
     )
     payload = wire.encode(state)
     assert len(payload) < wire.MAX_PAYLOAD / 3
-    assert wire.decode(payload, JSON, State).heard == neighbours
+    assert wire.decode(payload, JSON, State).received == neighbours
 
 
 def test_a_pose_is_rounded_to_what_sensors_know():
@@ -238,13 +238,13 @@ def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
 def test_telemetry_that_is_too_long_for_a_payload_goes_in_several(encoding, heard, followed):
     state = State(
         "A", 7, 1000.0, "running", (0.1, 0.2, 0.3),
-        heard=[Heard("KH01", k, 1000.0 + k, 1000.1 + k, (0.123456,) * 3, (0.0,) * 3) for k in range(heard)],
-        followed=[wire.GoalReceipt(k, 1000.0 + k, 1000.1 + k, 1000.2 + k) for k in range(followed)],
+        received=[PoseReceipt("KH01", k, 1000.0 + k, 1000.1 + k, (0.123456,) * 3, (0.0,) * 3) for k in range(heard)],
+        goal_receipts=[wire.GoalReceipt(k, 1000.0 + k, 1000.1 + k, 1000.2 + k) for k in range(followed)],
     )  # fmt: skip
     payloads = list(wire.payloads(state, encoding))
     parts = [wire.decode(payload, wire.MIME[encoding], State) for payload in payloads]
     assert (len(parts) == 1) == (len(wire.encode(state, encoding)) <= wire.MAX_PAYLOAD)
-    assert [each for part in parts for each in part.heard] == state.heard
-    assert [each for part in parts for each in part.followed] == state.followed
-    bare = msgspec.structs.replace(state, heard=[], followed=[])
-    assert all(msgspec.structs.replace(part, heard=[], followed=[]) == bare for part in parts)
+    assert [each for part in parts for each in part.received] == state.received
+    assert [each for part in parts for each in part.goal_receipts] == state.goal_receipts
+    bare = msgspec.structs.replace(state, received=[], goal_receipts=[])
+    assert all(msgspec.structs.replace(part, received=[], goal_receipts=[]) == bare for part in parts)

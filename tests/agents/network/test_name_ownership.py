@@ -318,7 +318,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
         robot._recover("it hung")
         assert CountedToken.live == shown
         robot._leaving.add(0)
-        robot.agent.lifecycle.land(0, "told to leave")
+        robot.agent.lifecycle.land(0, "ordered to leave")
         robot._watchdog.tripped = "it hangs"
         robot._call_for_help("it hangs")
         robot._retire(0.0)  # of a row whose token the alarm has taken back

@@ -72,7 +72,7 @@ def test_router_ends_with_its_starter():
 
 def test_lines_are_passed_on_whole_and_heartbeats_are_not(pipe):
     lines = []
-    line = Lifeline(threading.Event(), timeout_s=60.0, fd=pipe[0], told=lines.append)
+    line = Lifeline(threading.Event(), timeout_s=60.0, fd=pipe[0], on_line=lines.append)
     line.start()
     for part in (b"\n\nclock -0.", b"2001\n", b"\n\nclock 1\nx", b"x" * 10_000):
         os.write(pipe[1], part)

@@ -56,7 +56,9 @@ class Robot:
     def hear(self, count: int, first: int = 1) -> None:
         for seq in range(first, first + count):
             self.neighbours.news[0].append(
-                messages.Heard("B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0))
+                messages.PoseReceipt(
+                    "B", seq, UTC + 0.02 * seq, UTC + 0.02 * seq, (0.4, 0.1, 0.0), (0.123456, 0.0, 0.0)
+                )
             )
 
     def tell(self, t: float, **changed: float) -> list[messages.State]:
@@ -79,11 +81,11 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
 def test_who_does_not_know_where_it_is_tells_what_it_heard(robot: Robot) -> None:
     robot.hear(100)
     (said,) = robot.tell(0.02, position=np.nan)
-    assert (said.position, len(said.heard)) == (None, 100)
+    assert (said.position, len(said.received)) == (None, 100)
     assert not robot.neighbours.news[0]
     (said,) = robot.tell(0.04)
     assert said.position is not None
-    assert said.heard == []
+    assert said.received == []
 
 
 def test_what_waits_for_telemetry_is_bounded(robot: Robot) -> None:
@@ -91,7 +93,7 @@ def test_what_waits_for_telemetry_is_bounded(robot: Robot) -> None:
     assert len(robot.neighbours.news[0]) == NEWS
     states = robot.tell(0.02)
     assert len(states) > 1
-    assert [each.seq for state in states for each in state.heard] == list(range(501, NEWS + 501))
+    assert [each.seq for state in states for each in state.received] == list(range(501, NEWS + 501))
     assert {state.seq for state in states} == {1}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.protocols.crazyflie import Outside, Settings, capacity, overload
+from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from agents.protocols.crtp import Info
 from bridges.crazyflie.body import open_crazyflie
 from bridges.crazyflie.telemetry import Board, Telemetry
@@ -210,11 +210,11 @@ def test_what_a_radio_carries(exchanges, carried):
 
 def test_crowded_radio():
     """Six robots at the defaults, 45 packets per second each, are more than 250; the rates that are named fit."""
-    assert overload("0", [Settings()] * 5, 250.0) == ""
-    text = overload("0", [Settings()] * 6, 250.0)
+    assert overload("0", [CrazyflieSettings()] * 5, 250.0) == ""
+    text = overload("0", [CrazyflieSettings()] * 6, 250.0)
     assert text.startswith("radio 0: 6 robots ask for 270 packets/s, up and down; it carries 250: ")
     assert "log_hz = 16, status_hz = 4, stream_hz = 18, or plug in another radio" in text
-    assert overload("0", [Settings(log_hz=16, status_hz=4, stream_hz=18)] * 6, 250.0) == ""
-    with_positions = overload("0", [Settings(positioning=Outside())] * 8, 250.0)
+    assert overload("0", [CrazyflieSettings(log_hz=16, status_hz=4, stream_hz=18)] * 6, 250.0) == ""
+    with_positions = overload("0", [CrazyflieSettings(positioning=Outside())] * 8, 250.0)
     assert "520 packets/s" in with_positions
     assert "positioning.rate_hz = 9" in with_positions

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED
-from agents.protocols.crazyflie import Settings
+from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import Info
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
@@ -26,7 +26,7 @@ class Air:
             monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.board = Board(1)
         self.telemetry = Telemetry(self.board, 0, lighthouse=False)
-        self.flight = Flight(Settings(**chosen), self.telemetry, self.pause)
+        self.flight = Flight(CrazyflieSettings(**chosen), self.telemetry, self.pause)
         self.flight.link = types.SimpleNamespace(
             cf=self, error=None, busy=False, planner_reply=lambda command: self.replies.get(command, (0, 0))
         )

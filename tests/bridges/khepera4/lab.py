@@ -30,7 +30,7 @@ class Lab:
         monkeypatch.setattr(drivers, "awake", self.monotonic)
         self.program.begin_session()
         self.device._servers[0]._client = self  # a client is there
-        chosen = protocol.Settings(server=server if named else None, **settings)
+        chosen = protocol.Khepera4Settings(server=server if named else None, **settings)
         self.odometer = Odometer(0.0, 0.0, 0.0)
         try:
             self.driver = drivers.identify(self, chosen, chosen.server)

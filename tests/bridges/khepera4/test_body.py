@@ -21,7 +21,7 @@ from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
 from bridges.khepera4.body import OPEN_S, open_khepera4
-from bridges.khepera4.link import Address, Link, Odometry
+from bridges.khepera4.link import Address, Khepera4Link, Odometry
 from bridges.khepera4.odometry import Odometer
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import until
@@ -427,7 +427,9 @@ def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
 
 
 def test_a_stop_that_is_not_answered_is_said():
-    link = Link("KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
+    link = Khepera4Link(
+        "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
+    )
     link.drive(0.2, 0.0, 0.0)
     link.odometry = Odometry(100.0, 0.0, 0.0, 0.0, (0.2, 0.0))
     link.halt(100.0)
@@ -446,7 +448,7 @@ def test_a_serial_line_that_another_process_has_is_left_alone():
     ours, theirs = os.openpty()
     address = Address.parse("KH01", f"kteam://{os.ttyname(theirs)}")
     first = address.connect()
-    link = Link("KH02", address, protocol.Settings(), (0.0, 0.0, 0.0))
+    link = Khepera4Link("KH02", address, protocol.Khepera4Settings(), (0.0, 0.0, 0.0))
     link.start()
     try:
         until(lambda: "another process has this line; end it first" in link.trouble, "it is named")

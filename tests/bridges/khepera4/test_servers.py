@@ -8,7 +8,7 @@ from agents.body.interface import FRESH_S, BodyError
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.drivers import WrongServer
-from bridges.khepera4.link import Address, Link
+from bridges.khepera4.link import Address, Khepera4Link
 from tests.bridges.khepera4.lab import Lab
 
 SERVERS = list(protocol.PARK)
@@ -76,7 +76,7 @@ def test_a_gap_of_the_link_ends_in_a_stop_over_the_same_connection(lab, server):
     robot.gap_until = begin + 0.7
     with pytest.raises(TimeoutError):
         robot.exchange(0.1, 0.0)
-    robot.driver.patience_s = 0.2  # as `Link` does
+    robot.driver.patience_s = 0.2  # as `Khepera4Link` does
     while True:
         try:
             robot.exchange(0.0, 0.0)
@@ -101,7 +101,9 @@ def test_a_command_that_has_waited_too_long_is_sent_as_a_stop(lab, server):
 
 
 def test_a_command_is_as_old_as_the_state_on_which_it_was_decided(monkeypatch):
-    link = Link("KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Settings(), (0.0, 0.0, 0.0))
+    link = Khepera4Link(
+        "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
+    )
     link.drive(0.1, 0.2, drivers.awake())
     assert link._current_twist()[:2] == (0.1, 0.2)
     assert link._current_twist()[2] == pytest.approx(drivers.awake() + FRESH_S, abs=0.4)
@@ -134,10 +136,10 @@ def test_a_server_that_several_may_be_is_asked_for_and_not_driven(lab, server):
 def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
     robot = lab("2025-05")
     with pytest.raises(WrongServer, match="as the server of 2025-05 does, not that of 2023-01-07"):
-        drivers.identify(robot, protocol.Settings(server="2023-01-07"), "2023-01-07")
+        drivers.identify(robot, protocol.Khepera4Settings(server="2023-01-07"), "2023-01-07")
     robot.program.kind = protocol.ParkServer("pose", 3, drives=True, per_turn=False, clients=1)
     with pytest.raises(WrongServer, match="as no known server does"):
-        drivers.identify(robot, protocol.Settings(), None)
+        drivers.identify(robot, protocol.Khepera4Settings(), None)
     assert set(robot.heard) == {b"stop", b"p"}
 
 
@@ -166,7 +168,7 @@ def test_way_that_is_reported_late_is_counted_once(lab):
     ],
 )
 def test_the_server_is_named_in_the_address_or_in_the_table(address, device, server):
-    assert Address.parse("R0", address).server_of("R0", protocol.Settings(**device)) == server
+    assert Address.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
 
 
 @pytest.mark.parametrize(
@@ -176,4 +178,4 @@ def test_the_server_is_named_in_the_address_or_in_the_table(address, device, ser
 )  # fmt: skip
 def test_address_and_table_must_not_contradict_one_another(address, device):
     with pytest.raises(BodyError, match=r"R0: h:.*: device\.server is "):
-        Address.parse("R0", address).server_of("R0", protocol.Settings(**device))
+        Address.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device))

@@ -16,7 +16,7 @@ from agents.body.interface import UNANSWERED, BodyError, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
 from bridges.tello.body import open_tello
-from bridges.tello.pilot import Duty, Pilot
+from bridges.tello.pilot import Duty, TelloPilot
 from tests.twins.loopback import request
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -69,7 +69,7 @@ class Cockpit:
 
     def __init__(self, **chosen):
         self.drone, self.now = Paper(), 100.0
-        self.pilot = Pilot(self.drone, TELLO, protocol.Settings(**chosen))
+        self.pilot = TelloPilot(self.drone, TELLO, protocol.TelloSettings(**chosen))
         self.report = {"bat": 80, "yaw": 20, "h": 0, "time": 0}
         self.speaks = self.attended = True
 
@@ -379,7 +379,7 @@ def test_rows_that_cannot_be_flown():
 )
 def test_wrong_settings_are_named(table):
     with pytest.raises(BodyError, match=rf"^T1: device: .*{next(iter(table))}"):
-        settings(protocol.Settings, "T1", table)
+        settings(protocol.TelloSettings, "T1", table)
 
 
 # ---------------------------------------------------------------------- djitellopy and twins

@@ -203,8 +203,8 @@ def test_avoidance_gives_ears_and_nothing_else():
     one = next(iter(read.cases().values()))
     grants = access_rights.rights([one]).robots
     mates = [name for name, robot in one.robots.items() if robot.process == "squad_E1"]
-    assert [key for key in grants[mates[0]].hear if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
-    assert grants[mates[0]].say == [f"park/{mate}/**" for mate in mates]
+    assert [key for key in grants[mates[0]].subscribe if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
+    assert grants[mates[0]].publish == [f"park/{mate}/**" for mate in mates]
 
 
 def test_whoever_carries_bodies_speaks_of_them_and_of_no_others():

@@ -12,7 +12,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agents.network.messages import Event, Heard, Pose, State, Status
+from agents.network.messages import Event, Pose, PoseReceipt, State, Status
 from experiments.recording.cdr import (
     POSE_STAMPED,
     POSE_STAMPED_SCHEMA,
@@ -80,7 +80,7 @@ everything = st.builds(
     index=st.none() | st.integers(0, 2**63 - 1),
     last=word,
 )
-heard = st.builds(Heard, word, number, finite, finite, vector, vector)
+heard = st.builds(PoseReceipt, word, number, finite, finite, vector, vector)
 state = st.builds(
     State,
     robot=word,
@@ -95,7 +95,7 @@ state = st.builds(
     error=finite,
     true_position=st.none() | vector,
     true_yaw=st.none() | finite,
-    heard=st.lists(heard, max_size=5),
+    received=st.lists(heard, max_size=5),
 )
 
 
@@ -183,7 +183,7 @@ def test_a_status_survives(battery):
         body="",
         battery=battery,
         sent=3,
-        heard=4,
+        received=4,
         lost={"TB01": 2, "KH01": 0},
         dropped={"TB01": 4},
         malformed=0,

@@ -51,8 +51,8 @@ def test_goals_on_the_way_are_as_late_as_they_were():
     right = Correction([measured("lab2", 0.0, 0.2), measured("lab2", 600.0, 0.23)])
     pose, acted = true * (1 + drift), (true + 0.1) * (1 + drift)
     followed, rest = [GoalReceipt(7, 300.05, pose, acted)], (0.0, 0.0, 0.0)
-    said = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, followed=followed)
-    goal = right.state(said).followed[0]
+    said = State("CF01", 1, acted, "running", rest, rest, 0.0, None, None, 0.0, goal_receipts=followed)
+    goal = right.state(said).goal_receipts[0]
     assert goal.stamp == 300.05, "the centre runs where the conductor does"
     assert (goal.pose, goal.acted) == pytest.approx((true, true + 0.1), abs=1e-5)
 

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from agents.network.messages import Event, Heard, HostClock
+from agents.network.messages import Event, HostClock, PoseReceipt
 from experiments.definition.experiment import Formation, Rates
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
@@ -246,11 +246,11 @@ def test_what_a_drifting_clock_stamped_is_set_right(path):
     """50 ppm over an hour are 0.18 s: what CF01 says at 3600 s it stamps 0.18 s later."""
     long = msgspec.structs.replace(PAIR, duration_s=3600.0, rates=Rates(state_hz=1.0))
     clocks = [HostClock("lab2", START, 0.2, 1e-4, ["CF01"]), HostClock("lab2", START + 3600.0, 0.38, 1e-4, ["CF01"])]
-    heard = [Heard("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
+    heard = [PoseReceipt("CF01", 9, START + 1800.09, START + 1800.01, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))]
     messages = [begun(), *clocks]
     for k in range(0, 3601, 10):
         messages += [state("TB01", k + 1, k, 0.001 * k), state("CF01", k + 1, k * (1 + 50e-6), 0.001 * k)]
-    messages += [state("TB01", 9000, 3600.5, 3.6, heard=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
+    messages += [state("TB01", 9000, 3600.5, 3.6, received=heard), pose("CF01", 1, 1800.09), landed(3600.0)]
     write(path, *messages, experiment=long)
     trace = read(path).trace
     asked = [600, 1800, 3600]
