@@ -43,8 +43,8 @@ def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], 
         poses = np.bincount(log.sent.link[within], minlength=rows * len(log.seeds)).reshape(-1, rows)
         for copy, sent in enumerate(poses):
             told, heard = 0, 0
-            if log.steered is not None:
-                seen = goals_of(log.steered, log.names, copy * rows, experiment.duration_s, "json")
+            if log.centre is not None:
+                seen = goals_of(log.centre, log.names, copy * rows, experiment.duration_s, "json")
                 told, heard = len(seen.sent), int(seen.received.sum())
                 delay.append(float(seen.delay.mean()))
             messages.append(int(sent.sum()) + told)

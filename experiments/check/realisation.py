@@ -144,12 +144,6 @@ class Shape:
         return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
 
 
-def link_errors(links: Links, position: Array) -> Array:
-    """|‖p_i − p_j‖ − d_ij| (..., E) [m] of positions (..., N, 3)."""
-    offset = position[..., links.receiver, :] - position[..., links.sender, :]
-    return np.asarray(np.abs(norm(offset) - links.distance))
-
-
 def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
     """Places where links and anchors have what they ask for, one for each guess, until one is good.
 

@@ -6,7 +6,7 @@ Draft 7, because Taplo (the TOML extension of most editors) misreads the tuples 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path as File
 from typing import Any, Final
 
 import msgspec
@@ -15,17 +15,16 @@ from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
 from experiments.file.overrides import SHAPE
+from experiments.file.problems import Path
+from experiments.file.structure import group_of
 
-_CHOICES: Final = (
-    ("Experiment", "trigger", registry.TRIGGERS),
-    ("Experiment", "prediction", registry.PREDICTORS),
-    ("Formation", "update", registry.TRIGGERS),
-    ("Formation", "law", registry.LAWS),
-    ("Leg", "plan", registry.PLANNERS),
-    ("Obstacle", "plan", registry.PLANNERS),
-    ("Experiment", "avoidance", registry.AVOIDANCES),
-    ("World", "engine", registry.ENGINES),
-)
+_OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
+    "Experiment": (),
+    "Formation": ("formation",),
+    "Leg": ("timeline", 0),
+    "Obstacle": ("arena", "obstacles", "any"),
+    "World": ("world",),
+}
 _CASE: Final = "InCase"
 
 
@@ -33,10 +32,12 @@ def schema() -> dict[str, Any]:
     """The schema, with every plug-in that is installed."""
     _, definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
     definitions = {name: _draft7(each) for name, each in definitions.items()}
-    for owner, name, group in _CHOICES:
-        field = definitions[owner]["properties"][name]
-        kept = {key: field[key] for key in ("description", "default") if key in field}
-        definitions[owner]["properties"][name] = {**kept, **_choice(group, definitions)}
+    for owner, path in _OWNERS.items():
+        fields = definitions[owner]["properties"]
+        for name, field in fields.items():
+            if (group := group_of((*path, name))) is not None:
+                kept = {key: field[key] for key in ("description", "default") if key in field}
+                fields[name] = {**kept, **_choice(group, definitions)}
     for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
         field["description"] = definitions["Channel"]["properties"][name]["description"]
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE]})
@@ -53,7 +54,7 @@ def schema() -> dict[str, Any]:
     return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
 
 
-def write_schema(path: Path) -> None:
+def write_schema(path: File) -> None:
     """Writes the schema to a file."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=2) + b"\n")
 

@@ -196,7 +196,7 @@ def _robots(
     agreements = agreement(trace)
     dropped = Counter(dict.fromkeys(trace.robots, 0))
     for link in passed:
-        dropped[link.speaker] += link.dropped
+        dropped[link.sender] += link.dropped
     numbers = {  # (N,) each
         **{"messages": sent, "bytes": size, "recorded": recorded, "listeners": listeners, "heard": delivered},
         **{"lost": trace.lost, "missed_deadlines": trace.missed_deadlines, "updates": trace.decisions},

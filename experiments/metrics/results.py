@@ -133,8 +133,8 @@ class RobotMetrics(msgspec.Struct, frozen=True):
 class Belief(msgspec.Struct, frozen=True):
     """Error of a believed position: the last pose received, extrapolated, against the true position of the sender."""
 
-    listener: str
-    speaker: str
+    receiver: str
+    sender: str
     rms: float | None  # [m]
     max: float | None  # [m]
 
@@ -142,8 +142,8 @@ class Belief(msgspec.Struct, frozen=True):
 class Passage(msgspec.Struct, frozen=True):
     """Delivery statistics of one link."""
 
-    listener: str
-    speaker: str
+    receiver: str
+    sender: str
     heard: int  # poses received
     dropped: int  # by the modelled network
     delay_mean: float | None  # [s] from the stamp of a pose to its arrival, whatever caused it

@@ -257,8 +257,8 @@ def passages(trace: Trace) -> tuple[Passage, ...]:
     columns = zip(links.receiver.tolist(), links.sender.tolist(), counts.tolist(), dropped.tolist(), strict=True)
     return tuple(
         Passage(
-            listener=trace.robots[i],
-            speaker=trace.robots[j],
+            receiver=trace.robots[i],
+            sender=trace.robots[j],
             heard=number,
             dropped=lost,
             delay_mean=float(total[k]) / number if number else None,

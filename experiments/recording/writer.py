@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
 from typing import IO, Any, Final, Literal, Self, cast
 
 import msgspec
@@ -79,12 +78,7 @@ LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; n
 
 
 class Recording:
-    """Writes one recording; used by one thread.
-
-    Attributes:
-        path: Where it is written.
-        refused: Messages that were left out, because they hold what their type excludes.
-    """
+    """Writes one recording; used by one thread."""
 
     def __init__(
         self,
@@ -112,7 +106,7 @@ class Recording:
             RecordingError: If the file exists or cannot be written.
         """
         self.path = path
-        self.refused = 0
+        self.refused = 0  # messages left out, because they hold what their type excludes
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._latest = 0  # [ns]
@@ -194,9 +188,7 @@ class Recording:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _begin(self, experiment: Experiment, document: str, about: dict[str, str]) -> None:

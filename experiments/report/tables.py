@@ -316,7 +316,7 @@ def gaps_table(cases: Sequence[CaseMetrics]) -> Table:
 def links_table(cases: Sequence[CaseMetrics]) -> Table:
     """Belief error of each link, per case; the mean and the largest over several seeds."""
     columns = [("RMS", _cell(statistics.fmean, "rms", 1000.0)), ("largest", _cell(max, "max", 1000.0))]
-    name = "{0.listener} of {0.speaker}".format
+    name = "{0.receiver} of {0.sender}".format
     return _Rows("Receiver of sender", attrgetter("belief"), name, columns).side_by_side(cases, "mm")
 
 
@@ -329,7 +329,7 @@ def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
         ("Longest [ms]", _cell(max, "delay_max", 1e3)),
     ]
-    rows: _Rows[Passage] = _Rows("Link", attrgetter("passages"), "{0.speaker} > {0.listener}".format, columns)
+    rows: _Rows[Passage] = _Rows("Link", attrgetter("passages"), "{0.sender} > {0.receiver}".format, columns)
     return tuple(
         rows.table(name, runs, {"all": [link for run in runs for link in run.passages]})
         for name, runs in by_case(cases).items()

@@ -131,9 +131,9 @@ class Logbook:
         self._received = log.received.between(copy * per_copy, (copy + 1) * per_copy)
         self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
         self._goals: Goals | None = None
-        if log.steered is not None and not log.lean:
+        if log.centre is not None and not log.lean:
             encoding = experiment.network.encoding
-            self._goals = goals_of(log.steered, log.names, copy * rows, experiment.duration_s, encoding)
+            self._goals = goals_of(log.centre, log.names, copy * rows, experiment.duration_s, encoding)
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
@@ -200,8 +200,8 @@ class Logbook:
                     pending = next(sent, None)
                 for state in states:
                     recording.write(state)
-            if self._log.steered is not None and self._goals is not None:
-                for t, goal in goal_messages(self._log.steered, self._log.names, self._mine.start):
+            if self._log.centre is not None and self._goals is not None:
+                for t, goal in goal_messages(self._log.centre, self._log.names, self._mine.start):
                     recording.write(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
                 recording.write(centre_report(self._goals, self._log.names, self._experiment.duration_s))
             for status in self._statuses():
@@ -236,8 +236,8 @@ class Logbook:
         )
         received = self._received_by_sample()
         receipts: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
-        if log.steered is not None:
-            receipts = centre_receipts(log.steered, log.time, mine.start, len(log.names))
+        if log.centre is not None:
+            receipts = centre_receipts(log.centre, log.time, mine.start, len(log.names))
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,

@@ -251,6 +251,6 @@ class VirtualNetwork:
         """(E,) samples lost on each link, from the common start to the end of the experiment."""
         return self._channel.lost
 
-    def steered(self, begin: float) -> CentreLog | None:
+    def centre_log(self, begin: float) -> CentreLog | None:
         """Messages of the central controller; None if each robot decides for itself."""
         return None if self._centre is None else self._centre.logged(begin)

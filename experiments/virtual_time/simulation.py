@@ -64,7 +64,7 @@ class Log:
     shadow_position: Array | None
     shadow_yaw: Array | None  # (K, R) of those twins
     waited: Mask  # (repetitions,) that got an order later than alone, because another one was late
-    steered: CentreLog | None = None  # None if each robot decides for itself
+    centre: CentreLog | None = None  # None if each robot decides for itself
     incidents: tuple[Incident, ...] = ()  # hazards of robots
 
 
@@ -161,7 +161,7 @@ def simulate(
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,
         waited=conductor.waited,
-        steered=network.steered(begin),
+        centre=network.centre_log(begin),
         incidents=tuple(each._replace(time=each.time - begin) for each in agent.hazards.incidents),
         **columns,
     )

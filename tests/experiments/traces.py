@@ -214,3 +214,9 @@ def simulate(what: Experiment, start: Array, case: str, threshold: float, *, see
     events = [Event(0.0, "start", "conductor", "all robots are ready")]
     events += [Event(leg.at_s, "phase", leg.robot, "begins to follow its plan") for leg in what.timeline]
     return trace(what, record, sent=sent, delay=0.001, case=case, seed=seed, events=events)
+
+
+def link_errors(links, position):
+    """|‖p_i − p_j‖ − d_ij| (..., E) [m] of positions (..., N, 3)."""
+    offset = position[..., links.receiver, :] - position[..., links.sender, :]
+    return np.abs(np.linalg.norm(offset, axis=-1) - links.distance)

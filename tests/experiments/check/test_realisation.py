@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.formation.graph import Links, links
-from experiments.check.realisation import algebraic_connectivity, conflicts, link_errors, realise, stiffness, unfolded
+from experiments.check.realisation import algebraic_connectivity, conflicts, realise, stiffness, unfolded
 from experiments.definition.plan import Plan
 from experiments.file import document
+from tests.experiments.traces import link_errors
 
 # where the reference formation may stand: TB01, KH01..03, CF01..03
 PUBLISHED = np.array(

@@ -120,7 +120,7 @@ def moving(**rest: object) -> Trace:
 
 def test_belief_error_of_a_pose_held_for_a_second():
     belief = measure.measure(moving()).belief[0]
-    assert (belief.listener, belief.speaker) == ("F", "L")
+    assert (belief.receiver, belief.sender) == ("F", "L")
     assert belief.rms == pytest.approx(0.1 / math.sqrt(3.0), rel=0.03)
     assert belief.max == pytest.approx(0.1, abs=0.1 * STEP + 1e-9)
 

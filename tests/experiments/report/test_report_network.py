@@ -31,7 +31,7 @@ def test_what_was_dropped_is_told_apart_from_what_was_lost(run):
     measured = measure(run.trace())
     assert measured.modelled
     assert measured.lost == 0
-    links = {(each.speaker, each.listener): each for each in measured.passages}
+    links = {(each.sender, each.receiver): each for each in measured.passages}
     assert len(links) == 21
     spared = links["TB01", "KH01"]
     assert (spared.dropped, spared.heard) == (0, 200)  # that of the end is under way; one from before the start came

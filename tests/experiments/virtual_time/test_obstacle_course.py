@@ -7,11 +7,11 @@ import pytest
 
 from agents.arrays import norm
 from agents.body.kinds import KINDS
-from experiments.check.realisation import link_errors
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file.document import read
 from experiments.virtual_time import simulation
+from tests.experiments.traces import link_errors
 from twins import scene as outlines
 
 RADIUS = KINDS["turtlebot3"].radius
