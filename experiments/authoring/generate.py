@@ -44,7 +44,7 @@ class Wanted:
     kind: str = "crazyflie"  # of all robots
     spacing: float = 0.6  # between neighbours [m]
     scatter: float | None = None  # of the starts [m]; None for as much as keeps neighbours apart
-    seed: int = 1  # of the file, and of what is drawn while the formation is built
+    seed: int = 1  # of the file, and of the random numbers of the layout
     duration_s: float = 60.0  # [s]
     law: str = "distance"  # distance, or displacement, which finds the shape from any starts
 

@@ -37,7 +37,7 @@ class Prediction:
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
-    incidents: tuple[Incident, ...] = ()  # what is wrong with robots on the way
+    incidents: tuple[Incident, ...] = ()  # hazards of robots on the way
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
 
 

@@ -19,7 +19,7 @@ from experiments.check.ideal_run import approaches, fly_repeatedly, isolated, re
 from experiments.check.theory import FAR_OFF, OFF
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
-NEARLY: Final = 0.9  # of its speed: what is left is needed to catch up
+NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
 SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
 SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
 

@@ -19,7 +19,7 @@ TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_
 TINY: Final = 1e-18  # [m²] no length is zero
 EXACT: Final = 1e-9  # [m] link errors below this are arithmetic
 ENOUGH: Final = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
-SLOWLY: Final = 1e-2  # of what is left: improvements of an error that is small already are not worth their time
+SLOWLY: Final = 1e-2  # share of the rest: smaller improvements of a small error are not worth their time
 ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict one another by less
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
@@ -35,7 +35,7 @@ class Residuals:
 
     def jacobian(self, rows: Index, count: int) -> Array:
         """Derivatives (M, 2 R) of all values by x and y of `rows` (R,), of `count` robots."""
-        column = np.full(count + 1, -1)  # the last stands for what is no robot
+        column = np.full(count + 1, -1)  # the last stands for anchors
         column[rows] = np.arange(len(rows))
         number, slopes = np.arange(len(self.value)), np.zeros((len(self.value), len(rows), 2))
         for end, sign in ((self.tail, 1.0), (self.head, -1.0)):

@@ -125,7 +125,7 @@ def _whole(position: Array, receivers: Index, rows: int) -> Array:
 
 
 def _without(taken: Array, whole: Array, expected: Array) -> Array:
-    """The loop on what is left when the motions of the whole (2 L, 3) are taken out that it answers as `expected`."""
+    """The loop without those motions of the whole (2 L, 3) that it answers as `expected`."""
     basis, size, mixed = np.linalg.svd(whole, full_matrices=False)
     kept = size > 1e-9 * max(1e-300, float(size.max(initial=0.0)))
     basis = basis[:, kept]

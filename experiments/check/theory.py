@@ -19,7 +19,7 @@ FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another s
 OFF: Final = 0.001  # [m] more than written digits explain
 FEW: Final = 6  # names that are listed
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
-RINGS: Final = 1.2  # beyond 1 an error changes its sign; what is left to 2 is for lag that the model does not have
+RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
 
 def network(analysis: Analysis) -> Iterator[Claim]:

@@ -231,7 +231,7 @@ class Leg(Part, frozen=True):
 
 
 class LinkChannel(Part, frozen=True):
-    """Effects on one link; what is left out is as in the channel."""
+    """Effects on one link; a field left out is that of the channel."""
 
     delay_s: Delay | None = None
     jitter_s: Delay | None = None
@@ -261,7 +261,7 @@ class Channel(LinkEffects, Part, frozen=True):
 
     outages: Annotated[list[Outage], Meta(description="times in which nothing passes")] = []
     links: Annotated[
-        dict[str, LinkChannel], Meta(description='"A > B": poses from A to B; "A - B": both ways; what is otherwise')
+        dict[str, LinkChannel], Meta(description='"A > B": poses from A to B; "A - B": both ways; the effects there')
     ] = {}
 
 

@@ -93,8 +93,8 @@ def link_target(experiment: Experiment, text: str, given: Target | float, receiv
 
     Args:
         experiment: For the heights that robots hold.
-        text: The link, which says what is the first robot and what the second.
-        given: What stands behind it.
+        text: The link, with its first and its second robot.
+        given: Its target in the file.
         receiver: The end that is asked.
     """
     given = given if isinstance(given, Target) else Target(distance=given)

@@ -26,7 +26,6 @@ from experiments.file.problems import Path as Keys
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
 _HERE: Final = ("arena", "file")
-_FIELDS: Final = frozenset(Arena.__struct_fields__)
 _BELONGS: Final = "belongs in the experiment file: an arena file holds nothing but [arena]"
 
 
@@ -129,18 +128,16 @@ def _others(folder: Path) -> list[str]:
 def _misshapen(content: Mapping[str, Any]) -> Iterator[Fault]:
     """Faults by which the content is no arena file."""
     for fault in structure.faults(content, _Whole):
-        path = fault.path
-        if not path:
+        if not fault.path:
             yield replace(fault, hint="write [arena] above its keys, such as size = [4.0, 4.0, 2.5]")
-        elif len(path) == 1 and path != ("arena",):
-            yield replace(fault, hint="write [arena] above it" if path[0] in _FIELDS else f"it {_BELONGS}")
-        elif "belongs at the top" in fault.hint:
-            yield replace(fault, hint=f"'{path[-1]}' {_BELONGS}")
+        elif fault.path[0] != "arena" or "belongs at the top" in fault.hint:
+            above = fault.path[0] in Arena.__struct_fields__
+            yield replace(fault, hint="write [arena] above it" if above else f"'{fault.path[-1]}' {_BELONGS}")
         else:
             yield fault
     arena = content.get("arena")
     if isinstance(arena, dict) and "file" in arena:
-        yield Fault(_HERE, "an arena file cannot name another", "copy what is needed from there", on_key=True)
+        yield Fault(_HERE, "an arena file cannot name another", "copy its tables from there", on_key=True)
 
 
 def _refuse(read: ArenaFile, faults: list[Fault]) -> None:

@@ -212,7 +212,7 @@ class _Reading:
     def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
         """The document with `--set`, the tables of its cases, and each case merged into the document.
 
-        What an arena file holds is put below what the experiment says of its arena, and `--set` finds it there. Only a
+        The keys of an arena file are put below those of the [arena] of the experiment, where `--set` finds them. Only a
         change of which file that is must come first.
         """
         plain = deepcopy(self.content)

@@ -81,8 +81,8 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
 
     Args:
         document: Changed in place.
-        override: What to put where.
-        part: `document` holds only what a case changes, so what is missing from it is not missing.
+        override: The value and its path.
+        part: `document` holds the changes of a case alone, so that any key may be missing.
 
     Returns:
         Whether there was a place for it.
@@ -174,7 +174,7 @@ class _NoPlace(ValueError):
 
 
 def _need(law: object) -> str:
-    """What a law needs of every link; "any" if no such law is installed."""
+    """Target that a law needs of every link; "any" if no such law is installed."""
     name = law.get("kind") if isinstance(law, Mapping) else law
     if not isinstance(name, str) or name not in registry.names(registry.LAWS):
         return "any"

@@ -21,7 +21,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
 
 LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
-_REMEDY: Final = {  # of what is missing
+_REMEDY: Final = {  # of a missing key
     "title": 'add title = "what this experiment shows"',
     "duration_s": "add duration_s = 30.0",
     "robots": 'add at least one: [robots.KH01] with kind = "khepera4" and start = [0.0, 0.0]',
@@ -127,7 +127,7 @@ def _table(
 
     Args:
         value: The table, without the `kind` of a plug-in.
-        struct: What it should be.
+        struct: Its type.
         path: Where it stands.
         plugin: Group and kind, if these are a plug-in's parameters.
     """
@@ -291,8 +291,8 @@ def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = Non
 
     Args:
         flag: Such as "--obstacle".
-        text: What stands behind it.
-        struct: What it must be; None: any object.
+        text: Its value.
+        struct: Its type; None: any object.
         path: Where it would stand in an experiment file, if it could.
 
     Raises:

@@ -1,4 +1,4 @@
-"""From bytes to a document: what is no text, no TOML or no JSON is refused with the place and a remedy."""
+"""From bytes to a document; an error of text, TOML or JSON has its place and a remedy."""
 
 from __future__ import annotations
 

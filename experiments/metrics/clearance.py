@@ -34,7 +34,7 @@ class Clearance:
 
     @classmethod
     def of_trace(cls, trace: Trace) -> Clearance:
-        """Of a whole trace. What can be pushed counts only where nothing could have pushed it."""
+        """Of a whole trace; obstacles that can be pushed count only where no world watched for contacts."""
         names, solid = trace.robots, _Cylinders.of_trace(trace)
         robots: list[Approach | None] = [None] * len(names)
         arena: list[Approach | None] = [None] * len(names)
@@ -111,7 +111,7 @@ def _gap(level: Array, upright: Array, free: Mask) -> Array:
 
 
 def _nearer(known: Approach | None, time: Array, gap: Array, between: tuple[str, str]) -> Approach | None:
-    """The closest of what is known and of gaps (T,) over time."""
+    """The closer of a known approach and of gaps (T,) over time."""
     k = int(gap.argmin())
     if not np.isfinite(gap[k]) or (known is not None and known.gap <= gap[k]):
         return known

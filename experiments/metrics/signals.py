@@ -57,7 +57,7 @@ class LinkErrors:
     # is not there
     error: Array
     alive: Mask  # (T, N) whether the robot's own position is known
-    away: Mask  # (T,) the network was away, see `network_away`: what is unknown then tells nothing of a robot
+    away: Mask  # (T,) the network was away, see `network_away`: unknown positions then tell nothing of a robot
 
     @classmethod
     def of_trace(cls, trace: Trace) -> LinkErrors:
@@ -137,7 +137,7 @@ def formation_errors(trace: Trace) -> Array:
 
 
 def mean_known(values: Array) -> Array:
-    """Mean over the first axis of what is finite; NaN where nothing is (`nanmean` would warn)."""
+    """Mean of the finite values over the first axis; NaN where there is none (`nanmean` would warn)."""
     known = np.isfinite(values)
     count = known.sum(axis=0)
     total = np.where(known, values, 0.0).sum(axis=0)

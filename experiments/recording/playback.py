@@ -61,22 +61,22 @@ class Playback:
 def read(path: Path) -> Playback:
     """Reads a recording.
 
-    Positions and yaw are interpolated onto the grid, goals and setpoints are the last at or before. A robot that never
-    reported is NaN; one that fell silent is NaN from two state periods after its last sample, and inside holes of more
-    than a second. Attitude is interpolated as well, and where the twins beside the robots were.
+    Positions, yaw, attitude and the poses of shadow twins are interpolated onto the grid; goals and setpoints are the
+    last at or before. A robot that never reported is NaN; one that fell silent is NaN from two state periods after its
+    last sample, and inside holes of more than a second.
 
-    `lost` of a robot adds up what its sequence numbers prove: (1) gaps among its poses recorded in the run, where a
-    number that goes back is a publisher that began anew at 1; (2) what its last status of the run counts as sent beyond
-    the last pose recorded until then; (3) what the last status of each receiver counts as lost from it, less what the
-    same process counted before the common start. A pose that two listeners and the recorder missed counts three times:
-    each of them was owed it. What the modelled network dropped is no loss: `dropped` is what the listeners counted.
+    `lost` of a robot is the sum of: (1) gaps in the sequence numbers of its poses recorded in the run, where a number
+    that goes back is a publisher that began anew at 1; (2) poses beyond the last recorded one that its last status of
+    the run counts as sent; (3) poses that the last status of each receiver counts as lost from it, less the count of
+    the same process before the common start. A pose that two receivers and the recorder missed counts three times, for
+    each was to get it. Poses that the modelled network dropped are not lost; the receivers count them in `dropped`.
 
-    The trace of a run that did not last as long as its experiment ends with the run: where the conductor began to land
-    everybody (interrupted by the user, or all robots had come down before), else, when the recorder or the conductor
-    was killed, with the last that is known of the robots while they ran. Nothing of a landing is in the trace.
+    The trace of a shorter run than its experiment ends where the conductor began to land all robots (interrupted by
+    the user, or all had come down before); after a kill of recorder or conductor, with the last known samples of
+    running robots. It holds nothing of a landing.
 
-    What robots on other machines stamped is set right by what their clocks drifted in the run; their offset at its
-    beginning was taken off where the stamps were made.
+    Stamps of robots on other machines are corrected by the drift of their clocks in the run; their offset at its
+    beginning was subtracted where they were made.
 
     Raises:
         NotStarted: If the run ended before its common start.

@@ -70,7 +70,7 @@ def imported(text: str, label: str, duration_s: float, poses: str | None = None)
         poses: A file with starts, see `starts_from`; they go before those of theirs.
 
     Raises:
-        DocumentError: With what is wrong with theirs, by the path of the key.
+        DocumentError: With the errors in theirs, by the path of the key.
     """
     notes: list[str] = []
     park = read(label, text, {} if poses is None else starts_from(poses))

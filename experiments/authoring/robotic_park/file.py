@@ -285,7 +285,7 @@ def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
         poses: Of robots by name, from elsewhere; they go before those of the file.
 
     Raises:
-        DocumentError: With what is wrong with it or the files that it names, by the paths of the keys.
+        DocumentError: With all errors in it and in the files that it names, by the paths of the keys.
     """
     root = load(file, text)
     older = [] if root.has("Robots") else [each for each in root.tables() if any(map(each.has, OLDER))]
@@ -411,7 +411,7 @@ def _pose(entry: Entry, listed: _Robot, given: _Robot) -> Pose | None:
 
 
 def pose_of(entry: Entry, pose: str | list[float]) -> Pose:
-    """x, y and z or yaw of a text or a list; what is left out is 0."""
+    """x, y and z or yaw of a text or a list; 0 where left out."""
     parts = [part for part in re.split(r"[,\s]+", pose) if part] if isinstance(pose, str) else pose
     values = replace(entry, value=parts).typed(list[Number])
     if len(values) not in (2, 3):

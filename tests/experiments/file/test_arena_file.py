@@ -160,7 +160,7 @@ def test_an_arena_file_is_told_what_belongs_elsewhere(lab):
         read(lab(arena="[arena]\nseed = 3\n[robots.KH01]\n"))
     hints = [problem.hint for problem in caught.value.problems]
     assert hints[0].startswith("'seed' belongs in the experiment file")
-    assert hints[1].startswith("it belongs in the experiment file")
+    assert hints[1].startswith("'robots' belongs in the experiment file")
 
 
 def test_what_the_experiment_makes_wrong_of_it_points_into_both_files(lab):
