@@ -65,13 +65,13 @@ class LinkEffects(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     delay_s: Annotated[
         Delay,
-        Meta(description="from sender to receiver [s]; in real time what the network itself takes counts towards it"),
+        Meta(description="from sender to receiver [s]; in real time the delay of the network itself counts towards it"),
     ] = 0.001
     jitter_s: Annotated[Delay, Meta(description="mean of an exponential addition [s]")] = 0.0
     loss: Annotated[Share, Meta(description="share of samples that never arrive")] = 0.0
     burst: Annotated[
         AtLeastOne | None,
-        Meta(description="mean number of samples that are lost in a row; left out: each is lost or not by itself"),
+        Meta(description="mean number of samples lost in a row; left out: each is lost or not by itself"),
     ] = None
     bandwidth: Annotated[Positive | None, Meta(description="of each link [bit/s] of payload; left out: no limit")] = (
         None

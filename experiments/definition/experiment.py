@@ -62,10 +62,10 @@ class Arena(Part, frozen=True):
 class Rates(Part, frozen=True):
     """Rates [Hz]; pose_hz, coordination_hz and state_hz divide body_hz."""
 
-    body_hz: Annotated[Rate, Meta(description="position control and body")] = 100.0
-    pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked")] = 50.0
-    coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided")] = 10.0
-    state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers")] = 50.0
+    body_hz: Annotated[Rate, Meta(description="position control and body [1/s]")] = 100.0
+    pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked [1/s]")] = 50.0
+    coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided [1/s]")] = 10.0
+    state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers [1/s]")] = 50.0
 
 
 class Robot(Part, frozen=True):
@@ -107,7 +107,7 @@ class Target(Part, frozen=True):
     ] = None
     bearing: Annotated[
         Vector | None,
-        Meta(description="direction x, y (, z) from the first robot to the second; seen from above if z is left out"),
+        Meta(description="direction x, y (, z) from the first robot to the second; z left out: as seen from above"),
     ] = None
 
     def __post_init__(self) -> None:
@@ -122,7 +122,10 @@ class Target(Part, frozen=True):
 class Link(Target, frozen=True):
     """Link with a target other than a distance, a gain of its own, or a limited time."""
 
-    gain: Annotated[Positive | None, Meta(description="the formation's if left out")] = None
+    gain: Annotated[
+        Positive | None,
+        Meta(description="[1/(m²·decision)] of a distance, else [1/decision]; left out: that of the formation"),
+    ] = None
     from_s: Annotated[NotNegative, Meta(description="the link is there from then on [s]")] = 0.0
     until_s: Annotated[Positive | None, Meta(description="and until then [s]; left out: to the end")] = None
 
@@ -137,10 +140,17 @@ class Anchor(Part, frozen=True):
 
     distance: Annotated[NotNegative, Meta(description="[m]; 0: on it")] = 0.0
     to: Annotated[Vector | None, Meta(description="the point, x, y (, z) [m]; left out: the origin")] = None
-    along: Annotated[Vector | None, Meta(description="direction of a line through that point")] = None
-    across: Annotated[Vector | None, Meta(description="direction across a plane through that point")] = None
+    along: Annotated[
+        Vector | None, Meta(description="direction x, y (, z) of a line through that point, of any length")
+    ] = None
+    across: Annotated[
+        Vector | None, Meta(description="direction x, y (, z) across a plane through that point, of any length")
+    ] = None
     gain: Annotated[
-        Positive | None, Meta(description="left out: twice the formation's gain, or its stiffness where distance is 0")
+        Positive | None,
+        Meta(
+            description="[1/(m²·decision)]; left out: twice that of the formation, or its stiffness where distance is 0"
+        ),
     ] = None
 
     def __post_init__(self) -> None:
@@ -165,7 +175,9 @@ class Change(Part, frozen=True):
         dict[Name, Vector],
         Meta(description="places of robots, x, y (, z) [m]: new targets of the links that have theirs from a shape"),
     ] = {}
-    scale: Annotated[Positive, Meta(description="of the shape seen from above, as it is then; heights stay")] = 1.0
+    scale: Annotated[
+        Positive, Meta(description="of the shape seen from above, as a multiple of the shape before; heights stay")
+    ] = 1.0
     rotate: Annotated[float, Meta(description="to the left [rad]; not for distances, which know no direction")] = 0.0
 
 
@@ -292,7 +304,7 @@ class Network(Part, frozen=True):
         Meta(
             ge=1,
             le=8,
-            description="how many are started, each in its own process; a member that loses one goes on at the next",
+            description="number of routers, each in a process; a member that loses one goes on at the next",
         ),
     ] = 1
     address: Annotated[
@@ -330,7 +342,9 @@ class World(Part, frozen=True):
     """World that all twins share in virtual time, and those with `body = "world"` in real time."""
 
     engine: Annotated[Choice, Meta(description="a registered engine")] = "point-mass"
-    sensor_noise: Annotated[NotNegative, Meta(description="of range sensors, as a multiple of the real ones'")] = 1.0
+    sensor_noise: Annotated[
+        NotNegative, Meta(description="of range sensors, as a multiple of the noise of real ones")
+    ] = 1.0
     patience_s: Annotated[
         Positive, Meta(description="a robot whose world is gone holds for this long, then lands [s]")
     ] = 30.0
