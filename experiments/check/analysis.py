@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -31,7 +31,7 @@ from experiments.check.realisation import (
 )
 from experiments.check.stability import Modes, modes
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import Experiment, Link
 from experiments.definition.formation import FormationArrays, errors_over_time
 from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
@@ -178,6 +178,30 @@ class Analysis:
             (("formation", "links", text) for text in self.experiment.formation.links if ends in link_pairs(text)),
             ("formation", "links"),
         )
+
+    def fitting_links(self) -> dict[str, Link]:
+        """The links of the file with the nearest targets that fit together: those of the best shape, rounded to 0.1 mm.
+
+        Empty where the shape has no links.
+        """
+        if self.shape is None:
+            return {}
+        place = dict(zip(self.names, np.round(self.shape.position, 5), strict=True))
+        return {
+            text: _fitting(given if isinstance(given, Link) else Link(distance=given), *link_pairs(text)[0], place)
+            for text, given in self.experiment.formation.links.items()
+        }
+
+
+def _fitting(given: Link, second: str, first: str, place: Mapping[str, Array]) -> Link:
+    """A link with the target that two places have."""
+    offset = place[second] - place[first]
+    if given.distance is not None:
+        return msgspec.structs.replace(given, distance=round(float(norm(offset)), 4))
+    count = len(given.offset or given.bearing or ())
+    if given.offset is not None:
+        return msgspec.structs.replace(given, offset=np.round(offset[:count], 4).tolist())
+    return msgspec.structs.replace(given, bearing=np.round(offset[:count] / norm(offset[:count]), 4).tolist())
 
 
 def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:

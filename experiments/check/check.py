@@ -124,9 +124,16 @@ def check(given: Document) -> list[Finding]:
     return _findings(given, _analyses(given.cases()))
 
 
-def examine(given: Document) -> tuple[list[Finding], dict[str, Figures]]:
+def analyses(given: Document) -> dict[str, Analysis]:
+    """Analysis of each case, by its name."""
+    return _analyses(given.cases())
+
+
+def examine(
+    given: Document, analyses: Mapping[str, Analysis] | None = None
+) -> tuple[list[Finding], dict[str, Figures]]:
     """Findings of all cases, as `check`, and the figures of each case by its name."""
-    analyses = _analyses(given.cases())
+    analyses = _analyses(given.cases()) if analyses is None else analyses
     figures_of = {name: _figures(analysis) for name, analysis in analyses.items()}
     return _findings(given, analyses), figures_of
 

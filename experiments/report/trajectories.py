@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,14 +17,17 @@ from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from agents.arrays import Array
+from experiments.check.analysis import Analysis
 from experiments.metrics.signals import phase_starts
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
     INK,
+    KINDS,
     MAGENTA,
     MANY,
     PAPER,
+    ROBOTS,
     WIDTH,
     edges,
     last_known,
@@ -87,6 +90,50 @@ def plan_view(traces: Sequence[Trace]) -> Figure:
     figure.supylabel("$y$ [m]", fontsize=8)
     robot_legend(figure, traces, things)
     return figure
+
+
+@styled
+def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
+    """The formation of each case as `check` expects it, from above: starts hollow, expected ways, target shape with its
+    links (dashed where the shape misses their targets by more than the tolerance).
+    """
+    cases = list(analyses.items())
+    x, y, _ = cases[0][1].experiment.arena.size
+    columns = min(2, len(cases))
+    rows = math.ceil(len(cases) / columns)
+    panel = min((WIDTH - 0.5) / columns * y / x, 3.2) + 0.25
+    figure = Figure(figsize=(WIDTH, panel * rows + 0.4), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes, (name, known) in zip(grid.flat, cases, strict=False):
+        experiment, motion = known.experiment, known.prediction.position
+        scenery.from_above(axes, experiment)
+        target = motion[-1] if known.shape is None else _laid_upon(known.shape.position, motion[-1])
+        error = np.zeros(len(known.asked)) if known.shape is None else known.shape.error
+        for link, (i, j) in enumerate(zip(known.asked.receiver, known.asked.sender, strict=True)):
+            style = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
+            axes.plot(*target[[i, j], :2].T, color=MAGENTA, linewidth=0.8, linestyle=style, zorder=1)
+        for row, robot in enumerate(known.names):
+            colour = ROBOTS[row % len(ROBOTS)] if len(known.names) <= MANY else KINDS[experiment.robots[robot].kind]
+            axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
+            axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
+            axes.plot(*target[row, :2], "o", ms=3.5, mec="none", color=colour, zorder=3)
+            axes.annotate(robot, target[row, :2], (3, 3), textcoords="offset points", fontsize=5, color=colour)
+        axes.set_aspect("equal")
+        axes.set_xlim(-0.53 * x, 0.53 * x)
+        axes.set_ylim(-0.53 * y, 0.53 * y)
+        axes.set_title(plain(name), pad=3.0)
+    for axes in list(grid.flat)[len(cases) :]:
+        axes.set_visible(False)
+    figure.supxlabel("$x$ [m]", fontsize=8)
+    figure.supylabel("$y$ [m]", fontsize=8)
+    return figure
+
+
+def _laid_upon(shape: Array, place: Array) -> Array:
+    """A shape (N, 3), turned or mirrored in the plane and moved to fit places (N, 3) in the least squares (Kabsch)."""
+    middle, at = shape[:, :2].mean(axis=0), place[:, :2].mean(axis=0)
+    left, _, right = np.linalg.svd((shape[:, :2] - middle).T @ (place[:, :2] - at))
+    return np.column_stack([(shape[:, :2] - middle) @ left @ right + at, shape[:, 2]])
 
 
 def before(trace: Trace) -> slice:

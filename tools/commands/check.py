@@ -13,6 +13,7 @@ import typer
 from tools.commands.options import As, AsJson, Bodies, Cases, File, Here, Lab, Out, Settings, check_bodies
 
 if TYPE_CHECKING:
+    from experiments.check.analysis import Analysis
     from experiments.check.check import Figures, Finding
     from experiments.file.document import Document
     from experiments.real_time.conductor.preflight_checks import RobotChecks
@@ -24,9 +25,20 @@ CHECKED: Final = {"ok": "✓", "warn": "!", "bad": "✗", "unknown": "·"}
 
 
 @app.command()
-def check(file: File, settings: Settings = None, as_json: AsJson = False) -> int:
-    """Check an experiment file and say what theory says of it."""
-    from experiments.check.check import examine, unreadable
+def check(
+    file: File,
+    *,
+    settings: Settings = None,
+    fix: Annotated[
+        bool, typer.Option("--fix", help="Print the links with the nearest targets that fit together.")
+    ] = False,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw target shape, links and expected ways (.svg, .pdf, .png).")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Check an experiment file and say what theory says of it; exit code 1 if it has errors."""
+    from experiments.check.check import analyses, examine, unreadable
     from experiments.file import document
     from experiments.file.problems import DocumentError
 
@@ -37,12 +49,47 @@ def check(file: File, settings: Settings = None, as_json: AsJson = False) -> int
             raise
         _print_json(file, [unreadable(each) for each in error.problems], {})
         return 2
-    found, numbers = examine(given)
+    analysed = analyses(given)
+    found, numbers = examine(given, analysed)
     if as_json:
         _print_json(str(given.path), found, numbers)
     else:
         _print_table(given, found, numbers)
-    return 2 if any(each.severity == "error" for each in found) else 0
+    if fix and not as_json:
+        _print_fitting(analysed)
+    if plot is not None:
+        _draw(analysed, plot)
+    return 1 if any(each.severity == "error" for each in found) else 0
+
+
+def _print_fitting(analysed: Mapping[str, Analysis]) -> None:
+    """Prints the links of the first case, and of further cases where they differ."""
+    from msgspec import to_builtins
+
+    from experiments.file.reference import written
+
+    printed: list[object] = []
+    for case, known in analysed.items():
+        links = known.fitting_links()
+        if links in printed:
+            continue
+        print(f"\n[{'formation.links' if not printed else f'cases.{case}.formation.links'}]")
+        for text, link in links.items():
+            told = to_builtins(link)
+            print(f"{written(text)} = {written(told['distance'] if set(told) == {'distance'} else told)}")
+        printed.append(links)
+
+
+def _draw(analysed: Mapping[str, Analysis], file: Path) -> None:
+    from experiments.report.trajectories import expected_motion
+
+    if file.suffix not in {".svg", ".pdf", ".png"}:
+        raise typer.BadParameter(f"{file}: the name must end in .svg, .pdf or .png", param_hint="--plot")
+    try:
+        expected_motion(analysed).savefig(file, dpi=200)
+    except OSError as error:
+        raise typer.BadParameter(f"{file}: {error.strerror}", param_hint="--plot") from None
+    print(f"\n{file}: target shape, links and expected ways")
 
 
 @app.command()

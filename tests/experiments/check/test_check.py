@@ -399,32 +399,32 @@ def test_the_place_is_in_the_case_that_changes_it(tmp_path):
 
 
 def test_the_table(capsys):
-    assert commands.check(PARK, [], as_json=False) == 0
+    assert commands.check(PARK, settings=[], as_json=False) == 0
     said = capsys.readouterr().out
     assert "✓ the formation is rigid, rank 11 of 11" in said
     assert "! KH01 follows at 0.095 m/s" in said
     assert "periodic 350.0 per second, event" in said
     assert said.endswith("no errors, 1 warning\n")
-    assert commands.check(PARK, ["formation.gain=10"], as_json=False) == 2
+    assert commands.check(PARK, settings=["formation.gain=10"], as_json=False) == 1
     assert "✗ the formation hunts" in capsys.readouterr().out
 
 
 def test_json(capsys):
-    assert commands.check(PARK, ["robots.CF01.hover=0.81"], as_json=True) == 2
+    assert commands.check(PARK, settings=["robots.CF01.hover=0.81"], as_json=True) == 1
     said = json.loads(capsys.readouterr().out)
     assert said["file"].endswith("robotic-park.toml")
     assert said["ok"] is False
     assert said["findings"][0]["code"] == "too-high"
     assert said["figures"].keys() == {"periodic", "event"}
     assert said["figures"]["event"].keys() == set(Figures.__struct_fields__)
-    assert commands.check("triangle", [], as_json=True) == 0
+    assert commands.check("triangle", settings=[], as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["ok"] is True
 
 
 def test_a_file_that_cannot_be_read(capsys):
     with pytest.raises(DocumentError, match="no robot is called"):
-        commands.check(PARK, ["formation.leader=TB02"], as_json=False)
-    assert commands.check(PARK, ["formation.leader=TB02"], as_json=True) == 2
+        commands.check(PARK, settings=["formation.leader=TB02"], as_json=False)
+    assert commands.check(PARK, settings=["formation.leader=TB02"], as_json=True) == 2
     said = json.loads(capsys.readouterr().out)
     assert (said["ok"], said["findings"][0]["code"], said["figures"]) == (False, "document", {})
 
@@ -432,7 +432,7 @@ def test_a_file_that_cannot_be_read(capsys):
 def test_a_terminal_without_greek(monkeypatch):
     out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", out)
-    assert commands.check("triangle", [], as_json=False) == 0
+    assert commands.check("triangle", settings=[], as_json=False) == 0
     out.seek(0)
     assert "no errors, no warnings" in out.read()
 
@@ -456,7 +456,7 @@ def test_a_terminal_without_greek(monkeypatch):
     ],
 )
 def test_absurd_numbers_end_in_findings(change, capsys):
-    assert commands.check(PARK, [change, "duration_s=25"], as_json=True) in (0, 2)
+    assert commands.check(PARK, settings=[change, "duration_s=25"], as_json=True) in (0, 2)
     assert "Infinity" not in capsys.readouterr().out
 
 
