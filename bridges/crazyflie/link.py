@@ -28,6 +28,7 @@ FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two r
 SILENCE_S: Final = 1.0  # between two answers while the connection is set up
 ANSWER_S: Final = 3.0  # to the answer about a parameter
 REPEAT_S: Final = 0.3  # a question about a parameter is repeated after this
+BUSY_S: Final = 0.1  # gap after which a packet that waits is not being sent
 POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never before `Link.gap` has told
 JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
@@ -163,9 +164,9 @@ class CrazyflieLink:
 
     @property
     def busy(self) -> bool:
-        """Whether a packet waits for the radio: one more would block the sender."""
+        """Whether a packet waits for a radio that is silent: one more would block the sender until the gap is over."""
         waiting = getattr(self.cf.link, "out_queue", None)
-        return waiting is not None and bool(waiting.full())
+        return waiting is not None and self.gap > BUSY_S and bool(waiting.full())
 
     def open(self, deadline: float, end: threading.Event, meanwhile: Callable[[CrazyflieLink], None]) -> None:
         """Connect; give up at `deadline` on the monotonic clock [s], or at `end`.

@@ -296,9 +296,9 @@ class CrazyfliePilot:
             try:
                 self._mend_gap(link, now)
                 self._execute_order()
-                self._forward_external_pose(link, now)
                 self._flight.update_phase(now)
                 self._flight.send_due(now)
+                self._forward_external_pose(link, now)
             except OrderReplaced:
                 self._wake.set()
             if self._ending.is_set() and self._order is None:

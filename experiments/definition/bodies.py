@@ -25,7 +25,7 @@ VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
 # what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
 # hang on one radio, all Tellos of a computer on one port), and the source of its position
 PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
-    "crazyflie": ("crazyflie-twin", "radio0", "body"),
+    "crazyflie": ("crazyflie-twin", "radio0", "external"),
     "tello": ("tello-twin", "tellos", "external"),
     "khepera4": ("khepera4-twin", None, "external"),
     "turtlebot3": ("turtlebot3-twin", None, "external"),
@@ -184,9 +184,10 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
 
 
 def behind_protocols(experiment: Experiment) -> Experiment:
-    """Put every robot behind its real bridge and a protocol twin, with simulated motion capture."""
+    """Put every robot behind its real bridge and a protocol twin, with simulated motion capture and radio."""
     robots = {}
     for name, robot in experiment.robots.items():
         body, process, position = PROTOCOL[robot.kind]
-        robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position)
+        device = robot.device | {"link": "radio"} if robot.kind == "crazyflie" else robot.device
+        robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position, device=device)
     return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)

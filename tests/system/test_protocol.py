@@ -29,7 +29,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     bodies = {name: line for name in children for line in [children[name].cmdline()]}
     assert bodies["CF01"] == bodies["CF02"] == bodies["CF03"], "one radio, one process"
     addressed = json.loads((folder / "event-addressed.json").read_text())["robots"]
-    assert addressed["CF01"]["body"].startswith("udp://127.0.0.1:")
+    assert addressed["CF01"]["body"].startswith("radio://0/80/2M/E7E7E7E701?software=127.0.0.1:")
     assert addressed["KH01"]["body"].startswith("khepera4://127.0.0.1:")
     assert addressed["TB01"]["body"].startswith(("ros2dds://", "rmw://"))
     everyone = list(children.values())

@@ -118,6 +118,31 @@ def test_random_losses(loss):
         assert process.state.notes[0] == ""
 
 
+def test_setpoints_go_on_beside_external_positions():
+    """Two packets in each period, and room for one in the queue of the driver: neither starves the other."""
+    with flown(rows=2, device=RADIO, external=True) as (twin, process):
+        tick, oldest = process.tick, np.zeros(2)
+
+        def located():
+            for row in range(2):
+                process.body.locate(row, process.t, truth(twin, row), 0.0)
+            return tick()
+
+        process.tick = located
+        process.until(lambda: np.isfinite(process.state.position).all(), "settled")
+        process.takeoff(HEIGHT)
+        hovering(process, rows=2).run(0.5)
+        received = twin.device.flock.estimator.received.copy()
+        end = process.t + 4.0
+        while process.t < end:
+            process.tick()
+            flock = twin.device.flock
+            oldest = np.maximum(oldest, flock.commander.setpoint_age(flock.t))
+        assert oldest.max() < 0.4, "the firmware levels out after 0.5 s"
+        assert (twin.device.flock.estimator.received - received).min() > 30
+        process.land()
+
+
 class Unanswered:
     """Loses the answers of a drone on one port."""
 
