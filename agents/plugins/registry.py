@@ -124,6 +124,14 @@ def body_name(address: str) -> str:
     return address.partition("://")[0]
 
 
+def distributions() -> dict[str, str]:
+    """Installed distributions with plug-ins, and their versions, but for our own."""
+    groups = (BODIES, DEVICES, TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)
+    entries = [entry for group in groups for entry in _installed().select(group=group)]
+    owners = {entry.dist.name: entry.dist.version for entry in entries if entry.dist is not None}
+    return {name: owners[name] for name in sorted(owners) if name != "zenpark"}
+
+
 @cache
 def _installed() -> _Groups:
     """Cached, and all groups at once: reading the metadata of all installed distributions takes milliseconds."""

@@ -7,10 +7,12 @@ the same annotations and lets msgspec judge one value at a time, so that everyth
 from __future__ import annotations
 
 import math
+import pathlib
 import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from inspect import getfile
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
@@ -83,6 +85,25 @@ def group_of(path: Path) -> str | None:
         case _:
             return None
     return group
+
+
+def plugin_files(experiment: Experiment) -> set[pathlib.Path]:
+    """Modules of the plug-ins that an experiment chooses; other modules that they import are not among them."""
+    chosen = _choices(msgspec.to_builtins(experiment), ())
+    return {pathlib.Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen}
+
+
+def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
+    """Every plug-in that is chosen in a document: its group, and the choice."""
+    group = group_of(path)
+    if group is not None and value is not None:
+        yield group, value
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from _choices(each, (*path, key))
+    elif isinstance(value, list | tuple):
+        for number, each in enumerate(value):
+            yield from _choices(each, (*path, number))
 
 
 def parameters(group: str, kind: str) -> list[str]:

@@ -4,7 +4,7 @@ The recorder subscribes by this table, the writer and the playback look topics u
 `/<robot>/true_pose` (geometry_msgs/PoseStamped), the place of a robot in a type that every viewer draws.
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
-the metadata record `zenpark` has case, seed, clock and version.
+the metadata record `zenpark` has case, seed, clock, and the code, versions and machine that made it.
 """
 
 from __future__ import annotations

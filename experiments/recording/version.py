@@ -1,16 +1,76 @@
-"""Which zenpark this is: two machines have the same one if its code is the same to the letter."""
+"""Which zenpark this is, and where it runs: two machines have the same one if its code is the same to the letter."""
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
+import os
+import platform
+import shutil
+import socket
+import subprocess
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
+from agents.plugins import registry
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 SHOWN: Final = 8  # characters of a digest that people compare
+# of these the version may change what a run comes to, or what is said on a wire; those not installed are left out
+LIBRARIES: Final = ("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "cflib", "djitellopy", "rosbags")
+GIT_S: Final = 5.0
+UNSYNCHRONISED: Final = 5  # what adjtimex returns for a clock that nothing keeps right (TIME_ERROR)
+TIMEX_BYTES: Final = 256  # more than struct timex has
+
+
+class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Code, versions and machine with which something was made."""
+
+    zenpark: str  # version
+    code: str  # digest of all modules, see `digest`
+    python: str
+    packages: dict[str, str]  # versions of `LIBRARIES`
+    commit: str = ""  # of a checkout; "+changes" behind it if files differ from it
+    plugins: dict[str, str] = {}  # distributions that have plug-ins, but for our own, and their versions
+    host: str = ""
+    system: str = ""
+    cpu: str = ""
+    cores: int = 0
+    memory_gb: float = 0.0
+    load: float | None = None  # processes that wanted a core in the minute before
+    clock: str = ""  # whether something keeps the clock right, and how well
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Code, versions and machine in a sentence each, for people."""
+        code = f"zenpark {self.zenpark}, code {self.code[:SHOWN]}"
+        code += f", commit {self.commit[:SHOWN]}{' with changes' if self.commit.endswith('+changes') else ''}" * bool(
+            self.commit
+        )
+        used = [f"Python {self.python}", *(f"{name} {number}" for name, number in self.packages.items())]
+        added = [f"plug-ins of {name} {number}" for name, number in self.plugins.items()]
+        machine = [self.system, self.cpu, f"{self.cores} cores", f"{self.memory_gb:.0f} GB"]
+        load = [] if self.load is None else [f"load {self.load:.1f} before"]
+        clock = [f"clock {self.clock}"] if self.clock else []
+        return code, ", ".join([*used, *added]), ", ".join([self.host, *filter(None, machine), *load, *clock])
+
+    def differences(self, other: Provenance) -> list[str]:
+        """What differs in code and versions, in words; machines differ without being named."""
+        found = []
+        if self.code != other.code:
+            found.append(f"code {self.code[:SHOWN]}, not {other.code[:SHOWN]}")
+        mine, theirs = ({"Python": each.python, **each.packages, **each.plugins} for each in (self, other))
+        return found + [
+            f"{name} {mine.get(name, 'missing')}, not {theirs.get(name, 'missing')}"
+            for name in sorted(mine.keys() | theirs.keys())
+            if mine.get(name) != theirs.get(name)
+        ]
 
 
 @cache
@@ -25,7 +85,82 @@ def digest(root: Path = ROOT) -> str:
 
 def number() -> str:
     """The installed version."""
+    return _version("zenpark") or "unknown"
+
+
+def provenance() -> Provenance:
+    """Code, versions and machine of this process, now."""
+    packages = {name: found for name in LIBRARIES if (found := _version(name)) is not None}
+    with suppress(OSError, ValueError):
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    return Provenance(
+        zenpark=number(),
+        code=digest(),
+        python=platform.python_version(),
+        packages=packages,
+        commit=_commit(),
+        plugins=registry.distributions(),
+        host=socket.gethostname(),
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        cpu=_cpu(),
+        cores=os.cpu_count() or 0,
+        memory_gb=round(memory, 1),
+        load=load(),
+        clock=clock_quality(),
+    )
+
+
+def load() -> float | None:
+    """Processes that wanted a core in the last minute, on average; None where the system does not tell."""
     try:
-        return version("zenpark")
+        return round(os.getloadavg()[0], 2)
+    except (AttributeError, OSError):
+        return None
+
+
+def clock_quality() -> str:
+    """Whether a time service keeps the clock right, and within what, by the kernel; empty where it does not tell."""
+    try:
+        adjtimex = ctypes.CDLL(None, use_errno=True).adjtimex
+    except (AttributeError, OSError):
+        return ""
+    timex = (ctypes.c_long * (TIMEX_BYTES // ctypes.sizeof(ctypes.c_long)))()  # modes, offset, freq, maxerror [µs], ...
+    state = adjtimex(ctypes.byref(timex))
+    if state < 0:
+        return ""
+    return "not synchronised" if state == UNSYNCHRONISED else f"synchronised within {timex[3] / 1e3:.1f} ms"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
     except PackageNotFoundError:
-        return "unknown"
+        return None
+
+
+@cache
+def _commit() -> str:
+    """Commit of the checkout, with "+changes" if files differ from it; empty without git."""
+    if not (ROOT / ".git").exists() or shutil.which("git") is None:
+        return ""
+    try:
+        head, changed = (
+            subprocess.run(
+                ["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True, timeout=GIT_S
+            ).stdout.strip()
+            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return head + ("+changes" if changed else "")
+
+
+@cache
+def _cpu() -> str:
+    """Name of the processor; that of its architecture where the system does not tell."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() in ("model name", "Model"):
+                return value.strip()
+    return platform.processor()

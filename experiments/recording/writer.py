@@ -126,7 +126,10 @@ class Recording:
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._index = ChunkIndices(path.parent)
         self._index.stand_in(self._writer)
-        about = {"case": case, "seed": str(seed), "clock": clock, "version": version.number()}
+        made = version.provenance()
+        about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
+        about |= {"code": made.code, "commit": made.commit, "python": made.python, "host": made.host, "cpu": made.cpu}
+        about |= made.packages | made.plugins
         if started is not None:
             about["started"] = repr(started)
         try:

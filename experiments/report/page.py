@@ -108,8 +108,9 @@ def render(
     command: str,
     verdict: Sequence[Finding],
     sections: Sequence[Section],
+    foot: Sequence[str] = (),
 ) -> Path:
-    """Writes a page that needs nothing else: facts and findings on top, then the sections."""
+    """Writes a page that needs nothing else: facts and findings on top, then the sections, a `foot` of small lines."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
 
     pages = Environment(
@@ -120,7 +121,7 @@ def render(
         lstrip_blocks=True,
     )
     page = pages.get_template(TEMPLATE).render(
-        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections
+        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections, foot=foot
     )
     target.write_text(page, encoding="utf-8")
     return target

@@ -13,7 +13,9 @@ import msgspec
 from experiments.metrics.measure import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.statistics import by_case
+from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, read_origin
 from experiments.recording.trace import Trace
+from experiments.recording.version import provenance
 from experiments.report import figures, scenery
 from experiments.report.page import Finding, PageFigure, Section, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
@@ -62,14 +64,6 @@ NETWORK: Final = (
     "were discarded. Delays are from the stamp of a pose to its arrival, whatever caused them."
 )
 MOST_LINKS: Final = 60  # longer tables are folded
-ORIGIN: Final = "run.json"  # how and when a run was made, for when its report is made again
-
-
-class RunOrigin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Origin of a run: command and date."""
-
-    command: str  # how to do the run again
-    date: str  # when it was
 
 
 def write(
@@ -113,7 +107,9 @@ def write(
     experiment = traces[0].experiment
     seeds = sorted({trace.seed for trace in traces})
     folder.mkdir(parents=True, exist_ok=True)
-    made = _origin(folder if run is None else run, RunOrigin(command, date or date_of(time.time())))
+    made = _origin(
+        folder if run is None else run, RunOrigin(command, date or date_of(time.time()), made_by=provenance())
+    )
     facts = [
         ("Date", made.date),
         ("Clock", _words(trace.clock for trace in traces)),
@@ -163,6 +159,7 @@ def write(
         command=made.command,
         verdict=[*cut, *(Finding("fair", note) for note in notes), *verdict[len(cut) :]],
         sections=sections,
+        foot=() if made.made_by is None else made.made_by.words,
     )
 
 
@@ -235,15 +232,10 @@ def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
 
 def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
     """Origin of the run as its folder keeps it; kept now if the folder has none, and there is a command."""
-    file = folder / ORIGIN
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=RunOrigin)
-    except FileNotFoundError:
-        if now.command:
-            file.write_bytes(msgspec.json.format(msgspec.json.encode(now), indent=2) + b"\n")
-        return now
-    except (ValueError, RecursionError):  # another file of this name: a case may be called "run"
-        return now
+    kept = read_origin(folder)
+    if kept is None and now.command and not (folder / ORIGIN).exists():
+        keep_origin(folder, now)
+    return kept or now
 
 
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[PageFigure, ...]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from inspect import getfile
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -20,8 +19,7 @@ from agents.body.interface import BodyError
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
 from experiments.definition.standby import without_standby
-from experiments.file.problems import Path as Keys
-from experiments.file.structure import group_of
+from experiments.file.structure import plugin_files
 from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
 from experiments.metrics.signals import LinkErrors, gaps, integrals, leaders, transmissions
 from experiments.recording.trace import Trace
@@ -92,26 +90,12 @@ def code_of(experiment: Experiment) -> str:
 
     Of a plug-in the module counts in which it stands; another module that it imports does not.
     """
-    chosen = _choices(msgspec.to_builtins(experiment), ())
-    files = {Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen}
+    files = plugin_files(experiment)
     engine = registry.split(experiment.world.engine)[0]
     with suppress(PackageNotFoundError):
         engine += version(engine)
     others = sorted(_file_digest(file) for file in files if file.parent.parent != _root())
     return hashlib.sha256(":".join((_own_digest(), np.__version__, engine, *others)).encode()).hexdigest()[:20]
-
-
-def _choices(value: Any, path: Keys) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
-    """Every plug-in that is chosen in a document: its group, and the choice."""
-    group = group_of(path)
-    if group is not None and value is not None:
-        yield group, value
-    elif isinstance(value, dict):
-        for key, each in value.items():
-            yield from _choices(each, (*path, key))
-    elif isinstance(value, list | tuple):
-        for number, each in enumerate(value):
-            yield from _choices(each, (*path, number))
 
 
 def figures_of(log: Log, experiment: Experiment) -> list[Figures]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -28,6 +30,7 @@ from tools.commands.options import (
 if TYPE_CHECKING:
     from experiments.file.document import Document
     from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.recording.run_folder import RunOrigin
     from experiments.run import Run
 
 app: Final = typer.Typer()
@@ -55,42 +58,152 @@ def run(
     anyway: Anyway = False,
     report: Report = True,
     open_report: OpenReport = False,
+    tag: Annotated[
+        list[str] | None, typer.Option("--tag", metavar="WORD", help="By which `zenpark runs --past` finds it again.")
+    ] = None,
     lab: Lab = None,
     identity: As = "operator",
 ) -> int:
-    """Run an experiment: one process per robot, or in virtual time."""
-    from experiments.file.document import chosen, load
+    """Run an experiment: one process per robot, or in virtual time; a bundle repeats its run."""
+    from experiments.file.problems import DocumentError, Problem
     from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.recording import bundle
+    from experiments.recording.run_folder import RunOrigin
+
+    if any(not word.isprintable() or not word.strip() or "," in word for word in tag or []):
+        raise typer.BadParameter("a tag is a word without commas", param_hint="--tag")
+    options = RunOptions(case or [], bodies, here, lab, identity)
+    origin = RunOrigin(
+        file=file,
+        virtual=virtual,
+        cases=list(options.cases),
+        changes=[*(settings or []), *([] if seed is None else [f"seed={seed}"])],
+        seeds=seeds,
+        bodies=bodies,
+        here=here,
+        anyway=anyway,
+        tags=tag or [],
+    )
+    show = _Shown(out, as_json, report, open_report)
+    if not bundle.is_bundle(file):
+        return _run(origin, options, show)
+    if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
+        hint = "unpack it, and run its experiment file with other options"
+        raise DocumentError([Problem(file, 0, 0, "a bundle repeats its own run, and takes no options of it", hint)])
+    return _repeat(origin, show, lab, identity)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Where the results of a run go, and how they are shown."""
+
+    out: str | None
+    as_json: bool
+    report: bool
+    open_report: bool
+
+
+def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
+    """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
+    from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
 
-    options = RunOptions(case or [], bodies, here, lab, identity)
-    changes = [*(settings or []), *([] if seed is None else [f"seed={seed}"])]
-    read = load(file, *changes)
-    _refuse(options, virtual=virtual, seeds=seeds)
+    read = load(origin.file, *origin.changes)
+    _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
     chosen(read, options.cases)
-    if not sound(read, seeds=seeds) and not anyway:
+    if not sound(read, seeds=origin.seeds) and not origin.anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
-    folder = new_folder(read, out)
+    folder = new_folder(read, show.out)
     try:
         read.keep(folder / SOURCE)
-        if virtual:
-            runs, stopped, code = _simulate(read, folder, options, seeds), "", 0
-        else:
-            runs, stopped, code = _conduct(read, folder, options, quiet=as_json)
+        with _kept_origin(folder, origin, read, options):
+            if origin.virtual:
+                runs, stopped, code = _simulate(read, folder, options, origin.seeds), "", 0
+            else:
+                runs, stopped, code = _conduct(read, folder, options, quiet=show.as_json)
         if not runs:
             return code
         if not runs[0].traces:
             why = stopped or "interrupted"
             print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
             return code or 130
-        again = _command(file, options, virtual=virtual, changes=changes, seeds=seeds, anyway=anyway)
-        _write(runs, folder, again if report else None, as_json=as_json, open_report=open_report)
+        _write(runs, folder, show)
         if stopped:
             print(f"zenpark: {stopped}", file=sys.stderr)
-        return code
+        return code if former is None else max(code, _print_differences(folder, former))
     finally:
         remove_unused(folder)
+
+
+@contextmanager
+def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOptions) -> Iterator[None]:
+    """Keep how a run is made in its folder, from the beginning on; its end as well."""
+    import time
+
+    import msgspec
+
+    from experiments.recording.run_folder import keep_origin
+    from experiments.recording.version import load, provenance
+    from experiments.report.page import date_of
+
+    begun = time.time()
+    made = msgspec.structs.replace(
+        origin,
+        # of a repeated one the command is known, and the file is gone afterwards
+        file=Path(origin.file).name if origin.command else origin.file,
+        command=origin.command or _command(origin, options),
+        date=date_of(begun),
+        title=read.experiment.title,
+        begun=begun,
+        made_by=provenance(),
+    )
+    keep_origin(folder, made)
+    try:
+        yield
+    finally:
+        keep_origin(folder, msgspec.structs.replace(made, ended=time.time(), load_after=load()))
+
+
+def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> int:
+    """Repeat the run of a bundle; in virtual time the results are compared to the last bit."""
+    from tempfile import TemporaryDirectory
+
+    import msgspec
+
+    from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.recording import bundle
+    from experiments.recording.version import provenance
+
+    with TemporaryDirectory(prefix="zenpark-bundle-") as unpacked:
+        former = Path(unpacked)
+        origin = bundle.unpack(Path(asked.file), former)
+        if origin.made_by is not None:
+            _warn([f"{asked.file}: {each}" for each in provenance().differences(origin.made_by)])
+        again = msgspec.structs.replace(
+            origin,
+            command=f"zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
+            virtual=origin.virtual or asked.virtual,
+            tags=asked.tags,
+            ended=None,
+            load_after=None,
+        )
+        if again.virtual:
+            again = msgspec.structs.replace(again, bodies=None, here=False)
+        options = RunOptions(again.cases, again.bodies, again.here, lab, identity)
+        return _run(again, options, show, former=former if origin.virtual else None)
+
+
+def _print_differences(folder: Path, former: Path) -> int:
+    """Print whether a repeated run came to the same to the last bit; the exit code."""
+    from experiments.recording import bundle
+
+    found = bundle.differences(folder, former)
+    for each in found:
+        print(f"zenpark: differs from the bundle: {each}", file=sys.stderr)
+    if not found:
+        print("the same as in the bundle, to the last bit: figures and recordings")
+    return int(bool(found))
 
 
 def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> list[Run]:
@@ -140,23 +253,23 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     return runs, emergency.words, STOPPED if emergency else 130 if interrupted.asked else 0
 
 
-def _write(runs: Sequence[Run], folder: Path, command: str | None, *, as_json: bool, open_report: bool) -> None:
-    """Write and print the results; with the command that repeats the run, write its report as well."""
+def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
+    """Write and print the results."""
     import json
     import webbrowser
 
     from experiments.metrics.statistics import across_seeds
 
     _write_figures_of_merit(runs, folder)
-    page = None if command is None else _write_report(runs, folder, command)
+    page = _write_report(runs, folder) if show.report else None
     summary: dict[str, Any] = runs[0].summary()
     if len(runs) > 1:
         summary["across"] = across_seeds([each.summary() for each in runs])
-    if as_json:
+    if show.as_json:
         print(json.dumps(summary))
     else:
         _print(runs, summary, page)
-    if open_report and page is not None:
+    if show.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
 
 
@@ -207,7 +320,7 @@ def report(
     try:
         if len(read) == 1:
             _write_figures_of_merit(read, target)
-            print(_write_report(read, target, ""))
+            print(_write_report(read, target))
         else:
             named = [(Path(f).name, list(r.traces.values())) for f, r in zip(runs, read, strict=True)]
             print(pages.compare(target, named))
@@ -222,18 +335,24 @@ def report(
 def export(
     folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
     target: Annotated[
-        str | None, typer.Argument(metavar="FILE", help="FILE.mat or FILE.csv. [run.mat in the run's folder]")
+        str | None, typer.Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in the run's folder]")
     ] = None,
     as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+    as_bundle: Annotated[
+        bool, typer.Option("--bundle", help="All that is needed to repeat it: an archive for a paper's supplement.")
+    ] = False,
 ) -> None:
-    """Write a run for MATLAB, or its trajectories as one table."""
+    """Write a run for MATLAB, its trajectories as one table, or all of it as a bundle that `zenpark run` repeats."""
+    from experiments.recording import bundle
     from experiments.report.export import ExportError, require_savemat, write_csv, write_mat
     from experiments.run import reopen
 
-    file = Path(target) if target else Path(folder) / f"run{'.csv' if as_csv else '.mat'}"
+    own = ".csv" if as_csv else ".zip" if as_bundle else ".mat"
+    place = Path(folder).resolve()
+    file = Path(target) if target else place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
     suffix = file.suffix.lower()
-    if suffix not in (".mat", ".csv") or (as_csv and suffix == ".mat"):
-        raise ExportError(f"{file}: is no name for the {'table' if as_csv else 'file'}; let it end with .mat or .csv")
+    if suffix not in (".mat", ".csv", ".zip") or (suffix != own and (as_csv or as_bundle)):
+        raise ExportError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
     if suffix == ".mat":
         require_savemat()  # before a long recording is read
     found = reopen(Path(folder))
@@ -241,6 +360,8 @@ def export(
         raise ExportError(f"{folder}: no case had begun; there is nothing to export")
     if suffix == ".mat":
         write_mat(found.traces, found.metrics, file)
+    elif suffix == ".zip":
+        bundle.write(Path(folder), file, [trace.experiment for trace in found.traces.values()])
     else:
         write_csv(found.traces, file)
     print(f"{file}: {', '.join(found.traces)}")
@@ -261,17 +382,17 @@ def recover(
     print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
 
 
-def _command(file: str, options: RunOptions, *, virtual: bool, changes: Sequence[str], seeds: int, anyway: bool) -> str:
+def _command(origin: RunOrigin, options: RunOptions) -> str:
     """The command that repeats the run."""
-    parts = ["zenpark", "run", file, *(["--virtual"] if virtual else [])]
-    parts += [part for case in options.cases for part in ("--case", case)]
-    parts += [part for change in changes for part in ("--set", f"'{change}'")]
-    parts += ["--seeds", str(seeds)] if seeds > 1 else []
-    parts += ["--bodies", options.bodies] if options.bodies is not None else []
-    parts += ["--here"] if options.here else []
+    parts = ["zenpark", "run", origin.file, *(["--virtual"] if origin.virtual else [])]
+    parts += [part for case in origin.cases for part in ("--case", case)]
+    parts += [part for change in origin.changes for part in ("--set", f"'{change}'")]
+    parts += ["--seeds", str(origin.seeds)] if origin.seeds > 1 else []
+    parts += ["--bodies", origin.bodies] if origin.bodies is not None else []
+    parts += ["--here"] if origin.here else []
     parts += ["--lab", options.lab] if options.lab is not None else []
     parts += ["--as", options.identity] if options.identity != "operator" else []
-    return " ".join([*parts, *(["--anyway"] if anyway else [])])
+    return " ".join([*parts, *(["--anyway"] if origin.anyway else [])])
 
 
 def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
@@ -284,7 +405,7 @@ def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
     metrics_files.write_json(folder / "metrics.json", every)
 
 
-def _write_report(runs: Sequence[Run], folder: Path, command: str) -> Path:
+def _write_report(runs: Sequence[Run], folder: Path) -> Path:
     """Write figures and report of a run into its folder; return the report."""
     from experiments.report import report as pages
     from experiments.report import style as figures
@@ -297,7 +418,6 @@ def _write_report(runs: Sequence[Run], folder: Path, command: str) -> Path:
     return pages.write(
         folder,
         traces,
-        command=command,
         date=date_of(runs[0].made),
         run=runs[0].folder,
         text=runs[0].source,

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.definition.experiment import Channel, Start, World
+from experiments.file import structure
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.sweep import runs
@@ -95,8 +96,8 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
     before = code_of(park)
-    real = runs.getfile
-    monkeypatch.setattr(runs, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
+    real = structure.getfile
+    monkeypatch.setattr(structure, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
     foreign = code_of(park)
     runs._file_digest.cache_clear()
     file.write_text("two")

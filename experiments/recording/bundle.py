@@ -1,0 +1,173 @@
+"""Bundle of a run: one archive with its file, results, recordings, plug-ins and origin, from which it is repeated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Iterator
+from importlib.metadata import distributions
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from experiments.definition.experiment import Experiment
+from experiments.file.structure import plugin_files
+from experiments.recording.reader import RecordingError, Records
+from experiments.recording.run_folder import ORIGIN, SOURCE, RunOrigin, read_origin
+from experiments.recording.version import PACKAGES, ROOT
+
+SUFFIX: Final = ".zip"
+METRICS: Final = "metrics.json"
+LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
+DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
+LARGEST: Final = 1 << 34  # [bytes] of all members together
+README: Final = """{title}
+
+A run of zenpark, {date}, with all that is needed to repeat it:
+
+    {command}
+
+does what was done, from {source} with what `run.json` says ({version}). From this archive:
+
+    zenpark run {name}
+
+In virtual time the results are the same to the last bit, if code and versions are; zenpark says whether they are.
+
+run.json          how it was made: command, code, versions, machine
+requirements.txt  every Python package that was installed
+plugins/          source of the plug-ins that it used
+metrics.json      its figures; metrics.csv the same as a table
+*.mcap            recordings
+SHA256SUMS        of all files
+"""
+
+
+def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
+    """Write the bundle of a run.
+
+    Args:
+        folder: Of the run.
+        target: The archive.
+        experiments: Its cases, whose plug-ins are added.
+
+    Raises:
+        RecordingError: If the folder has no `run.json`, or the archive cannot be written.
+    """
+    origin = read_origin(folder)
+    if origin is None or not origin.file or not (folder / SOURCE).exists():
+        raise RecordingError(f"{folder}: has no {ORIGIN} that says how it was made; run it again with this zenpark")
+    made_by = origin.made_by
+    text = README.format(
+        title=origin.title or origin.file,
+        date=origin.date,
+        command=origin.command,
+        source=SOURCE,
+        version="an older zenpark" if made_by is None else f"zenpark {made_by.zenpark}, code {made_by.code}",
+        name=target.name,
+    )
+    members = {name: file.read_bytes() for name, file in _files(folder)}
+    members |= {f"plugins/{file.name}": file.read_bytes() for file in sorted(_plugins(experiments))}
+    members |= {"README.txt": text.encode(), "requirements.txt": _requirements().encode()}
+    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in sorted(members.items()))
+    try:
+        with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, data in sorted({**members, "SHA256SUMS": sums.encode()}.items()):
+                archive.writestr(zipfile.ZipInfo(name, DATE), data, zipfile.ZIP_DEFLATED)
+    except OSError as error:
+        raise RecordingError(f"{target}: cannot be written: {error.strerror}") from None
+    return target
+
+
+def is_bundle(file: str) -> bool:
+    """Whether a file is a bundle, by its name."""
+    return file.lower().endswith(SUFFIX)
+
+
+def unpack(bundle: Path, into: Path) -> RunOrigin:
+    """Unpack a bundle into an empty folder.
+
+    Returns:
+        Its origin, in which `file` is the experiment file in that folder, under its former name.
+
+    Raises:
+        RecordingError: If it is no bundle, or a damaged one.
+    """
+    try:
+        with zipfile.ZipFile(bundle) as archive:
+            if sum(member.file_size for member in archive.infolist()) > LARGEST:
+                raise RecordingError(f"{bundle}: more than {LARGEST >> 30} GB unpacked")
+            archive.extractall(into)  # names with .. or / at the front are made harmless by the library
+        sums = (into / "SHA256SUMS").read_text("utf-8")
+    except (OSError, zipfile.BadZipFile, UnicodeDecodeError, RuntimeError, NotImplementedError) as error:
+        raise RecordingError(f"{bundle}: is no bundle of `zenpark export RUN --bundle`: {error}") from None
+    for line in sums.splitlines():
+        wanted, _, name = line.partition("  ")
+        file = into / name
+        if not file.resolve().is_relative_to(into.resolve()) or not file.is_file():
+            raise RecordingError(f"{bundle}: {name} is missing in it")
+        if hashlib.sha256(file.read_bytes()).hexdigest() != wanted:
+            raise RecordingError(f"{bundle}: {name} is not what was put into it")
+    origin = read_origin(into)
+    if origin is None or not origin.file or not (into / SOURCE).is_file():
+        raise RecordingError(f"{bundle}: holds no {ORIGIN} and {SOURCE}")
+    former = Path(origin.file)
+    file = into / (former.name if former.suffix in (".toml", ".json") else f"{former.name}.toml")
+    if file.name != SOURCE:
+        file.write_bytes((into / SOURCE).read_bytes())
+    return msgspec.structs.replace(origin, file=str(file))
+
+
+def differences(repeated: Path, former: Path) -> list[str]:
+    """What differs between the results of two folders of one run in virtual time, to the last bit; empty if nothing."""
+    found = []
+    mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
+    if mine != theirs:
+        found.append("figures: " + ", ".join(sorted(_changed(theirs, mine, ""))[:5]))
+    for file in sorted(former.glob("*.mcap")):
+        if not (repeated / file.name).exists():
+            found.append(f"{file.name} is missing")
+        elif _messages(repeated / file.name) != _messages(file):
+            found.append(f"{file.name}: other messages")
+    return found
+
+
+def _changed(old: Any, new: Any, path: str) -> Iterator[str]:  # noqa: ANN401 - JSON
+    """Paths of the values that differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in old.keys() | new.keys():
+            yield from _changed(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for number, (before, after) in enumerate(zip(old, new, strict=True)):
+            yield from _changed(before, after, f"{path}[{number}]")
+    elif old != new:
+        yield f"{path} {old} → {new}"
+
+
+def _messages(file: Path) -> str:
+    """Digest of all messages of a recording, with topics and times, without what says who made it."""
+    total = hashlib.sha256()
+    records = Records(file)
+    for message in records.messages():
+        topic = records.channels[message.channel].topic
+        total.update(f"{topic} {message.logged} {message.published}\0".encode() + message.data)
+    return total.hexdigest()
+
+
+def _files(folder: Path) -> Iterator[tuple[str, Path]]:
+    for file in sorted(folder.rglob("*")):
+        name = file.relative_to(folder)
+        if file.is_file() and name.parts[0] not in LEFT_OUT and file.suffix != SUFFIX:
+            yield name.as_posix(), file
+
+
+def _plugins(experiments: list[Experiment]) -> set[Path]:
+    """Modules of the plug-ins that the cases choose, but for our own."""
+    files = {file for experiment in experiments for file in plugin_files(experiment)}
+    return {file for file in files if not any(file.is_relative_to(ROOT / package) for package in PACKAGES)}
+
+
+def _requirements() -> str:
+    """Installed distributions, as pip reads them."""
+    return "".join(sorted({f"{each.name}=={each.version}\n" for each in distributions()}, key=str.lower))
