@@ -77,6 +77,8 @@ class CrazyflieSettings(Part, frozen=True):
     arm: bool = True  # arm it before taking off, where the platform asks for that
     platform: Literal["crazyflie", "brushless"] = "crazyflie"  # for the twin only: a `brushless` one must be armed
     link: Literal["udp", "radio"] = "udp"  # for the twin only: `radio` puts a software Crazyradio between
+    # for the twin only: files of cflib's cache with the parameters and the log variables that it lists; empty: built in
+    tables: list[str] = []
     connect_s: Wait = 20.0  # [s] limit for connecting, from its turn on its radio
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 

@@ -18,8 +18,8 @@ NULL: Final = (15, 3)  # port and channel of a packet without content
 VERSIONS: Final = 1  # channel of `Port.PLATFORM` on which a drone says its versions,
 FIRMWARE: Final = 1  # and the question for that of its firmware, which is a text such as "2025.02"
 MTU: Final = 30  # [bytes] of payload
+TRAJECTORIES: Final = 10  # that may be defined
 GREETING: Final = b"Bitcraze Crazyflie".ljust(MTU, b"\0")  # how a Crazyflie is told from a boot loader
-SCAN: Final = 0xFF  # the header with which cflib asks whether anybody is there
 LOG_PAYLOAD: Final = 26  # [bytes] of values in one packet of a log block
 LOG_BLOCKS: Final = 16
 LOG_VARIABLES: Final = 128
@@ -127,9 +127,13 @@ class HighLevel(IntEnum):
 
     GROUP = 0
     STOP = 3
+    START = 5  # of protocol versions below 10
+    DEFINE = 6
     TAKEOFF = 7
     LAND = 8
+    SPIRAL = 11
     GO_TO = 12
+    START_2 = 13
 
 
 class Safety(IntEnum):
@@ -141,6 +145,23 @@ class Safety(IntEnum):
     WATCHDOG = 4
     ASK = 12
     ANSWER = 0x80  # added to the command that is answered
+
+
+class Platform(IntEnum):
+    """Commands of the platform port, channel 0; those of the supervisor before it had a port."""
+
+    ARM = 1
+    RECOVER = 2
+
+
+class PowerSwitch(IntEnum):
+    """Commands to the radio's processor, behind `NRF` in packets to channel 3 of the link port."""
+
+    ALL_OFF = 0x01
+    OFF = 0x02
+    ON = 0x03
+    RESET = 0xF0
+    RESET_BEGIN = 0xFF
 
 
 class Location(IntEnum):
@@ -156,10 +177,14 @@ class Location(IntEnum):
 class Memory(IntEnum):
     """Kinds of memories."""
 
+    EEPROM = 0x00
+    LED_RING = 0x10
     TRAJECTORY = 0x12
     LOCO = 0x13
     LIGHTHOUSE = 0x14
     TESTER = 0x15
+    LED_TIMING = 0x17
+    DECKS = 0x19
 
 
 ANCHOR_POSITION: Final = 1  # kind of LPP packet: where an anchor is, three floats [m]
@@ -177,6 +202,14 @@ THRUST: Final = Struct("<fffH")  # roll, pitch, yaw rate [degrees], thrust
 MEMORY: Final = Struct("<BI")  # memory, address
 MEMORY_INFO: Final = Struct("<BBBI8x")
 ANCHOR: Final = Struct("<fff?")
+
+SPIRAL: Final = Struct("<??fffff")  # sideways, clockwise, angle [rad], first, last radius, climb [m], time [s]
+DEFINE: Final = Struct("<BBIB")  # location, kind, address, number of pieces; the number of the trajectory precedes
+START: Final = Struct("<??Bf")  # relative, reversed, trajectory, time scale
+START_2: Final = Struct("<???Bf")  # relative position, relative yaw, reversed, trajectory, time scale
+PIECE: Final = Struct("<33f")  # coefficients of x, y, z, yaw, constant first, and time [s]
+NRF: Final = 0xFE  # addressee of power commands
+ADDRESS: Final = bytes.fromhex("E7E7E7E7")  # of the boot loader, without its first byte B1
 
 MM: Final = 1e-3
 SECONDS_MS: Final = 1000.0

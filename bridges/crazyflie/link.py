@@ -77,7 +77,9 @@ def prepare(addresses: Sequence[str]) -> None:
 
 def cache() -> Path:
     """Folder for the firmwares' tables of contents: with a cached one, connecting is ten times as fast."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / "crazyflie"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / "crazyflie"
+    folder.mkdir(parents=True, exist_ok=True)  # else several that connect at once fail in cflib, which creates it too
+    return folder
 
 
 def _tables() -> Any:  # noqa: ANN401 - cflib's

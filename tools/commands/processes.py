@@ -191,6 +191,13 @@ def twin(
     connect: Connect = None,
     faults: Annotated[str, typer.Option(metavar="JSON", help="What goes wrong, such as '{\"loss\": 0.05}'.")] = "{}",
     device: Annotated[str, typer.Option(metavar="JSON", help="Settings of the device.")] = "{}",
+    table: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A Crazyflie: parameters or log variables that it lists, a file of cflib's cache; may be repeated.",
+        ),
+    ] = None,
     lab: Lab = None,
     identity: As = "twin",
 ) -> int:
@@ -198,7 +205,7 @@ def twin(
     from experiments.real_time.processes.protocol_twins import command
 
     endpoints = routers(connect, lab)
-    return command(kind, count, faults=faults, device=device, connect=endpoints, identity=identity)
+    return command(kind, count, faults=faults, device=device, tables=table or [], connect=endpoints, identity=identity)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})

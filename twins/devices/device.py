@@ -28,18 +28,26 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     drain: float = 1.0  # battery drain as a multiple of the maker's figure
     refuse_arming: bool = False
     exchanges_hz: float = 500.0  # [1/s] exchanges of a software radio, 300 to 1000 by dongle and computer
+    tumbled_from_s: float | None = None  # [s] begin of lying on its side, as after a collision
+    tumbled_for_s: float = 1e9  # [s] until it is put upright
     occluded_from_s: float | None = None  # [s] begin of an occlusion of all robots from motion capture
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
 
     def silent(self, t: float) -> bool:
         """Whether the device is silent at time `t` [s]."""
-        begin = self.silent_from_s
-        return begin is not None and begin <= t < begin + self.silent_for_s
+        return _during(t, self.silent_from_s, self.silent_for_s)
+
+    def tumbled(self, t: float) -> bool:
+        """Whether the robots lie on their sides at time `t` [s]."""
+        return _during(t, self.tumbled_from_s, self.tumbled_for_s)
 
     def occluded(self, t: float) -> bool:
         """Whether motion capture sees nothing at time `t` [s]."""
-        begin = self.occluded_from_s
-        return begin is not None and begin <= t < begin + self.occluded_for_s
+        return _during(t, self.occluded_from_s, self.occluded_for_s)
+
+
+def _during(t: float, begin: float | None, duration: float) -> bool:
+    return begin is not None and begin <= t < begin + duration
 
 
 class Device(Protocol):

@@ -198,9 +198,20 @@ def _serve(
     return 0
 
 
-def command(kind: str, count: int, *, faults: str, device: str, connect: Sequence[str], identity: str = "twin") -> int:
-    """`zenpark twin`: as `by_hand`, with faults and settings as JSON."""
+def command(
+    kind: str,
+    count: int,
+    *,
+    faults: str,
+    device: str,
+    connect: Sequence[str],
+    tables: Sequence[str] = (),
+    identity: str = "twin",
+) -> int:
+    """`zenpark twin`: as `by_hand`, with faults and settings as JSON; `tables` are the setting of this name."""
     settings = structure.parse_object("--device", device)
+    if tables:
+        settings["tables"] = list(tables)
     return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect, identity=identity)
 
 

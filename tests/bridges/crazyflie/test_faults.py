@@ -37,15 +37,16 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
     twin = Served(open_device, request("crazyflie", ["crazyflie-twin"] * 5))
     other = Served(open_device, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]]))
     lines = twin.device.lines
-    lines[lossy].faults = Faults(loss=0.05)
     process = Process(open_crazyflie(request("crazyflie", [*twin.addresses, *other.addresses])))
     try:
+        process.until(lambda: np.isfinite(process.state.position).all(), "all are connected")
+        lines[lossy].faults = Faults(loss=0.05)  # not before: 402 parameters take long without repetitions
         process.takeoff(0.3)
         process.setpoint = [(0.0, float(row), 0.3, 0.0) for row in range(6)]
         process.run(0.3)
         lines[mute].faults = Faults(silent_from_s=0.0)
         lines[blinking].faults = Faults(silent_from_s=lines[blinking].t, silent_for_s=1.2)
-        twin.device.flock.charge[empty] = 0.16
+        twin.device.flock.charge[empty] = 0.05
         other.kill()
         process.setpoint[well] = (0.3, float(well), 0.3, 0.0)
         process.setpoint[lossy] = (0.3, float(lossy), 0.3, 0.0)
@@ -66,11 +67,13 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         assert any("link lost" in note for note in said[killed])
         assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is
         assert said[well] == {""}
-        assert process.state.flying[: lossy + 1].all()
+        assert process.state.flying[: lossy + 1].all(), said[lossy]
         process.until(
             lambda: abs(truth(twin, well)[0] - 0.3) < 0.03 and abs(truth(twin, lossy)[0] - 0.3) < 0.03, "goals"
         )
         assert process.t - process.state.time[well] < 0.5
+        twin.device.flock.charge[empty] = 0.02  # without load its voltage has recovered
+        process.until(lambda: process.state.notes[empty].endswith("; battery low"), "empty battery")
         process.body.takeoff(np.array([empty]), np.array([0.5]))
         process.until(lambda: "no take-off: battery low" in process.state.notes[empty], "refusal")
         process.body.stop(np.arange(6))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agents.arrays import Array, Mask
 
+HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
 NEITHER: Final = (np.nan, np.nan, np.nan)
 
 
@@ -56,6 +57,10 @@ class Commander:
         self._heading[row], self._turn[row], self._body[row], self.on[row] = heading, turn, body, on
         self._received[row] = t
         self._low_level[row] = True
+
+    def stop(self, row: int) -> None:
+        """Forget the setpoint of a row: motors off."""
+        self.on[row] = self._low_level[row] = False
 
     def release(self, row: int) -> None:
         """End the client's setpoints: the planner's setpoints count again."""

@@ -13,7 +13,8 @@ import numpy as np
 from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.body.kinds import CRAZYFLIE
-from agents.protocols.crtp import SCAN, Log, Port, header
+from agents.protocols import crazyradio
+from agents.protocols.crtp import Port, header
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink
@@ -38,6 +39,11 @@ class LossyLink:
         self.t = 0.0  # current time [s]
         self.faults, self._random = request.faults, random
         self._waiting: deque[tuple[float, bytes]] = deque()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the firmware counts its link as connected; without polls of a radio: whether it could be polled."""
+        return not (self.faults.silent(self.t) and self.faults.silent(self.t - crazyradio.ACTIVITY_S))
 
     @property
     def address(self) -> str:
@@ -126,9 +132,6 @@ class CrazyflieTwin:
             packet = line.receive()
             if packet is None:
                 return
-            if packet[0] == SCAN:
-                line.send(Port.LINK, 3, b"")
-                continue
             self._deliver(row, packet)
 
     def _deliver(self, row: int, packet: bytes) -> None:
@@ -144,8 +147,8 @@ class CrazyflieTwin:
             line.t = t
             if locked[drone.row]:
                 drone.console("SUP: Locked, reboot required\n")
-            if isinstance(line, RadioLink) and not line.connected:
-                drone.logs.execute(Log.RESET, 0, b"", t)
+            if not line.connected:
+                drone.logs.reset()
             drone.send_logs(t)
             line.send_due()
 

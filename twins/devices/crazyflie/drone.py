@@ -10,24 +10,43 @@ from typing import Any, Final
 
 import numpy as np
 
+from agents.arrays import Array
 from agents.protocols import crtp
-from agents.protocols.crtp import HighLevel, Location, Misc, Port, Safety, Setpoint, Status, Toc
+from agents.protocols.crtp import (
+    HighLevel,
+    Location,
+    Misc,
+    Platform,
+    Port,
+    PowerSwitch,
+    Safety,
+    Setpoint,
+    Status,
+    Toc,
+)
+from twins.devices.crazyflie.commander import HOVER_THRUST
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.logs import LogBlocks
-from twins.devices.crazyflie.memory import ANCHORS, Memories
+from twins.devices.crazyflie.memory import ANCHORS
 from twins.devices.crazyflie.planner import Plan
 from twins.devices.crazyflie.tables import (
     EXTENDED,
-    LOG_TABLE,
-    PARAMETER_TABLE,
-    PARAMETER_TYPES,
-    PARAMETERS,
+    PACKINGS,
+    PARAMETER_CODES,
     READ_ONLY,
     Table,
+    inventory,
+    pack,
 )
+from twins.devices.crazyflie.trajectories import Trajectories
 
+TOLD: Final = {  # parameters that make a Crazyflie write to its console
+    "system.assertInfo": "SYS: No assert information found\n",
+    "system.storageStats": "STORAGE: Used storage: 1 %\n",
+    "system.taskDump": "SYSLOAD: Task dump\n",
+    "supervisor.infdmp": "SUP: Supervisor info ---\n",
+}
 Send = Callable[[Port, int, bytes], None]
-HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
 LARGEST: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
 CLIMB_THRUST: Final = 24000.0  # additional thrust for a climb of about 1 m/s
 
@@ -43,19 +62,16 @@ class Drone:
     flock: Flock
     row: int
     send: Send
-    values: list[float] = field(default_factory=lambda: [parameter.default for parameter in PARAMETERS])
-    stored: dict[int, float] = field(default_factory=dict)
-    group: int = 0
+    stored: dict[int, float] = field(default_factory=dict)  # parameters stored on board
+    on: bool = True
 
     def __post_init__(self) -> None:
-        decks = {
-            "deck.bcLighthouse4": self.flock.lighthouse[self.row],
-            "deck.bcLoco": self.flock.loco[self.row],
-            "deck.bcMultiranger": self.flock.multiranger[self.row],
-        }
-        for name, present in decks.items():
-            self.values[PARAMETER_TABLE.number[name]] = int(present)
-        self.logs = LogBlocks(self.flock, self.row, self.value)
+        tables = inventory(self.flock.tables[self.row])
+        self.parameters, self._log_table = tables.parameters, tables.logs
+        self.memories = self.flock.memories[self.row]
+        self.trajectories = Trajectories(self.memories)
+        self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
+        self._start()
         self._answer: dict[int, Callable[[int, bytes], None]] = {
             Port.LINK: self._link,
             Port.PLATFORM: self._platform,
@@ -69,14 +85,34 @@ class Drone:
             Port.LOCATION: self._location,
         }
 
+    def _start(self) -> None:
+        """State after switching on."""
+        flock, row = self.flock, self.row
+        self.values = [variable.value for variable in self.parameters.variables]
+        present = {
+            "deck.bcLighthouse4": flock.lighthouse[row],
+            "deck.bcLoco": flock.loco[row],
+            "deck.bcDWM1000": flock.loco[row],
+            "deck.bcMultiranger": flock.multiranger[row],
+            "deck.bcFlow2": flock.flow[row],
+            "deck.bcZRanger2": flock.flow[row],
+        }
+        for name, deck in present.items():
+            if name in self.parameters.number:
+                self.values[self.parameters.number[name]] = int(deck)
+        for number, value in self.stored.items():
+            self.values[number] = value
+        self.logs.reset()
+
     def value(self, name: str) -> float:
-        """The value of a parameter."""
-        return self.values[PARAMETER_TABLE.number[name]]
+        """Value of a parameter; 0 if this firmware has none of this name."""
+        number = self.parameters.number.get(name)
+        return 0.0 if number is None else self.values[number]
 
     def receive(self, port: int, channel: int, data: bytes) -> None:
         """Process one packet."""
         answer = self._answer.get(port)
-        if answer is not None:
+        if answer is not None and (self.on or (port == Port.LINK and channel == 3)):
             answer(channel, data)
 
     def console(self, text: str) -> None:
@@ -97,12 +133,33 @@ class Drone:
             self.send(Port.LINK, 0, data)
         elif channel == 1:
             self.send(Port.LINK, 1, crtp.GREETING)
+        elif channel == 3 and not data:
+            self.send(Port.LINK, 3, b"")
+        elif channel == 3 and data[0] == crtp.NRF:
+            self.send(Port.LINK, 3, data[:2] + (crtp.ADDRESS if data[1] == PowerSwitch.RESET_BEGIN else b""))
+            if data[1] != PowerSwitch.RESET_BEGIN:
+                self.on = data[1] in (PowerSwitch.ON, PowerSwitch.RESET)
+                self.flock.restart(self.row)
+                self._start()
 
     def _platform(self, channel: int, data: bytes) -> None:
         if channel == 1 and data[0] == 0:
             self.send(Port.PLATFORM, 1, b"\0" + struct.pack("<I", crtp.VERSION))
         elif channel == 1 and data[0] == 1:
             self.send(Port.PLATFORM, 1, b"\1twin")
+        elif channel == 0 and data[0] == Platform.ARM:
+            self.send(Port.PLATFORM, 0, data[:1] + self._arm(on=bool(data[1])))
+        elif channel == 0 and data[0] == Platform.RECOVER:
+            self.send(Port.PLATFORM, 0, data[:1] + self._recover())
+
+    def _arm(self, *, on: bool) -> bytes:
+        """Arm or disarm; returns success and state."""
+        return bytes((self.flock.arm(self.row, on=on), self.flock.supervisor.armed(self.row)))
+
+    def _recover(self) -> bytes:
+        """Recover from a crash; returns success, and whether it has recovered."""
+        done = self.flock.supervisor.recover(self.row)
+        return bytes((done, done))
 
     def _supervisor(self, channel: int, data: bytes) -> None:
         command, answer = data[0], bytes((data[0] | Safety.ANSWER,))
@@ -110,10 +167,9 @@ class Drone:
         if channel == 0 and command == Safety.ASK:
             self.send(Port.SUPERVISOR, 0, answer + struct.pack("<H", self.flock.info(self.row)))
         elif channel == 1 and command == Safety.ARM:
-            done = self.flock.arm(self.row, on=bool(data[1]))
-            self.send(Port.SUPERVISOR, 1, answer + bytes((done, supervisor.armed(self.row))))
+            self.send(Port.SUPERVISOR, 1, answer + self._arm(on=bool(data[1])))
         elif channel == 1 and command == Safety.RECOVER:
-            self.send(Port.SUPERVISOR, 1, answer + b"\1\1")
+            self.send(Port.SUPERVISOR, 1, answer + self._recover())
         elif channel == 1 and command == Safety.STOP:
             supervisor.stop(self.row)
         elif channel == 1 and command == Safety.WATCHDOG:
@@ -129,41 +185,44 @@ class Drone:
             self.send(port, 0, data[:3] + table.items[number] if number < len(table.items) else data[:1])
 
     def _param(self, channel: int, data: bytes) -> None:
+        table = self.parameters
         if channel == 0:
-            self._table(Port.PARAM, PARAMETER_TABLE, data)
+            self._table(Port.PARAM, table, data)
             return
         if channel == 3:
             self._param_misc(data)
             return
         (number,) = crtp.IDENT.unpack_from(data)
-        if number >= len(PARAMETERS):
+        if number >= len(table.variables):
             self.send(Port.PARAM, channel, data[:2] + bytes((Status.UNKNOWN,)))
-        elif channel == 1:
-            self.send(Port.PARAM, 1, data[:2] + b"\0" + PARAMETERS[number].packing.pack(self._stored_as(number)))
-        elif not PARAMETERS[number].flags & READ_ONLY:  # a write to a constant is never answered
-            (value,) = _numbers(PARAMETERS[number].packing, data[2:])
+            return
+        variable = table.variables[number]
+        if channel == 1:
+            self.send(Port.PARAM, 1, data[:2] + b"\0" + pack(variable.type, self.values[number]))
+        elif not variable.flags & READ_ONLY:  # a write to a constant is never answered
+            (value,) = _numbers(PACKINGS[variable.type], data[2:])
             self.send(Port.PARAM, 2, data)
             self._set(number, value)
 
     def _param_misc(self, data: bytes) -> None:
+        variables = self.parameters.variables
         if data[0] == Misc.SET_BY_NAME:
             group, name, rest = data[1:].split(b"\0", 2)
-            number = PARAMETER_TABLE.number.get(f"{group.decode()}.{name.decode()}")
+            number = self.parameters.number.get(f"{group.decode()}.{name.decode()}")
             status = Status.UNKNOWN
-            if number is not None and PARAMETER_TYPES[PARAMETERS[number].type][0] == rest[0]:
+            if number is not None and PARAMETER_CODES[variables[number].type] == rest[0]:
                 status = Status.OK
-                self._set(number, _numbers(PARAMETERS[number].packing, rest[1:])[0])
+                self._set(number, _numbers(PACKINGS[variables[number].type], rest[1:])[0])
             self.send(Port.PARAM, 3, data[: len(group) + len(name) + 3] + bytes((status,)))
             return
         command, number = crtp.ITEM.unpack_from(data)
         known = data[: crtp.ITEM.size]
-        if number >= len(PARAMETERS):
+        if number >= len(variables):
             self.send(Port.PARAM, 3, known + bytes((Status.UNKNOWN,)))
             return
-        parameter = PARAMETERS[number]
-        packing = parameter.packing
-        extended = bytes((1 if parameter.flags & EXTENDED else 0,))
-        default = packing.pack(_typed(parameter.type, parameter.default))
+        variable = variables[number]
+        extended = bytes((1 if variable.flags & EXTENDED else 0,))
+        default = pack(variable.type, variable.value)
         if command == Misc.EXTENDED:
             self.send(Port.PARAM, 3, known + extended)
         elif command == Misc.EXTENDED_2:
@@ -178,34 +237,35 @@ class Drone:
             self.send(Port.PARAM, 3, known + b"\0")
         elif command == Misc.STORED:
             kept = self.stored.get(number)
-            tail = b"\0" + default if kept is None else b"\1" + default + packing.pack(_typed(parameter.type, kept))
+            tail = b"\0" + default if kept is None else b"\1" + default + pack(variable.type, kept)
             self.send(Port.PARAM, 3, known + tail)
-
-    def _stored_as(self, number: int) -> float:
-        return _typed(PARAMETERS[number].type, self.values[number])
 
     def _set(self, number: int, value: float) -> None:
         """Set a parameter and apply its effect."""
         before, self.values[number] = self.values[number], value
-        name, flock = PARAMETERS[number].name, self.flock
+        name, flock = self.parameters.variables[number].name, self.flock
         if name == "kalman.resetEstimation" and value:
             place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
             flock.estimator.reset(self.row, place - flock.place[self.row])
         elif name == "lighthouse.systemType" and value != before:
-            flock.memories[self.row].clear_stations()
+            self.memories.clear_stations()
         elif name == "stabilizer.stop" and value:
             flock.supervisor.stop(self.row)
+        elif name == "memTst.resetW" and value:
+            self.memories.write_errors = 0
+        elif name in TOLD and value:
+            self.console(TOLD[name])
 
     def _log(self, channel: int, data: bytes) -> None:
         if channel == 0:
-            self._table(Port.LOG, LOG_TABLE, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
+            self._table(Port.LOG, self._log_table, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
         elif channel == 1:
             block = data[1] if len(data) > 1 else 0
             status = self.logs.execute(data[0], block, data[2:], self.flock.t)
             self.send(Port.LOG, 1, bytes((data[0], block, status)))
 
     def _memory(self, channel: int, data: bytes) -> None:
-        kinds, memories = Memories.kinds, self.flock.memories[self.row]
+        kinds, memories = self.memories.kinds, self.memories
         if channel == 0:
             if data[0] == 1:
                 self.send(Port.MEMORY, 0, bytes((1, len(kinds))))
@@ -264,27 +324,71 @@ class Drone:
         self.send(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),)))
 
     def _plan(self, command: int, group: int, data: bytes) -> Status:
-        flock, row, t = self.flock, self.row, self.flock.t
-        meant = not group or bool(group & self.group)
+        flock, row, planner = self.flock, self.row, self.flock.planner
+        if command == HighLevel.DEFINE:  # for all groups: the number of the trajectory is in the place of the mask
+            return self.trajectories.define(group, *crtp.DEFINE.unpack_from(data))
         if command == HighLevel.GROUP:
-            self.group = group
-        elif command == HighLevel.STOP and meant:
-            flock.planner.stop(row)
-        if command in (HighLevel.GROUP, HighLevel.STOP) or not meant:
+            if (number := self.parameters.number.get("hlCommander.groupmask")) is not None:
+                self.values[number] = group
             return Status.OK
-        if not flock.supervisor.may_fly[row]:
-            return Status.BUSY
-        pose = flock.pose(row)
-        if command in (HighLevel.TAKEOFF, HighLevel.LAND):
-            height, yaw, keep, span = _numbers(crtp.CLIMB, data)
-            yaw = float(pose[3]) if keep else yaw
-            climb = flock.planner.takeoff if command == HighLevel.TAKEOFF else flock.planner.land
-            return climb(row, t, pose, height=height, yaw=yaw, span=span)
-        if command == HighLevel.GO_TO:
-            relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
-            goal, velocity = np.array([x, y, z, yaw]), flock.quadrotor.velocity[row]
-            return flock.planner.go_to(row, t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear)
-        return Status.NO_COMMAND
+        if group and not group & int(self.value("hlCommander.groupmask")):
+            return Status.OK
+        if command == HighLevel.STOP:
+            planner.stop(row)
+            return Status.OK
+        begin = {
+            HighLevel.TAKEOFF: self._climb,
+            HighLevel.LAND: self._climb,
+            HighLevel.GO_TO: self._go_to,
+            HighLevel.SPIRAL: self._spiral,
+            HighLevel.START: self._follow,
+            HighLevel.START_2: self._follow,
+        }.get(command)  # type: ignore[call-overload]
+        if begin is None or not flock.supervisor.may_fly[row]:
+            return Status.NO_COMMAND if begin is None else Status.BUSY
+        # the firmware plans from its last setpoint while a plan runs, else from its estimate
+        pose = flock.pose(row) if planner.plan[row] == Plan.IDLE else planner.state(row, flock.t)[0]
+        status: Status = begin(command, pose, data)
+        return status
+
+    def _climb(self, command: int, pose: Array, data: bytes) -> Status:
+        height, yaw, keep, span = _numbers(crtp.CLIMB, data)
+        planner = self.flock.planner
+        climb = planner.takeoff if command == HighLevel.TAKEOFF else planner.land
+        yaw = float(pose[3]) if keep else yaw
+        return climb(self.row, self.flock.t, pose, height=height, yaw=yaw, span=span)
+
+    def _go_to(self, _: int, pose: Array, data: bytes) -> Status:
+        relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
+        goal, velocity = np.array([x, y, z, yaw]), self.flock.quadrotor.velocity[self.row]
+        return self.flock.planner.go_to(
+            self.row, self.flock.t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear
+        )
+
+    def _spiral(self, _: int, pose: Array, data: bytes) -> Status:
+        sideways, clockwise, angle, first, last, climb, span = _numbers(crtp.SPIRAL, data)
+        return self.flock.planner.spiral(
+            self.row,
+            self.flock.t,
+            pose,
+            angle=angle,
+            radii=(first, last),
+            climb=climb,
+            span=span,
+            sideways=sideways,
+            clockwise=clockwise,
+        )
+
+    def _follow(self, command: int, pose: Array, data: bytes) -> Status:
+        if command == HighLevel.START:
+            (relative, reverse, number, scale), turned = _numbers(crtp.START, data), False
+        else:
+            relative, turned, reverse, number, scale = _numbers(crtp.START_2, data)
+        start = pose if relative else None
+        status, pieces = self.trajectories.pieces(number, start, turned=turned, reverse=reverse, scale=scale)
+        if pieces:
+            self.flock.planner.follow(self.row, self.flock.t, pieces)
+        return status
 
     # ------------------------------------------------------------------ position
 
@@ -312,11 +416,6 @@ class Drone:
     def planned(self) -> Plan:
         """State of the planner."""
         return Plan(self.flock.planner.plan[self.row])
-
-
-def _typed(kind: str, value: float) -> float:
-    """Value converted for packing as `kind`."""
-    return value if kind == "float" else int(value)
 
 
 def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:

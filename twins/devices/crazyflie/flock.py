@@ -20,7 +20,7 @@ from twins.devices.crazyflie.supervisor import Supervisor
 from twins.devices.device import Faults
 from twins.models.disturbance import HoverJitter, Latency, Measurement
 from twins.models.noise import Noise
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.models.quadrotor import GRAVITY, RESPONSES, Quadrotor
 
 SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
 PRECISE: Final = 1e-5  # [m²] final variance
@@ -59,9 +59,15 @@ class Estimator:
         self.variance = np.where(measured, settled, np.minimum(self.variance + GROWTH * dt, LOST))
 
 
-FULL_V: Final = 4.2
-EMPTY_V: Final = 3.0
+# voltage [V] of a battery at rest by charge: the curve from which the firmware gives pm.batteryLevel, and full
+VOLTS: Final = np.array([3.0, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.0, 4.04, 4.1, 4.2])
+CHARGES: Final = np.linspace(0.0, 1.0, len(VOLTS))
+SAG_V: Final = 0.3  # under the load of hovering: 2 A through 0.15 ohm
 LOW_V: Final = 3.2  # the firmware's own threshold
+LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
+IMPACT: Final = 2.0  # [m/s] a robot that hits the floor faster (a fall of 0.2 m) ends on its side
+TRIM: Final = np.radians([0.4, -0.3])  # roll, pitch of a robot at rest [rad]: none is exactly level
+LEANING_S: Final = 0.05  # time constant of the attitude
 ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
 
 
@@ -81,6 +87,9 @@ class Flock:
         self.multiranger = [each.multiranger for each in settings]
         outside = np.array([isinstance(each.positioning, Outside) for each in settings])
         self._on_board = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
+        self.flow = self._on_board.tolist()
+        self.tables = [tuple(each.tables) for each in settings]
+        self._faults, self._fault_tumbled = faults, False
         by_hand = [faults.refuse_arming or each.platform == "brushless" for each in settings]
         self.refuse_arming = faults.refuse_arming
         self.planner = Planner(rows)
@@ -90,6 +99,7 @@ class Flock:
         self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
         self.memories = [Memories() for _ in range(rows)]
         self.charge = np.full(rows, faults.battery)  # 0 to 1
+        self._low_since = np.full(rows, np.inf)  # [s]
         self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s
         spatial = np.ones((rows, 3))
         noise = Noise(request.names, request.seeds, "measurement", 4)
@@ -104,20 +114,27 @@ class Flock:
         self.estimate = self.place + self.estimator.error  # (N, 3) reported positions [m]
         self.velocity = np.zeros((rows, 3))  # reported, from measured positions [m/s]
         self._last_measured = self.place
+        self.acceleration = np.zeros((rows, 3))  # [m/s²]
+        self.attitude = np.tile(TRIM, (rows, 1))  # roll to the right, pitch nose up [rad]
 
     def pose(self, row: int) -> Array:
         """Estimated pose (4,) of a row: x, y, z [m], yaw [rad]."""
         return np.append(self.quadrotor.position[row] + self.estimator.error[row], self.quadrotor.yaw[row])
 
-    def voltage(self, row: int) -> float:
-        """Voltage of a row's battery [V]."""
-        return EMPTY_V + (FULL_V - EMPTY_V) * float(self.charge[row])
+    @property
+    def volts(self) -> Array:
+        """(N,) voltages of the batteries [V]; under load they sag."""
+        return np.asarray(np.interp(self.charge, CHARGES, VOLTS) - SAG_V * self.quadrotor.flying)
+
+    def battery_level(self, row: int) -> int:
+        """Log variable pm.batteryLevel [%], in steps of 10."""
+        return 10 * int(np.searchsorted(VOLTS[:-2], self.volts[row]))
 
     def power(self, row: int) -> Power:
         """State of a row's power management."""
         if self.charge[row] <= 0.0:
             return Power.SHUTDOWN
-        return Power.LOW if self.voltage(row) < LOW_V else Power.BATTERY
+        return Power.LOW if self.t - self._low_since[row] > LOW_S else Power.BATTERY
 
     def info(self, row: int) -> Info:
         """Flags of a row's supervisor and planner."""
@@ -151,8 +168,17 @@ class Flock:
             return False
         return self.supervisor.arm(row, self.t, on=on)
 
+    def restart(self, row: int) -> None:
+        """Switch a row off and on: motors off, estimator at its start."""
+        self.planner.stop(row)
+        self.commander.stop(row)
+        self.supervisor.restart(row)
+        self.quadrotor.stop(np.array([row]))
+        if not self._on_board[row]:
+            self.estimator.reset(row, -self.quadrotor.position[row])
+
     def advance(self, t: float) -> Mask:
-        """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked on the way."""
+        """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked or crashed on the way."""
         steps = max(1, round((t - self.t) / self.dt))
         if steps * self.dt > CATCH_UP_S:
             steps = 1
@@ -163,6 +189,9 @@ class Flock:
 
     def _step(self, t: float) -> Mask:
         self.t = t
+        if self._faults.tumbled(t) != self._fault_tumbled:
+            self._fault_tumbled = not self._fault_tumbled
+            self.supervisor.tumbled[:] = self._fault_tumbled
         quadrotor, commander, supervisor = self.quadrotor, self.commander, self.supervisor
         commander.take_planned(t, self.planner.goal(t))
         locked = supervisor.advance(t, quadrotor.flying, commander.setpoint_age(t))
@@ -180,19 +209,42 @@ class Flock:
         )
         setpoint[:, :3] -= self.estimator.error  # the controller uses the estimate, not the truth
         quadrotor.command(self._latency.delay(setpoint) if self._latency.present else setpoint)
+        before = quadrotor.velocity
         quadrotor.advance()
+        self._touch_floor(before)
+        self._lean(before)
         self.place = quadrotor.position.copy()
         if self._jitter.present:
             self._jitter.advance()
             share = np.minimum(quadrotor.position[:, 2] / FULL_WOBBLE, 1.0)
             self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
+        self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
         self.estimator.advance(t, self.dt, self.place, self.ready())
         measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
         self.estimate = measured + self.estimator.error
         self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
         self._last_measured = measured
         return locked
+
+    def _touch_floor(self, before: Array) -> None:
+        """Stop rows at the floor; those that hit it hard, with `before` (N, 3) [m/s], end on their sides."""
+        quadrotor = self.quadrotor
+        floor = quadrotor.position[:, 2] <= 0.0
+        self.supervisor.tumbled |= floor & (before[:, 2] < -IMPACT)
+        below = quadrotor.position[:, 2] < 0.0
+        quadrotor.position[below, 2] = 0.0
+        quadrotor.velocity[below] = 0.0
+
+    def _lean(self, before: Array) -> None:
+        """Attitude that gives the acceleration from `before` (N, 3) [m/s] on, with a lag."""
+        quadrotor = self.quadrotor
+        self.acceleration = np.where(quadrotor.flying[:, None], (quadrotor.velocity - before) / self.dt, 0.0)
+        cos, sin = np.cos(quadrotor.yaw), np.sin(quadrotor.yaw)
+        x, y, z = self.acceleration.T
+        lift = GRAVITY + z
+        wanted = TRIM + np.stack([np.arctan2(sin * x - cos * y, lift), -np.arctan2(cos * x + sin * y, lift)], axis=1)
+        self.attitude += -np.expm1(-self.dt / LEANING_S) * (wanted - self.attitude)
 
     def _motors_on(self) -> Mask:
         """Rows (N,) whose motors turn."""

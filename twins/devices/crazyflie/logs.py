@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from struct import Struct
+from functools import partial
 from typing import Final
 
 import numpy as np
 
+from agents.arrays import Array
 from agents.protocols import crtp
 from agents.protocols.crtp import Info, Log, Status
+from twins.devices.crazyflie.commander import HOVER_THRUST
 from twins.devices.crazyflie.flock import Flock
-from twins.devices.crazyflie.tables import LOG_FORMATS, LOGS
+from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, Table, pack
+from twins.models.quadrotor import GRAVITY
 
 ROOM: Final = (2.0, 2.0, 2.5)  # [m] from the origin to the walls, and height: measured by the Multi-ranger
 REACH: Final = 4.0  # [m] of its sensors
@@ -29,29 +32,35 @@ Read = Callable[[], float]
 class Block:
     """One log block."""
 
-    variables: list[tuple[Read, Struct, bool]] = field(default_factory=list)
+    variables: list[tuple[Read, str]] = field(default_factory=list)  # and the type in which each is sent
     period: float = 0.0  # [s], 0 while it is stopped
     next: float = 0.0
 
     @property
     def size(self) -> int:
         """Bytes of its values."""
-        return sum(packing.size for _, packing, _ in self.variables)
+        return sum(PACKINGS[kind].size for _, kind in self.variables)
 
 
 class LogBlocks:
     """The log blocks of one Crazyflie."""
 
-    def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float]) -> None:
+    def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: Table) -> None:
         self._blocks: dict[int, Block] = {}
         known = _variables(flock, row, parameter)
-        self._read: list[Read] = [known.get(variable.name, _zero) for variable in LOGS]
+        self._read: list[Read] = [
+            known.get(variable.name, partial(float, variable.value)) for variable in table.variables
+        ]
+
+    def reset(self) -> None:
+        """Delete all blocks."""
+        self._blocks.clear()
 
     def execute(self, command: int, number: int, rest: bytes, t: float) -> Status:
         """Execute a command for block `number` at time `t` [s]."""
         block = self._blocks.get(number)
         if command == Log.RESET:
-            self._blocks.clear()
+            self.reset()
             return Status.OK
         if command == Log.CREATE:
             return self._create(number, rest)
@@ -77,9 +86,7 @@ class LogBlocks:
             block.next += block.period
             if block.next < t - BEHIND_S:
                 block.next = t + block.period
-            values = b"".join(
-                packing.pack(_wrapped(read(), packing) if whole else read()) for read, packing, whole in block.variables
-            )
+            values = b"".join(pack(kind, read()) for read, kind in block.variables)
             yield bytes((number,)) + stamp + values
 
     def _create(self, number: int, items: bytes) -> Status:
@@ -92,60 +99,120 @@ class LogBlocks:
 
     def _append(self, block: Block, items: bytes) -> Status:
         for begin in range(0, len(items) - 2, 3):
-            kind, number = crtp.ITEM.unpack_from(items, begin)
-            if number >= len(LOGS) or kind & 0x0F not in LOG_FORMATS:
+            code, number = crtp.ITEM.unpack_from(items, begin)
+            kind = LOG_TYPES.get(code & 0x0F)
+            if number >= len(self._read) or kind is None:
                 return Status.UNKNOWN
-            packing, whole = LOG_FORMATS[kind & 0x0F]
-            if block.size + packing.size > crtp.LOG_PAYLOAD:
+            if block.size + PACKINGS[kind].size > crtp.LOG_PAYLOAD:
                 return Status.TOO_LARGE
             if sum(len(other.variables) for other in self._blocks.values()) == crtp.LOG_VARIABLES:
                 return Status.NO_ROOM
-            block.variables.append((self._read[number], packing, whole))
+            block.variables.append((self._read[number], kind))
         return Status.OK
 
 
-def _zero() -> float:
-    return 0.0
-
-
-def _wrapped(value: float, packing: Struct) -> int:
-    """Whole number, wrapped to the size of the packing."""
-    bits = 8 * packing.size
-    whole = int(value) & ((1 << bits) - 1)
-    signed = packing.format[-1].islower()
-    return whole - (1 << bits) if signed and whole >> (bits - 1) else whole
-
-
 def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
-    """Functions that read the log variables."""
-    quadrotor, memories = flock.quadrotor, flock.memories[row]
+    """Functions that read the log variables that are simulated; the others are constants of the table."""
+    return _motion(flock, row) | _system(flock, row, parameter)
+
+
+def _motion(flock: Flock, row: int) -> dict[str, Read]:
+    """Estimates, sensors of motion, setpoints."""
+    quadrotor = flock.quadrotor
+    noise = np.random.default_rng(row)
     read: dict[str, Read] = {}
-    for i, axis in enumerate("xyz"):
-        read[f"stateEstimate.{axis}"] = lambda i=i: float(flock.estimate[row, i])  # type: ignore[misc]
-        read[f"stateEstimate.v{axis}"] = lambda i=i: float(flock.velocity[row, i])  # type: ignore[misc]
-        read[f"stateEstimateZ.{axis}"] = lambda i=i: flock.estimate[row, i] / crtp.MM  # type: ignore[misc]
-        read[f"stateEstimateZ.v{axis}"] = lambda i=i: flock.velocity[row, i] / crtp.MM  # type: ignore[misc]
-        read[f"ctrltarget.{axis}"] = lambda i=i: float(np.nan_to_num(flock.commander.target[row, i]))  # type: ignore[misc]
-        read[f"locSrv.{axis}"] = lambda i=i: float(flock.estimator.external[row, i])  # type: ignore[misc]
-        read[f"kalman.varP{axis.upper()}"] = lambda: float(flock.estimator.variance[row])
-    for sensor, bearing in SENSORS.items():
+
+    def vector(names: str, of: Callable[[], Array], scale: float = 1.0, sigma: float = 0.0) -> None:
+        """Add the components of a vector under their names."""
+        for i, name in enumerate(names.split()):
+            read[name] = lambda i=i: float(scale * of()[i]) + (sigma * noise.standard_normal() if sigma else 0.0)  # type: ignore[misc]
+
+    def level(of: Array) -> Array:
+        """Vector of the world (3,) in the level frame with the robot's yaw."""
+        cos, sin = math.cos(quadrotor.yaw[row]), math.sin(quadrotor.yaw[row])
+        return np.array([cos * of[0] + sin * of[1], cos * of[1] - sin * of[0], of[2]])
+
+    def angles() -> Array:
+        return np.degrees([*flock.attitude[row], _wrap(quadrotor.yaw[row])])
+
+    def force() -> Array:
+        """Specific force [g], which is measured; none in free fall."""
+        falls = not quadrotor.flying[row] and flock.place[row, 2] > 0.0
+        return np.zeros(3) if falls else level(flock.acceleration[row]) / GRAVITY + [0.0, 0.0, 1.0]
+
+    def attitude() -> Array:
+        """Quaternion x, y, z, w."""
+        roll, pitch, yaw = np.radians(angles()) * [0.5, -0.5, 0.5]  # a positive pitch of the firmware is nose up
+        (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+        return np.array(
+            [
+                sr * cp * cy - cr * sp * sy,
+                cr * sp * cy + sr * cp * sy,
+                cr * cp * sy - sr * sp * cy,
+                cr * cp * cy + sr * sp * sy,
+            ]
+        )
+
+    def thrust() -> float:
+        return HOVER_THRUST * float(force()[2]) if quadrotor.flying[row] else 0.0
+
+    def target() -> Array:
+        return np.asarray(np.nan_to_num(flock.commander.target[row]))
+
+    millimetres = 1.0 / crtp.MM
+    vector("stateEstimate.x stateEstimate.y stateEstimate.z", lambda: flock.estimate[row])
+    vector("kalman.stateX kalman.stateY kalman.stateZ", lambda: flock.estimate[row])
+    vector("stateEstimate.vx stateEstimate.vy stateEstimate.vz", lambda: flock.velocity[row])
+    vector("kalman.statePX kalman.statePY kalman.statePZ", lambda: level(flock.velocity[row]))
+    vector("stateEstimate.ax stateEstimate.ay stateEstimate.az", lambda: flock.acceleration[row], 1.0 / GRAVITY)
+    vector("stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z", lambda: flock.estimate[row], millimetres)
+    vector("stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz", lambda: flock.velocity[row], millimetres)
+    vector("stateEstimateZ.ax stateEstimateZ.ay stateEstimateZ.az", lambda: flock.acceleration[row], millimetres)
+    for group in ("stateEstimate", "stabilizer", "controller"):
+        vector(f"{group}.roll {group}.pitch {group}.yaw", angles)
+    vector("stateEstimate.qx stateEstimate.qy stateEstimate.qz stateEstimate.qw", attitude)
+    vector("kalman.q1 kalman.q2 kalman.q3 kalman.q0", attitude)
+    vector("acc.x acc.y acc.z", force, sigma=0.005)
+    vector("gyro.x gyro.y gyro.z", lambda: np.zeros(3), sigma=0.05)
+    vector("gyro.xRaw gyro.yRaw gyro.zRaw", lambda: np.zeros(3), sigma=2.0)
+    vector("ctrltarget.x ctrltarget.y ctrltarget.z", target)
+    vector("posCtl.targetX posCtl.targetY posCtl.targetZ", target)
+    vector("ctrltargetZ.x ctrltargetZ.y ctrltargetZ.z", target, millimetres)
+    vector("locSrv.x locSrv.y locSrv.z", lambda: flock.estimator.external[row])
+    vector("ext_pos.X ext_pos.Y ext_pos.Z", lambda: flock.estimator.external[row])
+    for axis in "XYZ":
+        for name in (f"kalman.varP{axis}", f"kalman.var{axis}"):
+            read[name] = lambda: float(flock.estimator.variance[row])
+    for name in ("stabilizer.thrust", "ctrltarget.thrust", "controller.cmd_thrust", "controller.actuatorThrust"):
+        read[name] = thrust
+    for number in range(1, 5):
+        read[f"motor.m{number}"] = read[f"motor.m{number}req"] = thrust
+    read["supervisor.accNorm"] = lambda: float(np.linalg.norm(force()))
+    read["baro.asl"] = lambda: 72.5 + float(flock.place[row, 2]) + 0.05 * noise.standard_normal()
+    return read
+
+
+def _system(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
+    """Decks, battery, supervisor."""
+    memories, read = flock.memories[row], dict[str, Read]()
+    for sensor, bearing in SENSORS.items() if flock.multiranger[row] else ():
         read[f"range.{sensor}"] = lambda bearing=bearing: _distance(flock, row, bearing)  # type: ignore[misc]
+    if flock.multiranger[row]:
+        read["range.up"] = lambda: _in_reach(ROOM[2] - flock.place[row, 2])
+    if flock.flow[row]:
+        read["range.zrange"] = lambda: _in_reach(flock.place[row, 2])
+    if flock.loco[row]:
+        read["loco.spiWr"] = read["loco.spiRe"] = lambda: 500.0  # [1/s] accesses of the deck's driver
     read |= {
-        "stateEstimate.yaw": lambda: math.degrees(_wrap(quadrotor.yaw[row])),
-        "stabilizer.yaw": lambda: math.degrees(_wrap(quadrotor.yaw[row])),
-        "stateEstimate.qz": lambda: math.sin(0.5 * quadrotor.yaw[row]),
-        "stateEstimate.qw": lambda: math.cos(0.5 * quadrotor.yaw[row]),
-        "range.up": lambda: _in_reach(ROOM[2] - flock.place[row, 2]),
-        "range.zrange": lambda: _in_reach(flock.place[row, 2]),
-        "pm.vbat": lambda: flock.voltage(row),
-        "pm.vbatMV": lambda: crtp.SECONDS_MS * flock.voltage(row),
-        "pm.batteryLevel": lambda: 100.0 * float(flock.charge[row]),
+        "pm.vbat": lambda: float(flock.volts[row]),
+        "pm.vbatMV": lambda: crtp.SECONDS_MS * float(flock.volts[row]),
+        "pm.batteryLevel": lambda: flock.battery_level(row),
         "pm.state": lambda: flock.power(row),
         "supervisor.info": lambda: flock.info(row),
         "sys.canfly": lambda: bool(flock.info(row) & Info.CAN_FLY),
         "sys.isFlying": lambda: bool(flock.info(row) & Info.FLYING),
-        "radio.isConnected": lambda: 1.0,
-        "radio.rssi": lambda: 45.0,
+        "sys.isTumbled": lambda: bool(flock.info(row) & Info.TUMBLED),
+        "memTst.errCntW": lambda: memories.write_errors,
         "lighthouse.status": lambda: flock.station_status(row),
         "lighthouse.bsReceive": lambda: memories.geometries if flock.lighthouse[row] else 0,
         "lighthouse.bsActive": lambda: memories.geometries & memories.calibrations,

@@ -1,7 +1,8 @@
-"""Memories of a Crazyflie: trajectories, Loco anchors, Lighthouse base stations, and one for tests of the link."""
+"""Memories of a Crazyflie: EEPROM, trajectories, decks, Loco anchors, Lighthouse base stations, test of the link."""
 
 from __future__ import annotations
 
+import struct
 from typing import Final
 
 from agents.protocols.crtp import ANCHOR, Memory
@@ -15,7 +16,13 @@ CALIBRATION: Final = 0x1000  # address of the calibrations
 ACTIVE: Final = 0x1000  # address of the list of active anchors
 ANCHOR_PAGES: Final = 0x2000
 
+DECK_VERSION: Final = 3  # of the list of deck memories, which is empty otherwise
+
 SIZES: Final = {
+    Memory.EEPROM: 0x20,
+    Memory.LED_RING: 24,
+    Memory.LED_TIMING: 0x400,
+    Memory.DECKS: 0x2000,
     Memory.TRAJECTORY: 4096,
     Memory.LOCO: ANCHOR_PAGES + PAGE * 0x100,
     Memory.LIGHTHOUSE: 2 * CALIBRATION,
@@ -33,6 +40,10 @@ class Memories:
         loco = self._bytes[Memory.LOCO]
         for where in (0, ACTIVE):  # all anchors are active, without positions
             loco[where : where + 1 + ANCHORS] = bytes((ANCHORS, *range(ANCHORS)))
+        self._bytes[Memory.DECKS][0] = DECK_VERSION
+        settings = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)  # radio, trim, address
+        self._bytes[Memory.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
+        self.write_errors = 0  # of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
 
     @staticmethod
@@ -53,6 +64,8 @@ class Memories:
         """Write `data` to `address`; False at an invalid address."""
         if kind == Memory.LOCO or address + len(data) > SIZES[kind] or not self._exists(kind, address):
             return False
+        if kind == Memory.TESTER:
+            self.write_errors += sum(value != (address + k) & 0xFF for k, value in enumerate(data))
         self._bytes[kind][address : address + len(data)] = data
         return True
 

@@ -6,8 +6,10 @@ per axis (Richter, Bry and Roy, "Polynomial Trajectory Planning for Aggressive Q
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
-from math import pi
+from math import cos, pi, sin
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,10 @@ from numpy.typing import NDArray
 from agents.arrays import Array, Mask
 from agents.protocols.crtp import Status
 
-SHORTEST = 0.01  # [s]
+SHORTEST: Final = 0.01  # [s]
+ORDER: Final = 7  # of the polynomials
+
+Piece = tuple[float, Array]  # duration [s], coefficients (4, ORDER + 1) of x, y, z, yaw, constant first
 
 
 class Plan(IntEnum):
@@ -64,7 +69,8 @@ class Planner:
         self.plan: NDArray[np.int8] = np.zeros(rows, dtype=np.int8)  # (N,) `Plan` of each row
         self._begin = np.zeros(rows)
         self._span = np.ones(rows)
-        self._coefficients = np.zeros((rows, 4, 8))
+        self._coefficients = np.zeros((rows, 4, ORDER + 1))
+        self._rest: list[list[Piece]] = [[] for _ in range(rows)]  # pieces after the current one
 
     def takeoff(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
         """Plan a vertical motion to `height` [m]; refused unless idle."""
@@ -99,7 +105,7 @@ class Planner:
         zero = np.zeros(4)
         speed, acceleration = np.append(velocity, 0.0), zero
         if self.plan[row] != Plan.IDLE:
-            pose, speed, acceleration = self._state(row, t)
+            pose, speed, acceleration = self.state(row, t)
         if relative:
             goal = pose + goal
         goal = self._shorter_turn(pose, goal)
@@ -108,9 +114,66 @@ class Planner:
             ends = (pose, even, zero), (goal, even, zero)
         else:
             ends = (pose, speed, acceleration), (goal, zero, zero)
-        self._start(row, t, span, polynomial(span, *ends))
-        self.plan[row] = Plan.FLYING
+        self.follow(row, t, [(span, polynomial(span, *ends))])
         return Status.OK
+
+    def spiral(
+        self,
+        row: int,
+        t: float,
+        pose: Array,
+        *,
+        angle: float,
+        radii: tuple[float, float],
+        climb: float,
+        span: float,
+        sideways: bool,
+        clockwise: bool,
+    ) -> Status:
+        """Plan an arc from `pose` around a centre beside it, or ahead of (clockwise) or behind it if `sideways`.
+
+        As in the firmware the arc is one polynomial with the position, velocity and acceleration of the spiral at its
+        ends, so it is a spiral for angles up to 90° only.
+
+        Args:
+            row: Row of the plan.
+            t: Current time [s].
+            pose: Start (4,).
+            angle: Of the arc and of the turn, at most a full circle [rad].
+            radii: First and last [m].
+            climb: [m].
+            span: Duration [s].
+            sideways: The nose points to or from the centre instead of along the arc.
+            clockwise: Sense.
+        """
+        span, angle = max(span, SHORTEST), max(-2.0 * pi, min(2.0 * pi, angle))
+        first, last = (max(radius, 0.0) for radius in radii)
+        rate = (-angle if clockwise else angle) / span
+        growth = (last - first) / span
+        # direction from the centre to the robot, ahead of its nose by:
+        side = (pi if clockwise else 0.0) if sideways else (0.5 * pi if clockwise else -0.5 * pi)
+        ends = []
+        for radius, yaw in ((first, pose[3]), (last, pose[3] + rate * span)):
+            out = np.array([cos(yaw + side), sin(yaw + side)])
+            along = np.array([-out[1], out[0]])
+            velocity = growth * out + radius * rate * along
+            acceleration = 2.0 * growth * rate * along - radius * rate**2 * out
+            ends.append(
+                (
+                    np.array([*(radius * out), 0.0, yaw]),
+                    np.array([*velocity, climb / span, rate]),
+                    np.array([*acceleration, 0.0, 0.0]),
+                )
+            )
+        (begin, v, a), (end, w, b) = ends
+        goal = pose + (end - begin) + [0.0, 0.0, climb, 0.0]
+        self.follow(row, t, [(span, polynomial(span, (pose, v, a), (goal, w, b)))])
+        return Status.OK
+
+    def follow(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
+        """Follow pieces one after the other, then hold the last pose."""
+        self._start(row, t, pieces)
+        self.plan[row] = Plan.FLYING
 
     def stop(self, row: int) -> None:
         """Drop the plan of a row."""
@@ -118,17 +181,22 @@ class Planner:
 
     def finished(self, t: float) -> Mask:
         """Rows (N,) at the end of their plan, or without one."""
-        return np.asarray((self.plan == Plan.IDLE) | (t - self._begin >= self._span))
+        last = np.array([not rest for rest in self._rest])
+        return np.asarray((self.plan == Plan.IDLE) | (last & (t - self._begin >= self._span)))
 
     def goal(self, t: float) -> Array:
         """Current planned poses (N, 4), NaN for idle rows; a row that has landed becomes idle."""
+        for row, rest in enumerate(self._rest):
+            if rest:
+                self._advance(row, t)
         self.plan[(self.plan == Plan.LANDING) & (t - self._begin >= self._span)] = Plan.IDLE
         elapsed = np.clip(t - self._begin, 0.0, self._span)
         pose, _, _ = evaluate(self._coefficients, elapsed[:, None])
         return np.asarray(np.where((self.plan == Plan.IDLE)[:, None], np.nan, pose))
 
-    def _state(self, row: int, t: float) -> tuple[Array, Array, Array]:
+    def state(self, row: int, t: float) -> tuple[Array, Array, Array]:
         """Pose, speed and acceleration (4,) on the plan of a row; at rest after the end of the plan."""
+        self._advance(row, t)
         elapsed = t - self._begin[row]
         pose, speed, acceleration = evaluate(self._coefficients[row], np.clip(elapsed, 0.0, self._span[row]))
         if elapsed >= self._span[row]:
@@ -138,13 +206,23 @@ class Planner:
     def _vertical(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> None:
         span, zero = max(span, SHORTEST), np.zeros(4)
         goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
-        self._start(row, t, span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))
+        self._start(row, t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
 
-    def _start(self, row: int, t: float, span: float, coefficients: Array) -> None:
-        self._begin[row], self._span[row], self._coefficients[row] = t, span, coefficients
+    def _start(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
+        (self._span[row], self._coefficients[row]), *self._rest[row] = pieces
+        self._begin[row] = t
+
+    def _advance(self, row: int, t: float) -> None:
+        """Proceed to the piece of time `t`."""
+        while self._rest[row] and t - self._begin[row] >= self._span[row]:
+            self._start(row, self._begin[row] + self._span[row], self._rest[row])
 
     @staticmethod
     def _shorter_turn(pose: Array, goal: Array) -> Array:
         """Goal with the yaw of the shorter turn."""
-        turn = (goal[3] - pose[3] + pi) % (2.0 * pi) - pi
-        return np.array([*goal[:3], pose[3] + turn])
+        return np.array([*goal[:3], pose[3] + wrap(goal[3] - pose[3])])
+
+
+def wrap(angle: float) -> float:
+    """Angle from -pi up to pi [rad]."""
+    return (angle + pi) % (2.0 * pi) - pi

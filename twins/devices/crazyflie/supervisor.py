@@ -20,6 +20,7 @@ LOCK_S: Final = 2.0  # without setpoints for so long, the drone locks
 FLYING_S: Final = 2.0  # a drone counts as flying for so long after its motors turned
 LANDED_S: Final = 3.0  # from landing to disarming
 PREFLIGHT_S: Final = 30.0  # from arming to disarming, if it does not take off
+SPIN_UP_S: Final = 0.5  # from the arming of brushless motors to their readiness
 WATCHDOG_S: Final = 1.0  # longest time between two packets of the emergency watchdog
 
 
@@ -32,6 +33,8 @@ class State(IntEnum):
     LEVEL = 3  # setpoints have ceased: height and attitude are held, not the position
     LANDED = 4
     LOCKED = 5  # until a restart
+    ARMING = 6  # brushless motors spin up: armed, but not yet allowed to fly
+    CRASHED = 7  # until it stands upright again and recovery is requested
 
 
 class Supervisor:
@@ -41,6 +44,7 @@ class Supervisor:
         rows = len(auto_arm)
         self._auto = auto_arm
         self.state: NDArray[np.int8] = np.where(auto_arm, State.READY, State.DISARMED).astype(np.int8)
+        self.tumbled: NDArray[np.bool_] = np.zeros(rows, dtype=bool)  # upside down, or on their side
         self._since = np.zeros(rows)  # time of arming or landing [s]
         self._motors_ran = np.full(rows, -np.inf)
         self._watchdog = np.full(rows, np.inf)  # watchdog; infinity while it is not in use
@@ -49,24 +53,40 @@ class Supervisor:
     @property
     def may_fly(self) -> Mask:
         """Rows (N,) whose motors may turn."""
-        return np.asarray((self.state != State.DISARMED) & (self.state != State.LOCKED))
+        state = self.state
+        return np.asarray(
+            (state == State.READY) | (state == State.FLYING) | (state == State.LEVEL) | (state == State.LANDED)
+        )
 
     @property
     def level(self) -> Mask:
         """Rows (N,) that ignore horizontal setpoints."""
         return np.asarray(self.state == State.LEVEL)
 
+    def restart(self, row: int) -> None:
+        """State after switching off and on."""
+        self.state[row] = State.READY if self._auto[row] else State.DISARMED
+        self._motors_ran[row], self._watchdog[row], self._stop[row] = -np.inf, np.inf, False
+
     def arm(self, row: int, t: float, *, on: bool) -> bool:
         """Arm or disarm a row; False if not possible in its state."""
-        if on and self.state[row] == State.DISARMED:
-            self.state[row], self._since[row] = State.READY, t
-        elif not on and self.state[row] != State.LOCKED:
+        if on and self.state[row] == State.DISARMED and not self.tumbled[row]:
+            self.state[row], self._since[row] = State.ARMING, t
+        elif not on and self.state[row] in (State.FLYING, State.LEVEL):
+            self._stop[row] = True  # disarmed in the air, it locks
+        elif not on and self.state[row] not in (State.LOCKED, State.CRASHED):
             self.state[row] = State.DISARMED
         return bool(self.armed(row) == on)
 
+    def recover(self, row: int) -> bool:
+        """Recover a row from a crash, once it stands upright; whether it is in order."""
+        if self.state[row] == State.CRASHED and not self.tumbled[row]:
+            self.state[row] = State.DISARMED
+        return bool(self.state[row] != State.CRASHED)
+
     def armed(self, row: int) -> bool:
         """Whether a row is armed."""
-        return bool(self.may_fly[row])
+        return bool(self.may_fly[row] or self.state[row] == State.ARMING)
 
     def stop(self, row: int) -> None:
         """Request an emergency stop of a row."""
@@ -77,7 +97,7 @@ class Supervisor:
         self._watchdog[row] = t
 
     def advance(self, t: float, spinning: Mask, age: Array) -> Mask:
-        """Advance one tick; returns the rows (N,) that have just been locked.
+        """Advance one tick; returns the rows (N,) that have just been locked or have crashed.
 
         Args:
             t: Current time [s].
@@ -87,38 +107,50 @@ class Supervisor:
         self._motors_ran[spinning] = t
         flying, state = t - self._motors_ran < FLYING_S, self.state
         airborne = (state == State.FLYING) | (state == State.LEVEL)
-        lock = (state != State.LOCKED) & (self._stop | (t - self._watchdog > WATCHDOG_S) | (airborne & (age > LOCK_S)))
+        lock = (state != State.LOCKED) & (
+            self._stop
+            | (t - self._watchdog > WATCHDOG_S)
+            | (airborne & (age > LOCK_S))
+            | ((state == State.LEVEL) & self.tumbled)
+        )
+        crash = (state == State.FLYING) & self.tumbled & ~lock
         settled = t - self._since
-        home = np.where(self._auto, State.READY, State.DISARMED)
-        after = np.select(
-            [
-                lock,
-                (state == State.FLYING) & (age > LEVEL_S),
-                (state == State.LEVEL) & (age <= LEVEL_S),
-                (state == State.FLYING) & ~flying,
-                ((state == State.READY) | (state == State.LANDED)) & flying,
-                (state == State.READY) & ~self._auto & (settled > PREFLIGHT_S),
-                (state == State.LANDED) & (settled > LANDED_S),
-            ],
-            [State.LOCKED, State.LEVEL, State.FLYING, State.LANDED, State.FLYING, State.DISARMED, home],
-            state,
-        ).astype(np.int8)
-        self._since[(after == State.LANDED) & (state != State.LANDED)] = t
+        rules = (
+            (lock, State.LOCKED),
+            (crash, State.CRASHED),
+            (self.tumbled & ((state == State.READY) | (state == State.ARMING)), State.DISARMED),
+            ((state == State.DISARMED) & self._auto & ~self.tumbled, State.READY),
+            ((state == State.ARMING) & (settled >= SPIN_UP_S), State.READY),
+            ((state == State.FLYING) & (age > LEVEL_S), State.LEVEL),
+            ((state == State.LEVEL) & (age <= LEVEL_S), State.FLYING),
+            ((state == State.FLYING) & ~flying, State.LANDED),
+            (((state == State.READY) | (state == State.LANDED)) & flying, State.FLYING),
+            ((state == State.READY) & ~self._auto & (settled > PREFLIGHT_S), State.DISARMED),
+            ((state == State.LANDED) & (settled > LANDED_S), State.DISARMED),
+        )
+        after = np.select([rule for rule, _ in rules], [to for _, to in rules], state).astype(np.int8)
+        self._since[((after == State.LANDED) | (after == State.READY)) & (state != after)] = t
         self.state = after
-        return np.asarray(lock)
+        return np.asarray(lock | crash)
 
     def info(self, row: int) -> Info:
         """Flags of a row, without those of the planner."""
         state = State(self.state[row])
         info = Info(0)
-        if state == State.DISARMED:
+        if state == State.DISARMED and not self.tumbled[row]:
             info |= Info.CAN_BE_ARMED
+        if self.armed(row):
+            info |= Info.ARMED
         if self.may_fly[row]:
-            info |= Info.ARMED | Info.CAN_FLY
+            info |= Info.CAN_FLY
         if self._auto[row]:
             info |= Info.AUTO_ARM
         if state in (State.FLYING, State.LEVEL):
             info |= Info.FLYING
+        if self.tumbled[row]:
+            info |= Info.TUMBLED
         if state == State.LOCKED:
             info |= Info.LOCKED
+        if state == State.CRASHED:
+            info |= Info.CRASHED
         return info

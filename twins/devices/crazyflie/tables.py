@@ -1,158 +1,178 @@
-"""Tables of contents: parameters and log variables of the firmware, as bytes on the wire."""
+"""Tables of contents: parameters and log variables, built in or those of a lab's own drone, as bytes on the wire."""
 
 from __future__ import annotations
 
+import re
 import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 from struct import Struct
 from typing import Final
 
+import msgspec
+
+from agents.body.interface import BodyError
+
 READ_ONLY: Final = 0x40
 EXTENDED: Final = 0x10  # may be stored on board
+FLAGS: Final = {"": 0, "!": READ_ONLY, "*": EXTENDED}
 
-PARAMETER_TYPES: Final = {
-    "u8": (0x08, Struct("<B")),
-    "u16": (0x09, Struct("<H")),
-    "u32": (0x0A, Struct("<L")),
-    "i8": (0x00, Struct("<b")),
-    "i16": (0x01, Struct("<h")),
-    "i32": (0x02, Struct("<i")),
-    "float": (0x06, Struct("<f")),
+PACKINGS: Final = {
+    "u8": Struct("<B"),
+    "u16": Struct("<H"),
+    "u32": Struct("<L"),
+    "u64": Struct("<Q"),
+    "i8": Struct("<b"),
+    "i16": Struct("<h"),
+    "i32": Struct("<i"),
+    "i64": Struct("<q"),
+    "half": Struct("<e"),
+    "float": Struct("<f"),
+    "double": Struct("<d"),
 }
-LOG_TYPES: Final = {
-    "u8": (1, Struct("<B")),
-    "u16": (2, Struct("<H")),
-    "u32": (3, Struct("<L")),
-    "i8": (4, Struct("<b")),
-    "i16": (5, Struct("<h")),
-    "i32": (6, Struct("<i")),
-    "float": (7, Struct("<f")),
-    "half": (8, Struct("<e")),
-}
-LOG_FORMATS: Final = {number: (packing, name[0] in "ui") for name, (number, packing) in LOG_TYPES.items()}
+PARAMETER_CODES: Final = {
+    "u8": 0x08, "u16": 0x09, "u32": 0x0A, "u64": 0x0B, "i8": 0x00, "i16": 0x01, "i32": 0x02, "i64": 0x03, "float": 0x06,
+    "double": 0x07,
+}  # fmt: skip
+LOG_CODES: Final = {"u8": 1, "u16": 2, "u32": 3, "i8": 4, "i16": 5, "i32": 6, "float": 7, "half": 8}
+LOG_TYPES: Final = {code: kind for kind, code in LOG_CODES.items()}
+BUILT_IN: Final = Path(__file__).with_name("inventory.txt")
+RANGE: Final = re.compile(r"(\w*?)(\d+)-(\d+)")  # several names with a number each
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter: type, default, access."""
+class Variable:
+    """One parameter or log variable: type on board, value at the start, access."""
 
     name: str
     type: str
-    default: float
+    value: float = 0.0
     flags: int = 0
 
-    @property
-    def packing(self) -> Struct:
-        """Packing of the value."""
-        return PARAMETER_TYPES[self.type][1]
 
-    @property
-    def item(self) -> bytes:
-        """Its entry in the table."""
-        return entry(PARAMETER_TYPES[self.type][0] | self.flags, self.name)
-
-
-@dataclass(frozen=True)
-class LogVariable:
-    """One log variable and its type on board."""
-
-    name: str
-    type: str
-
-    @property
-    def item(self) -> bytes:
-        """Its entry in the table."""
-        return entry(LOG_TYPES[self.type][0], self.name)
+def pack(kind: str, value: float) -> bytes:
+    """Value in the type `kind`; whole numbers wrap, as in C."""
+    packing = PACKINGS[kind]
+    if kind[0] not in "ui":
+        return packing.pack(value)
+    bits = 8 * packing.size
+    whole = int(value) & ((1 << bits) - 1)
+    return packing.pack(whole - (1 << bits) if kind[0] == "i" and whole >> (bits - 1) else whole)
 
 
-def entry(kind: int, name: str) -> bytes:
-    """One entry of a table; the last NUL is required, because cflib always cuts one byte off."""
-    group, variable = name.split(".")
-    return bytes((kind,)) + f"{group}\0{variable}\0".encode()
-
-
-@dataclass(frozen=True)
 class Table:
-    """One table: entries as bytes, numbers by name, and a checksum.
+    """Variables in the order of their numbers."""
 
-    cflib caches tables by checksum only, those of parameters and of logs in one folder: the checksum must depend on the
-    content, and differ between the two.
+    def __init__(self, variables: Sequence[Variable], codes: Mapping[str, int]) -> None:
+        """`codes`: codes of the types on the wire; they are part of the checksum, because cflib keeps all tables in one
+        cache by checksum."""
+        self.variables = tuple(variables)
+        self.number = {variable.name: i for i, variable in enumerate(self.variables)}
+        # the last NUL is required: cflib always cuts one byte off
+        self.items = tuple(
+            bytes((codes[variable.type] | variable.flags,)) + variable.name.replace(".", "\0").encode() + b"\0"
+            for variable in self.variables
+        )
+        self.crc = zlib.crc32(bytes(codes.values()) + b"".join(self.items))
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """Both tables of a Crazyflie."""
+
+    parameters: Table
+    logs: Table
+
+
+class LogTocElement(msgspec.Struct, tag_field="__class__", tag="LogTocElement"):
+    """Log variable in cflib's cache."""
+
+    ident: int
+    group: str
+    name: str
+    ctype: str
+    access: int = 0
+    extended: bool = False
+
+
+class ParamTocElement(LogTocElement, tag_field="__class__", tag="ParamTocElement"):
+    """Parameter in cflib's cache."""
+
+
+Cached = dict[str, dict[str, LogTocElement | ParamTocElement]]
+
+
+@cache
+def inventory(files: tuple[str, ...] = ()) -> Inventory:
+    """Tables built in, or those of `files` of cflib's cache, one for parameters, one for log variables.
+
+    Variables of a file start with the value that the variable of the same name has in the built-in table, otherwise 0.
+
+    Raises:
+        BodyError: If a file is no table of cflib's cache, or two are of the same kind.
     """
-
-    items: tuple[bytes, ...]
-    number: dict[str, int]
-    crc: int
-
-    @classmethod
-    def build(cls, entries: Sequence[Parameter | LogVariable], salt: bytes) -> Table:
-        """Build the table of these entries."""
-        items = tuple(one.item for one in entries)
-        return cls(items, {one.name: i for i, one in enumerate(entries)}, zlib.crc32(salt + b"".join(items)))
-
-
-PARAMETERS: Final = (
-    Parameter("commander.enHighLevel", "u8", 1),  # without effect, kept by the firmware for old clients
-    Parameter("deck.bcLighthouse4", "u8", 0, READ_ONLY),
-    Parameter("deck.bcLoco", "u8", 0, READ_ONLY),
-    Parameter("deck.bcMultiranger", "u8", 0, READ_ONLY),
-    Parameter("deck.bcFlow2", "u8", 0, READ_ONLY),
-    Parameter("firmware.revision0", "u32", 0x2A18FC29, READ_ONLY),
-    Parameter("firmware.revision1", "u16", 0x9D7B, READ_ONLY),
-    Parameter("hlCommander.vtoff", "float", 0.5),
-    Parameter("hlCommander.vland", "float", 0.5),
-    Parameter("kalman.initialX", "float", 0.0),
-    Parameter("kalman.initialY", "float", 0.0),
-    Parameter("kalman.initialZ", "float", 0.0),
-    Parameter("kalman.initialYaw", "float", 0.0),
-    Parameter("kalman.resetEstimation", "u8", 0),
-    Parameter("kalman.robustTdoa", "u8", 0),
-    Parameter("kalman.robustTwr", "u8", 0),
-    Parameter("lighthouse.method", "u8", 1),
-    Parameter("lighthouse.systemType", "u8", 2, EXTENDED),
-    Parameter("lighthouse.bsCalibReset", "u8", 0),
-    Parameter("loco.mode", "u8", 0),
-    Parameter("locSrv.extPosStdDev", "float", 0.01),
-    Parameter("locSrv.extQuatStdDev", "float", 0.0045),
-    Parameter("locSrv.enRangeStreamFP32", "u8", 0),
-    Parameter("motorPowerSet.enable", "u8", 0),
-    Parameter("pm.lowVoltage", "float", 3.2, EXTENDED),
-    Parameter("pm.criticalLowVoltage", "float", 3.0, EXTENDED),
-    Parameter("stabilizer.controller", "u8", 1, EXTENDED),
-    Parameter("stabilizer.estimator", "u8", 0, EXTENDED),
-    Parameter("stabilizer.stop", "u8", 0),
-    Parameter("supervisor.landedTimeout", "u16", 3000, EXTENDED),
-    Parameter("supervisor.prefltTimeout", "u16", 30000, EXTENDED),
-)
-
-LOGS: Final = tuple(
-    LogVariable(name, type_)
-    for type_, names in (
-        ("float", "stateEstimate.x stateEstimate.y stateEstimate.z"),
-        ("float", "stateEstimate.vx stateEstimate.vy stateEstimate.vz"),
-        ("float", "stateEstimate.roll stateEstimate.pitch stateEstimate.yaw"),
-        ("float", "stateEstimate.qx stateEstimate.qy stateEstimate.qz stateEstimate.qw"),
-        ("i16", "stateEstimateZ.x stateEstimateZ.y stateEstimateZ.z"),
-        ("i16", "stateEstimateZ.vx stateEstimateZ.vy stateEstimateZ.vz"),
-        ("float", "stabilizer.roll stabilizer.pitch stabilizer.yaw stabilizer.thrust"),
-        ("float", "kalman.varPX kalman.varPY kalman.varPZ"),
-        ("float", "ctrltarget.x ctrltarget.y ctrltarget.z"),
-        ("float", "locSrv.x locSrv.y locSrv.z"),
-        ("float", "pm.vbat"),
-        ("u16", "pm.vbatMV"),
-        ("u8", "pm.batteryLevel"),
-        ("i8", "pm.state"),
-        ("u16", "supervisor.info"),
-        ("u8", "sys.canfly sys.isFlying sys.isTumbled"),
-        ("u8", "radio.rssi radio.isConnected"),
-        ("u8", "lighthouse.status"),
-        ("u16", "lighthouse.bsReceive lighthouse.bsActive lighthouse.bsGeoVal lighthouse.bsCalVal"),
-        ("u8", "loco.mode"),
-        ("u16", "ranging.state"),
-        ("u16", "range.front range.back range.left range.right range.up range.zrange"),
+    sections = list(_sections(BUILT_IN.read_text("ascii")))
+    read: dict[type, list[Variable]] = {}
+    for file in files:
+        kind, variables = _cached(file)
+        if kind in read:
+            raise BodyError(f"{file}: a second table of the same kind; give one of parameters and one of log variables")
+        known = {variable.name: variable.value for variable in sections[0 if kind is ParamTocElement else 1]}
+        read[kind] = [replace(variable, value=known.get(variable.name, 0.0)) for variable in variables]
+    return Inventory(
+        Table(read.get(ParamTocElement, sections[0]), PARAMETER_CODES),
+        Table(read.get(LogTocElement, sections[1]), LOG_CODES),
     )
-    for name in names.split()
-)
 
-PARAMETER_TABLE: Final = Table.build(PARAMETERS, b"parameters")
-LOG_TABLE: Final = Table.build(LOGS, b"logs")
+
+def _sections(text: str) -> Iterator[list[Variable]]:
+    """Variables of each section of the built-in text."""
+    for section in re.split(r"^\[\w+\]$", text, flags=re.MULTILINE)[1:]:
+        variables = []
+        for line in filter(None, section.splitlines()):
+            head, names = line.split(": ")
+            group, kind = head.split()
+            flags = FLAGS[kind.lstrip("abcdefghijklmnopqrstuvwxyz0123456789")]
+            for word in names.split():
+                name, _, value = word.partition("=")
+                several = RANGE.fullmatch(name)
+                every = [name] if several is None else _numbered(*several.groups())
+                variables += [
+                    Variable(f"{group}.{each}", kind.rstrip("!*"), float(value or 0.0), flags) for each in every
+                ]
+        yield variables
+
+
+def _numbered(name: str, first: str, last: str) -> list[str]:
+    return [f"{name}{number}" for number in range(int(first), int(last) + 1)]
+
+
+def _flags(element: LogTocElement) -> int:
+    return (READ_ONLY if element.access else 0) | (EXTENDED if element.extended else 0)
+
+
+def _cached(file: str) -> tuple[type, list[Variable]]:
+    """Kind and variables of a table in cflib's cache."""
+    try:
+        groups = msgspec.json.decode(Path(file).read_bytes(), type=Cached)
+        elements = sorted((element for group in groups.values() for element in group.values()), key=lambda e: e.ident)
+        (kind,) = {type(element) for element in elements}
+        codes = PARAMETER_CODES if kind is ParamTocElement else LOG_CODES
+        variables = [
+            Variable(
+                f"{element.group}.{element.name}",
+                element.ctype.removesuffix("_t").replace("uint", "u").replace("int", "i"),
+                flags=_flags(element) if kind is ParamTocElement else 0,
+            )
+            for element in elements
+        ]
+        if [element.ident for element in elements] != list(range(len(elements))):
+            raise ValueError("the numbers of its variables are not 0, 1, 2, ...")
+        if strange := sorted({variable.type for variable in variables} - set(codes)):
+            raise ValueError(f"unknown type {strange[0]}")
+    except (OSError, ValueError, msgspec.MsgspecError) as error:
+        remedy = "give a file of cflib's cache, such as ./cache/1A2B3C4D.json beside a script that used rw_cache"
+        raise BodyError(f"{file}: no table of a Crazyflie: {error}; {remedy}") from error
+    return kind, variables

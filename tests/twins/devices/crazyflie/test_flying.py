@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 
-from agents.protocols.crtp import HighLevel, Info, Location, Port, Safety, Setpoint, Status, yaw_of
+from agents.protocols.crtp import HighLevel, Info, Location, Platform, Port, Power, Safety, Setpoint, Status, yaw_of
 from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
 from twins.devices.crazyflie.supervisor import State
@@ -114,6 +114,19 @@ def test_groups():
     assert wire.plan(HighLevel.TAKEOFF, struct.pack("<ff?f", 1.0, 0.0, True, 1.0), group=2) == Status.OK
     wire.wait(2.0)
     assert wire.position[2] > 0.8
+
+
+def test_plans_begin_at_the_last_setpoint():
+    """While a plan runs, where it should be counts, not where it is: it lags half a second behind."""
+    wire = Wire().hovering()
+    wire.go_to(1.0, 0.0, 1.0, 0.0, 3.0)
+    wire.wait(1.5)
+    planned = wire.flock.planner.goal(wire.t)[0]
+    assert planned[0] - wire.position[0] > 0.2
+    wire.land(2.0)
+    assert wire.flock.planner.goal(wire.t)[0] == pytest.approx(planned)
+    wire.wait(3.0)
+    assert wire.position[0] == pytest.approx(planned[0], abs=0.02)
 
 
 # ---------------------------------------------------------------------- low level, and who is heard
@@ -283,10 +296,15 @@ def test_arming():
     assert wire.takeoff(0.5, 1.0) == Status.BUSY
     assert wire.arm() == bytes((0x81, 1, 1))
     assert Info.ARMED in wire.flock.info(0)
+    assert Info.CAN_FLY not in wire.flock.info(0)  # its motors spin up
+    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    wire.wait(0.6)
+    assert Info.CAN_FLY in wire.flock.info(0)
     wire.wait(30.1)
     assert Info.ARMED not in wire.flock.info(0)
     assert Info.CAN_BE_ARMED in wire.flock.info(0)
-    wire.arm()
+    assert wire.put(Port.PLATFORM, 0, int(Platform.ARM), 1) == [(Port.PLATFORM, 0, b"\1\1\1")]  # before version 12
+    wire.wait(0.6)
     wire.hovering(0.5)
     wire.land(1.0)
     wire.wait(1.2 + 2.0 + 2.5)
@@ -312,6 +330,77 @@ def test_battery():
     wire.wait(0.4 * 42.0 + 1.0)
     assert wire.flock.charge[0] == 0.0
     assert wire.position[2] == 0.0
+
+
+def test_the_level_of_the_battery_is_that_of_the_firmware():
+    """10 % from 3.00 to 3.78 V; 90 % is the most that it says; under load the voltage sags."""
+    flock = Wire().flock
+    levels = {1.0: 90, 0.95: 90, 0.85: 90, 0.55: 60, 0.15: 20, 0.09: 10, 0.01: 10, 0.0: 0}
+    for charge, level in levels.items():
+        flock.charge[0] = charge
+        assert flock.battery_level(0) == level
+    flock.charge[0] = 0.6
+    assert flock.volts[0] == pytest.approx(3.96)
+    flock.quadrotor.flying[0] = True
+    assert flock.volts[0] == pytest.approx(3.66)
+    assert flock.battery_level(0) == 10
+
+
+def test_an_empty_battery_is_reported_after_five_seconds():
+    wire = Wire(battery=0.05).hovering(0.5)
+    assert wire.flock.volts[0] < 3.2
+    assert wire.flock.power(0) == Power.BATTERY
+    wire.wait(1.5)
+    assert wire.flock.power(0) == Power.LOW
+
+
+# ---------------------------------------------------------------------- the floor, and crashes
+
+
+def test_the_floor():
+    """Motors that do not carry it leave it where it stands."""
+    wire = Wire()
+    wire.wait(1.0, lambda: wire.put(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 20000)))
+    assert wire.motors
+    assert wire.position.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_fall_ends_upside_down():
+    """Crashed, until it is put upright and recovery is asked for; then it flies again."""
+    wire = Wire().hovering()
+    wire.plan(HighLevel.STOP)
+    wire.wait(1.0)
+    assert wire.position[2] == 0.0
+    assert wire.state == State.CRASHED
+    assert Info.CRASHED | Info.TUMBLED in wire.flock.info(0)
+    assert wire.put(Port.SUPERVISOR, 1, int(Safety.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\0\0")]
+    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    wire.flock.supervisor.tumbled[0] = False
+    assert wire.takeoff(0.5, 1.0) == Status.BUSY
+    assert wire.put(Port.PLATFORM, 0, int(Platform.RECOVER)) == [(Port.PLATFORM, 0, b"\2\1\1")]  # before version 12
+    wire.wait(0.1)
+    assert wire.hovering(0.5).state == State.FLYING
+
+
+def test_a_collision():
+    """It lies on its side from a time on: its motors stop, it falls; upright again it can be recovered."""
+    wire = Wire(tumbled_from_s=5.0, tumbled_for_s=3.0).hovering()
+    wire.wait(1.5)
+    assert wire.state == State.CRASHED
+    wire.wait(3.0)
+    assert Info.TUMBLED not in wire.flock.info(0)
+    assert wire.state == State.CRASHED
+    assert wire.put(Port.SUPERVISOR, 1, int(Safety.RECOVER)) == [(Port.SUPERVISOR, 1, b"\x82\1\1")]
+
+
+def test_disarmed_in_the_air_it_locks():
+    wire = Wire(device={"platform": "brushless"})
+    wire.arm()
+    wire.wait(0.6)
+    wire.hovering(0.5)
+    wire.arm(on=False)
+    wire.wait(0.1)
+    assert wire.state == State.LOCKED
 
 
 # ---------------------------------------------------------------------- where it believes to be

@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 
 from agents.body.interface import BodyError, Disturbance, Jitter
 from agents.protocols import crtp
-from agents.protocols.crtp import Log, Memory, Misc, Port, Safety, Status, Toc, header
+from agents.protocols.crtp import NRF, Log, Memory, Misc, Port, PowerSwitch, Safety, Status, Toc, header
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.loopback import request
 from twins.body import TwinBody
 from twins.devices.crazyflie.device import open_device
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
-from twins.devices.crazyflie.tables import LOG_TABLE, LOGS, PARAMETER_TABLE, PARAMETERS
+from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS, inventory
 from twins.devices.device import DeviceRequest, Faults
+
+PARAMETER_TABLE, LOG_TABLE = inventory().parameters, inventory().logs
 
 
 def number(name):
@@ -106,16 +108,20 @@ def test_constants_are_not_answered():
 
 def test_stored_parameters():
     wire = Wire()
-    key = number("stabilizer.estimator")
+    key = number("ring.effect")
     (answer,) = wire.put(Port.PARAM, 3, int(Misc.EXTENDED_2), key)
     assert answer[2][3:] == b"\0\1"
-    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\0\0"
+    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\0\6"
     wire.put(Port.PARAM, 2, key, 2)
     wire.put(Port.PARAM, 3, int(Misc.STORE), key)
     wire.put(Port.PARAM, 2, key, 1)
-    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\1\0\2"
+    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\1\6\2"
+    assert wire.put(Port.LINK, 3, NRF, int(PowerSwitch.OFF)) == [(Port.LINK, 3, bytes((NRF, PowerSwitch.OFF)))]
+    assert wire.put(Port.PARAM, 1, key) == []
+    wire.put(Port.LINK, 3, NRF, int(PowerSwitch.ON))
+    assert wire.drone.value("ring.effect") == 2  # it survives a restart, which others do not
     wire.put(Port.PARAM, 3, int(Misc.CLEAR), key)
-    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\0\0"
+    assert wire.put(Port.PARAM, 3, int(Misc.STORED), key)[0][2][3:] == b"\0\6"
     assert wire.put(Port.PARAM, 3, int(Misc.DEFAULT_2), number("pm.lowVoltage"))[0][2][3:] == b"\0" + struct.pack(
         "<f", 3.2
     )
@@ -131,9 +137,9 @@ def test_parameter_by_name():
 
 def test_every_parameter_packs():
     wire = Wire()
-    for i, parameter in enumerate(PARAMETERS):
+    for i, parameter in enumerate(PARAMETER_TABLE.variables):
         ((_, _, answer),) = wire.put(Port.PARAM, 1, struct.pack("<H", i))
-        assert parameter.packing.unpack(answer[3:])[0] == pytest.approx(parameter.default)
+        assert PACKINGS[parameter.type].unpack(answer[3:])[0] == pytest.approx(wire.drone.values[i])
 
 
 # ---------------------------------------------------------------------- logs
@@ -178,16 +184,61 @@ def test_log_limits():
     assert wire.put(Port.LOG, 1, int(Log.RESET))[0][2] == bytes((Log.RESET, 0, 0))  # three bytes, or cflib stumbles
 
 
+def test_silence_deletes_log_blocks():
+    """After a second without a link the firmware forgets them; the client is not told."""
+    with Client(silent_from_s=1.0, silent_for_s=1.5) as client:
+        block = variable(0x77, "stateEstimate.x")
+        client.device.drones[0].logs.execute(Log.CREATE, 0, block, 0.0)
+        client.device.drones[0].logs.execute(Log.START, 0, b"\1", 0.0)
+        client.ping(0.0)
+        for t, logged in ((0.5, True), (1.9, False), (2.1, False), (2.6, False)):
+            client.heard()
+            client.device.advance(t)
+            assert bool(client.heard()) == logged
+        assert client.device.drones[0].logs.execute(Log.START, 0, b"\1", 2.6) == Status.UNKNOWN
+
+
+def test_other_memories():
+    """What Bitcraze's examples read: EEPROM with its checksum, an empty list of decks, errors of the tester."""
+    wire = Wire()
+
+    def read(kind, count):
+        return wire.put(Port.MEMORY, 1, struct.pack("<BI", Memories.kinds.index(kind), 0), count)[0][2][6:]
+
+    eeprom = read(Memory.EEPROM, 21)
+    assert eeprom[:7] == b"0xBC\1P\2"
+    assert sum(eeprom[:20]) % 256 == eeprom[20]
+    assert read(Memory.DECKS, 24) == b"\3" + bytes(23)
+    tester = Memories.kinds.index(Memory.TESTER)
+    wire.put(Port.MEMORY, 2, struct.pack("<BI", tester, 5), bytes((5, 6, 7, 99)))
+    assert wire.flock.memories[0].write_errors == 1
+    wire.put(Port.PARAM, 2, number("memTst.resetW"), 1)
+    assert wire.flock.memories[0].write_errors == 0
+
+
+def test_power_switch():
+    """Off it answers no scan of its own, falls, and forgets what is not stored; on it is as new."""
+    wire = Wire().hovering()
+    wire.put(Port.LINK, 3, NRF, int(PowerSwitch.OFF))
+    wire.wait(1.0)
+    assert wire.position[2] == 0.0
+    assert wire.put(Port.LINK, 0, b"echo") == []
+    wire.flock.supervisor.tumbled[0] = False
+    assert wire.put(Port.LINK, 3, NRF, int(PowerSwitch.RESET_BEGIN))[0][2] == b"\xfe\xff\xe7\xe7\xe7\xe7"
+    wire.put(Port.LINK, 3, NRF, int(PowerSwitch.ON))
+    assert wire.put(Port.LINK, 0, b"echo") == [(Port.LINK, 0, b"echo")]
+    wire.hovering(0.5)
+
+
 def test_every_variable_packs():
     """In the type that it has on board, standing and flying."""
     wire = Wire(device={"multiranger": True}).hovering()
-    kinds = {"u8": 1, "u16": 2, "u32": 3, "i8": 4, "i16": 5, "float": 7}
-    for i, one in enumerate(LOGS):
+    for i, one in enumerate(LOG_TABLE.variables):
         wire.put(Port.LOG, 1, int(Log.RESET))
-        wire.put(Port.LOG, 1, int(Log.CREATE), 0, struct.pack("<BH", kinds[one.type], i))
+        wire.put(Port.LOG, 1, int(Log.CREATE), 0, struct.pack("<BH", LOG_CODES[one.type], i))
         wire.put(Port.LOG, 1, int(Log.START), 0, 1)
         ((_, _, data),) = wire.wait(0.02)[:1]
-        (value,) = struct.unpack({"u8": "<B", "u16": "<H", "i8": "<b", "i16": "<h", "float": "<f"}[one.type], data[4:])
+        (value,) = PACKINGS[one.type].unpack(data[4:])
         assert math.isfinite(value)
 
 

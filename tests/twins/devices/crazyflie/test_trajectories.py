@@ -1,0 +1,162 @@
+"""Uploaded trajectories and spirals of a Crazyflie twin, packed as cflib packs them."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+
+from agents.protocols.crtp import HighLevel, Memory, Port, Status
+from tests.twins.crazyflie_wire import Wire
+from twins.devices.crazyflie.memory import Memories
+from twins.devices.crazyflie.planner import Planner, evaluate
+from twins.devices.crazyflie.trajectories import COMPRESSED, IN_MEMORY, UNCOMPRESSED, Trajectories
+
+RISE = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 in 1 s, at rest at both ends
+
+
+def piece(span, x=(), y=(), z=(), yaw=()):
+    return struct.pack("<33f", *[c for axis in (x, y, z, yaw) for c in (*axis, *[0.0] * (8 - len(axis)))], span)
+
+
+def uploaded(data, kind=UNCOMPRESSED, count=0):
+    """Trajectory 3 of a memory that holds `data` at address 132."""
+    memories = Memories()
+    assert memories.write(Memory.TRAJECTORY, 132, data)
+    trajectories = Trajectories(memories)
+    assert trajectories.define(3, IN_MEMORY, kind, 132, count) == Status.OK
+    return trajectories
+
+
+def pose(pieces, t):
+    """Pose (4,) on pieces at time `t` [s]."""
+    for span, coefficients in pieces:
+        if t <= span:
+            return evaluate(coefficients, np.full(4, t))[0]
+        t -= span
+    raise AssertionError
+
+
+def flown(trajectories, start=None, **options):
+    options = {"turned": False, "reverse": False, "scale": 1.0} | options
+    status, pieces = trajectories.pieces(3, start, **options)
+    assert status == Status.OK
+    return pieces
+
+
+@pytest.fixture
+def corner():
+    """A metre along x, then half a metre along y while it turns."""
+    east = piece(1.0, RISE, [0.5], [1.0])
+    north = piece(2.0, [1.0], [0.5, 0.25], [1.0], [0.0, 0.3])
+    return uploaded(east + north, count=2)
+
+
+def test_pieces_of_the_memory(corner):
+    pieces = flown(corner)
+    assert [span for span, _ in pieces] == [1.0, 2.0]
+    assert pose(pieces, 0.5) == pytest.approx([0.5, 0.5, 1.0, 0.0])
+    assert pose(pieces, 2.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
+    assert pose(flown(corner, scale=2.0), 4.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])  # slower
+    assert pose(flown(corner, reverse=True), 1.0) == pytest.approx([1.0, 0.75, 1.0, 0.3])
+    assert pose(flown(corner, reverse=True), 2.75) == pytest.approx([Polynomial(RISE)(0.25), 0.5, 1.0, 0.0])
+
+
+def test_relative_trajectories(corner):
+    """Shifted to where it is; with a relative yaw turned as well, as the firmware does it."""
+    start = np.array([2.0, 2.0, 0.4, 0.5 * math.pi])
+    assert pose(flown(corner, start), 0.0) == pytest.approx([2.0, 2.0, 0.4, 0.0])
+    assert pose(flown(corner, start), 1.0) == pytest.approx([3.0, 2.0, 0.4, 0.0])
+    turned = flown(uploaded(piece(1.0, RISE), count=1), start, turned=True)
+    assert pose(turned, 1.0) == pytest.approx([2.0, 3.0, 0.4, 0.5 * math.pi])
+
+
+def test_compressed_pieces():
+    """Constant, linear, cubic and seventh order elements, each against its Bézier curve."""
+    start = struct.pack("<4h", 500, -200, 1000, 900)  # mm, tenths of a degree
+    first = struct.pack("<BH", 0 | 1 << 2 | 2 << 4 | 0 << 6, 1500) + struct.pack("<h3h", 300, 1000, 1400, 1200)
+    high = [600, 700, 800, 900, 1000, 1100, 1250]
+    second = struct.pack("<BH", 3 | 0 << 2 | 0 << 4 | 1 << 6, 1000) + struct.pack("<7hh", *high, 0)
+    pieces = flown(uploaded(start + first + second + b"\0\0\0", COMPRESSED))
+    assert [span for span, _ in pieces] == [1.5, 1.0]
+
+    def bezier(points, s):
+        n = len(points) - 1
+        return sum(math.comb(n, i) * s**i * (1 - s) ** (n - i) * p for i, p in enumerate(points))
+
+    for s in (0.0, 0.3, 1.0):
+        wanted = [0.5, -0.2 + 0.5 * s, 1e-3 * bezier([1000, 1000, 1400, 1200], s), 0.5 * math.pi]
+        assert pose(pieces, 1.5 * s) == pytest.approx(wanted)
+        if s > 0.0:  # at its beginning the last piece counts
+            wanted = [1e-3 * bezier([500, *high], s), 0.3, 1.2, 0.5 * math.pi * (1.0 - s)]
+            assert pose(pieces, 1.5 + s) == pytest.approx(wanted)
+    other = uploaded(start + first + b"\0\0\0", COMPRESSED)
+    assert other.pieces(3, None, turned=False, reverse=True, scale=1.0) == (Status.NO_COMMAND, [])
+
+
+def test_what_is_not_there(corner):
+    assert corner.pieces(4, None, turned=False, reverse=False, scale=1.0) == (Status.OK, [])  # as the firmware
+    assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == Status.NO_COMMAND
+    with pytest.raises(ValueError, match="no numbers"):
+        uploaded(piece(math.nan), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
+    with pytest.raises(ValueError, match="no numbers"):
+        uploaded(b"", count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
+
+
+def test_a_trajectory_is_flown():
+    """Uploaded, defined and started by packets; afterwards it hovers at the end, and lands there."""
+    wire = Wire().hovering()
+    memory = Memories.kinds.index(Memory.TRAJECTORY)
+    data = piece(2.0, [c / 2.0**k for k, c in enumerate(RISE)], [], [1.0])
+    for at in range(0, len(data), 24):
+        where = struct.pack("<BI", memory, at)
+        assert wire.put(Port.MEMORY, 2, where, data[at : at + 24])[0][2] == where + b"\0"
+    ((_, _, answer),) = wire.put(Port.HIGH_LEVEL, 0, int(HighLevel.DEFINE), 1, struct.pack("<BBIB", 1, 0, 0, 1))
+    assert answer[3] == Status.OK
+    assert wire.plan(HighLevel.START_2, struct.pack("<???Bf", False, False, False, 1, 1.0)) == Status.OK
+    wire.wait(1.0)
+    assert wire.flock.planner.goal(wire.t)[0, 0] == pytest.approx(0.5)
+    assert not wire.flock.planner.finished(wire.t)[0]
+    wire.wait(4.0)
+    assert wire.position == pytest.approx([1.0, 0.0, 1.0], abs=0.01)
+    assert wire.flock.planner.finished(wire.t)[0]
+    assert wire.plan(HighLevel.START, struct.pack("<??Bf", True, True, 1, 1.0)) == Status.OK  # back, protocol 9
+    wire.wait(5.0)
+    assert wire.position == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+
+
+# ---------------------------------------------------------------------- spirals
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize("sideways", [False, True])
+def test_a_spiral_goes_round_its_centre(clockwise, sideways):
+    """A quarter of a circle that widens and climbs: distance to its centre, speed, and where the nose points."""
+    planner, yaw, angle, span = Planner(1), 0.3, 0.5 * math.pi, 4.0
+    start = np.array([0.2, -0.1, 1.0, yaw])
+    planner.spiral(
+        0, 0.0, start, angle=angle, radii=(0.5, 0.7), climb=0.4, span=span, sideways=sideways, clockwise=clockwise
+    )
+    sense = -1.0 if clockwise else 1.0
+    to_centre = yaw + (0.0 if clockwise else math.pi) if sideways else yaw + sense * 0.5 * math.pi
+    centre = start[:2] + 0.5 * np.array([math.cos(to_centre), math.sin(to_centre)])
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        x, y, z, heading = planner.goal(span * share)[0]
+        out = np.array([x, y]) - centre
+        assert math.hypot(*out) == pytest.approx(0.5 + 0.2 * share, abs=0.01)  # one polynomial is no spiral: 1 cm
+        assert z == pytest.approx(1.0 + 0.4 * share, abs=1e-9)
+        assert heading == pytest.approx(yaw + sense * angle * share, abs=1e-9)
+    _, speed, _ = planner.state(0, 0.0)
+    along = (
+        (math.sin(to_centre), -math.cos(to_centre)) if not clockwise else (-math.sin(to_centre), math.cos(to_centre))
+    )
+    assert float(np.dot(speed[:2], along)) == pytest.approx(0.5 * angle / span)
+
+
+def test_a_spiral_is_flown():
+    wire = Wire().hovering()
+    assert wire.plan(HighLevel.SPIRAL, struct.pack("<??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0)) == Status.OK
+    wire.wait(6.0)
+    assert wire.position == pytest.approx([0.5, 0.5, 1.2], abs=0.02)
+    assert wire.flock.quadrotor.yaw[0] == pytest.approx(math.pi / 2, abs=0.02)
