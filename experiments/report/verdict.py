@@ -64,13 +64,10 @@ def left_out(cases: Sequence[CaseMetrics]) -> str:
     died = list(dict.fromkeys(name for case in cases for name in case.died))
     words = []
     if leading:
-        words.append(
-            f"{_list(leading)} {'leads' if len(leading) == 1 else 'lead'} and {_is(leading)} left out of the means."
-        )
+        words.append(f"{_list(leading)} {_verb(leading, 'leads and is', 'lead and are')} left out of the means.")
     if died:
-        words.append(
-            f"{_list(died)} {_is(died)} left out too where the position is unknown for 5 % of the run or more."
-        )
+        are = _verb(died, "is", "are")
+        words.append(f"{_list(died)} {are} left out too where the position is unknown for 5 % of the run or more.")
     return " ".join(words) or "The means are over all robots."
 
 
@@ -131,7 +128,7 @@ def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
     for name, runs in by_case(cases).items():
         died = list(dict.fromkeys(robot for run in runs for robot in run.died))
         if died:
-            them = "it" if len(died) == 1 else "them"
+            them = _verb(died, "it", "them")
             found.append(Finding("bad", f"In {name}, {_list(died)} dropped out; the means leave {them} out."))
     return found
 
@@ -171,19 +168,14 @@ def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:
             if when.n < len(runs):
                 short = cut if any(run.interrupted for run in runs) else missing
                 short.append(name if len(runs) == 1 else f"{name} ({len(runs) - when.n} of {len(runs)} seeds)")
-        which = (
-            f"The formation was acquired by all to {tolerance}"
-            if k == 0
-            else f"After the leg at {start:g} s it was acquired by all again"
-        )
+        formation = "The formation" if k == 0 else f"After the leg at {start:g} s it"
         if reached:
-            found.append(Finding("good" if not missing else "fair", f"{which} after {_list(reached)}."))
+            text = f"{formation} was acquired by all {'again' if k else f'to {tolerance}'} after {_list(reached)}."
+            found.append(Finding("fair" if missing else "good", text))
         if missing:
-            once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
-            found.append(Finding("bad", f"{once} never stayed within {tolerance} in {_list(missing)}."))
+            found.append(Finding("bad", f"{formation} never stayed within {tolerance} in {_list(missing)}."))
         if cut:
-            once = "The formation" if k == 0 else f"After the leg at {start:g} s it"
-            text = f"{once} was not within {tolerance} when {_list(cut)} {_was(cut)} interrupted."
+            text = f"{formation} was not within {tolerance} when {_list(cut)} {_verb(cut, 'was', 'were')} interrupted."
             found.append(Finding("plain", text))
     return found
 
@@ -218,10 +210,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
             text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot."
             found.append(Finding("good" if fewer > 0.0 else "plain", text))
-        errors = [
-            (label, spread(ratios(runs, first, index)))
-            for index, label in (("iae", "IAE"), ("itae", "ITAE"), ("rmse", "RMSE"))
-        ]
+        errors = [(index.upper(), spread(ratios(runs, first, index))) for index in ("iae", "itae", "rmse")]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
             text = f"{name} and {reference} are of different length: their errors are not compared."
@@ -280,10 +269,10 @@ def _avoided(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    slow = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
-    if not slow or min(slow)[0] >= KEPT_UP:
+    factors = [(case.world_factor, case.case) for case in cases if case.world_factor is not None]
+    factor, case = min(factors, default=(1.0, ""))
+    if factor >= KEPT_UP:
         return []
-    factor, case = min(slow)
     text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
     return [Finding("fair" if factor >= 0.9 else "bad", text)]
 
@@ -312,21 +301,14 @@ def _unfinished(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    found = []
     far = max(cases, key=lambda case: case.excursion)
-    if far.excursion > 0.0:
-        text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
-        found.append(Finding("fair" if far.excursion < 0.02 else "bad", text))
-    return found
+    text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
+    return [Finding("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
 
 
 def _list(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _was(names: Sequence[str]) -> str:
-    return "was" if len(names) == 1 else "were"
-
-
-def _is(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
+def _verb(names: Sequence[str], one: str, several: str) -> str:
+    return one if len(names) == 1 else several

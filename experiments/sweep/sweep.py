@@ -128,7 +128,7 @@ class SweepRunner:
         total = sum(len(cell_seeds) for _, cell_seeds in lacking)
         if not total:
             return True
-        piece = max(1, math.ceil(total / (SHARE * self.crew.count)))
+        piece = max(1, math.ceil(total / (SHARE * self.crew.count())))
         works = [
             Work(
                 cell.digest,

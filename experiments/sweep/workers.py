@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final
@@ -44,15 +44,10 @@ class Workers:
     """Runs work on an executor; without one, in this process."""
 
     executor: Executor | None
-    threads: Callable[[], int]
+    count: Callable[[], int]  # works that run at once, now
     place: str
-    failures: tuple[type[Exception], ...] = ()  # of the executor, ...
-    reason: Callable[[Exception], str] = str  # ... and what one of them means
-
-    @property
-    def count(self) -> int:
-        """Works that run at once, now."""
-        return self.threads()
+    failures: tuple[type[Exception], ...] = ()  # of the executor
+    reason: Callable[[Exception], str] = str  # of a failure, in words
 
     def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, WorkResult]]:
         """Runs all works, and yields each when it is done, in any order.
@@ -92,33 +87,28 @@ def workers(scheduler: str | None, processes: int | None) -> AbstractContextMana
     Raises:
         SweepError: At the beginning of the block, if a scheduler is not there, or has no worker.
     """
-    return local(processes) if scheduler is None else cluster(scheduler)
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return _local(processes) if scheduler is None else _cluster(scheduler)
 
 
 @contextmanager
-def local(processes: int | None = None) -> Iterator[Workers]:
+def _local(processes: int | None) -> Iterator[Workers]:
     """Processes on this machine, one for each core if no number is given; with 1 the work is done in this one."""
-    count = cores() if processes is None else processes
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores if processes is None else processes
     if count == 1:
         yield Workers(None, lambda: 1, "this machine")
         return
     others = frozenset(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # for the processes
     pool = ProcessPoolExecutor(count, context, initializer=_prepare)
     try:
         yield Workers(pool, lambda: count, "this machine", (BrokenProcessPool,), lambda _: KILLED)
     finally:
-        for name, value in before.items():
+        for name in ONE_THREAD:
             os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.update(before)
         for child in multiprocessing.active_children():
             if child not in others:
                 child.terminate()
@@ -127,7 +117,7 @@ def local(processes: int | None = None) -> Iterator[Workers]:
 
 
 @contextmanager
-def cluster(address: str) -> Iterator[Workers]:
+def _cluster(address: str) -> Iterator[Workers]:
     """The workers of a dask scheduler, wherever they are; work of one that dies is given to another one.
 
     Raises:
@@ -142,10 +132,11 @@ def cluster(address: str) -> Iterator[Workers]:
         ) from None
     if not ADDRESS.fullmatch(address):
         raise SweepError(f"--scheduler {address}: this is no address; write one as tcp://192.0.2.7:8786")
-    client: Any = None
-    try:
+    with ExitStack() as stack:
+        client: Any = None
         try:
             client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
+            stack.callback(client.close, timeout=ANSWER_S)
             client.wait_for_workers(1, timeout=ANSWER_S)
         except OSError as error:  # time-outs are
             why = "has no workers" if client is not None else f"does not answer ({_first_line(error)})"
@@ -162,22 +153,19 @@ def cluster(address: str) -> Iterator[Workers]:
 
         failures = (distributed.KilledWorker, CancelledError, OSError)
         yield Workers(client.get_executor(pure=False, retries=1), threads, "a worker", failures, reason)
-    finally:
-        if client is not None:
-            client.close(timeout=ANSWER_S)
 
 
 def _prepare() -> None:
     """In each process: Ctrl-C is the sweep's, and the process ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
-    if parent is not None:
+    assert parent is not None
+
+    def end_with_parent() -> None:
         parent.join()
         os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def _first_line(error: BaseException) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, AsJson, Connect, Lab, routers
+from tools.commands.options import As, AsJson, Connect, Lab
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
@@ -38,7 +38,7 @@ def keys(
     if context.invoked_subcommand is None:
         from tools.commands.network import print_members
 
-        print_members(routers(connect, lab), as_json=as_json, identity=identity)
+        print_members(connect, lab, as_json=as_json, identity=identity)
 
 
 @app.command()

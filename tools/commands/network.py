@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, Connect, KeyExpression, Lab, Seconds, routers
+from tools.commands.options import As, Connect, KeyExpression, Lab, Seconds, session
 
 if TYPE_CHECKING:
     import zenoh
 
 app: Final = typer.Typer()
 
-WAIT_S: Final = 1.0  # for a router that is on this machine or not at all
 POLL_S: Final = 0.02
 WINDOW_S: Final = 1.0
 DEPTH: Final = 8192  # samples between two polls
@@ -118,7 +117,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # not of this project
 
 
-def print_members(connect: Sequence[str], *, as_json: bool, identity: str) -> None:
+def print_members(connect: list[str] | None, lab: str | None, *, as_json: bool, identity: str) -> None:
     """Print the members of the network and the keys that they hold.
 
     Raises:
@@ -126,11 +125,8 @@ def print_members(connect: Sequence[str], *, as_json: bool, identity: str) -> No
     """
     import msgspec
 
-    from agents.network.endpoints import DEFAULT_ENDPOINT
-    from agents.network.session import open_session
-
-    with open_session(connect or [DEFAULT_ENDPOINT], name="zenpark keys", wait_s=WAIT_S, identity=identity) as session:
-        found = members(session)
+    with session("keys", connect, lab, identity) as opened:
+        found = members(opened)
     if as_json:
         print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
         return
@@ -182,17 +178,15 @@ def echo(
     """Print the samples of a key, the last poses first."""
     import zenoh
 
-    from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.pubsub import pose_subscriber
-    from agents.network.session import open_session, received
+    from agents.network.session import received
 
-    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     left = math.inf if count is None else count
     with (
-        open_session(endpoints, name="zenpark echo", wait_s=WAIT_S, identity=identity) as session,
-        pose_subscriber(session, expression, DEPTH) as samples,
+        session("echo", connect, lab, identity) as opened,
+        pose_subscriber(opened, expression, DEPTH) as samples,
     ):
         while left > 0 and time.monotonic() < deadline:
             for sample in received(samples.handler):
@@ -274,16 +268,14 @@ def hz(
     identity: As = "observer",
 ) -> None:
     """Print the rate, bytes and intervals of each key, second by second."""
-    from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.pubsub import subscriber
-    from agents.network.session import open_session, received
+    from agents.network.session import received
 
-    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
     expression = key_expression(key)
     cadence = Cadence()
     with (
-        open_session(endpoints, name="zenpark hz", wait_s=WAIT_S, identity=identity) as session,
-        subscriber(session, expression, DEPTH) as samples,
+        session("hz", connect, lab, identity) as opened,
+        subscriber(opened, expression, DEPTH) as samples,
     ):
         print(HEADING, flush=True)
         began = printed = time.monotonic()

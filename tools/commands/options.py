@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    import zenoh
 
 File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
 Connect = Annotated[
@@ -51,6 +56,28 @@ def routers(connect: list[str] | None, lab: str | None) -> list[str]:
     from experiments.definition.endpoints import listed
 
     return secured(listed(connect or []), lab)
+
+
+@contextmanager
+def session(
+    name: str,
+    connect: list[str] | None,
+    lab: str | None,
+    identity: str,
+    wait_s: float = 1.0,  # a router of this machine answers at once
+) -> Iterator[zenoh.Session]:
+    """A session of a command, at the routers of the command line or at that of this machine.
+
+    Raises:
+        EndpointError, LabError: As `routers`.
+        Unreachable: If no router answers within `wait_s` [s].
+    """
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.session import open_session
+
+    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
+    with open_session(endpoints, name=f"zenpark {name}", wait_s=wait_s, identity=identity) as opened:
+        yield opened
 
 
 def check_bodies(bodies: str | None) -> None:

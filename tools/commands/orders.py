@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Final, get_args
 
 import typer
 
-from tools.commands.options import As, Connect, Lab, Realm, routers
+from tools.commands.options import As, Connect, Lab, Realm, session
 
 if TYPE_CHECKING:
-    import zenoh
-
     from agents.network import messages
 
 app: Final = typer.Typer()
@@ -23,6 +20,7 @@ robot_app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=F
 Place = tuple[float, float]
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots of the run.")]
 
+WAIT_S: Final = 2.0  # for a router
 WORLD_ORDERS: Final = ("pause", "resume", "step", "reset", "spawn", "remove")
 CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
     "pause": "Let robots hold where they are; the others go on.",
@@ -35,21 +33,6 @@ CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
 
 class WorldOrderError(ValueError):
     """An order that makes no sense as it was written, with how to write it."""
-
-
-@contextmanager
-def _session(name: str, connect: list[str] | None, lab: str | None, identity: str) -> Iterator[zenoh.Session]:
-    """A session that gives orders.
-
-    Raises:
-        EndpointError, Unreachable: If no router can be reached.
-    """
-    from agents.network.endpoints import DEFAULT_ENDPOINT
-    from agents.network.session import open_session
-
-    endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
-    with open_session(endpoints, name=name, wait_s=2.0, identity=identity) as session:
-        yield session
 
 
 @app.command()
@@ -72,10 +55,10 @@ def order(
         print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
         return 2
     keys = Keys(realm)
-    with _session("order", connect, lab, identity) as session:
+    with session("order", connect, lab, identity, WAIT_S) as opened:
         alive = [
             robot
-            for reply in session.liveliness().get(keys.alive("*"), timeout=2.0)
+            for reply in opened.liveliness().get(keys.alive("*"), timeout=2.0)
             if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
         ]
         if not alive:
@@ -83,7 +66,7 @@ def order(
             return 2
         receivers = robots or sorted(alive)
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
-        replies = orders.send_order(session, keys, receivers, messages.Order(what, at=at))  # type: ignore[arg-type]
+        replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))  # type: ignore[arg-type]
     for robot, reply in replies.items():
         print(f"{robot}: {'yes' if reply.ok else 'no'}, {reply.phase}" + (f": {reply.reason}" if reply.reason else ""))
     return int(not all(reply.ok for reply in replies.values()))
@@ -126,8 +109,8 @@ def world_order(
         if what == "spawn" and not given.keys() & {"at", "wall"}:
             raise WorldOrderError(f"{name or 'the obstacle'} has no place; say where, with --at X Y")
     order = messages.WorldOrder(what, steps=steps, name=name, kind=kind, at=at, yaw=yaw, obstacle=given)  # type: ignore[arg-type]
-    with _session("world-order", connect, lab, identity) as session:
-        reply = orders.send_world_order(session, Keys(realm), order)
+    with session("world-order", connect, lab, identity, WAIT_S) as opened:
+        reply = orders.send_world_order(opened, Keys(realm), order)
     if not reply.ok:
         print(f"no: {reply.reason}", file=sys.stderr)
         return 1
@@ -166,8 +149,8 @@ def _change(order: messages.RunOrder, connect: list[str] | None, realm: str, lab
     from experiments.real_time.conductor import orders
     from tools.commands.network import printable
 
-    with _session("zenpark robot", connect, lab, order.who) as session:
-        reply = orders.send_run_order(session, Keys(realm), order)
+    with session("robot", connect, lab, order.who, WAIT_S) as opened:
+        reply = orders.send_run_order(opened, Keys(realm), order)
     if reply.reason:
         print(f"zenpark: {printable(reply.reason)}", file=sys.stderr)
         return 2
