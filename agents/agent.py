@@ -306,6 +306,7 @@ class Agent:
             None if guidance is None else running & guidance.unguided(t),
             None if guidance is None else guidance.stamp,
             self.goal[:, 2],
+            self._setpoint,
             self._not_finite,
             self._landing,
         )

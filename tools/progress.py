@@ -47,7 +47,7 @@ class Lines:
             errors = ", ".join(
                 f"{name} {'-' if view.gone else _metres(view.error)}" for name, view in progress.robots.items()
             )
-            what = _silence(progress) or f"error [m] {errors}"
+            what = _silence(progress) or f"error [m] {errors}"  # – of robots that have no link, or no goal of their own
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
 
 

@@ -160,6 +160,8 @@ class BodyState:
     shadow_yaw: Array | None = None  # (n,) of that twin [rad]
     # (n,) [s] stamp of the last external position less the time of its arrival; None without external positions
     ahead: Array | None = None
+    # (n,) when the device was heard last, on the clock of `read` [s]; NaN, or None, for bodies without a device
+    heard: Array | None = None
 
 
 class Body(Protocol):

@@ -17,6 +17,7 @@ from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause, Observation
 from agents.safety.landing import Landing
+from agents.safety.obedience import Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M, PoseValidity
 
 
@@ -113,6 +114,7 @@ class RowStatus(msgspec.Struct, frozen=True):
     unguided: Mask | None  # running without guidance; None: no row is guided
     goal_stamp: Array | None  # decision time of the goals of guided rows [s], −inf for others; None: no row is guided
     goal_height: Array  # [m]
+    setpoint: Array  # (N, 4) of the tick before, NaN for rows that their bodies drive by themselves
     not_finite: Mask  # the last setpoint was not finite
     landing_places: Landing  # of rows that land
 
@@ -133,6 +135,7 @@ class Detector:
         links, avoidance_only = assignment.links, assignment.avoidance_only
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
+        self._obedience = Obedience(assignment.kinds)
 
     def detect(  # noqa: PLR0917 - what there is to look at
         self,
@@ -154,6 +157,7 @@ class Detector:
                 Observation(Cause.SETPOINT, rows.not_finite & rows.cruising, lambda _: "not made of finite numbers")
             )
         self._measured(state, rows, seen)
+        self._disobedient(t, state, where, rows, seen)
         if self._limits.separation is not None:
             self._near(t, state, neighbours, seen)
         if neighbours.incomplete:
@@ -249,6 +253,24 @@ class Detector:
             seen.append(Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s"))
             if some(rows.landing_places.aside):
                 seen.append(Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below))
+
+    def _disobedient(
+        self, t: float, state: BodyState, where: PoseValidity, rows: RowStatus, seen: list[Observation]
+    ) -> None:
+        """Rows whose devices do not answer, that do not move as they are told, or move otherwise."""
+        if state.heard is not None and some(gone := t - state.heard > self._limits.own_silence_s):
+            heard = state.heard
+            seen.append(Observation(Cause.UNREACHABLE, gone, lambda row: f"for {t - heard[row]:.1f} s"))
+        obedience = self._obedience
+        obedience.update(t, rows.setpoint, state.position, state.yaw, rows.cruising & ~where.invalid)
+        if some(obedience.still):
+            seen.append(
+                Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
+            )
+        if some(obedience.strays):
+            seen.append(
+                Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
+            )
 
     def _near(self, t: float, state: BodyState, neighbours: NeighbourStates, seen: list[Observation]) -> None:
         """Separation from other robots at their extrapolated places."""

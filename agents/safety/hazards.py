@@ -61,6 +61,9 @@ class Cause(IntEnum):
     CLOCK = 21
     BEHIND = 22
     STANDSTILL = 23
+    STILL = 24
+    STRAYING = 25
+    UNREACHABLE = 26
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,9 @@ RULES: Final[Mapping[Cause, Rule]] = {
     Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
     Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
     Cause.STANDSTILL: Rule("its process stood still", Outcome.HOLD),
+    Cause.STILL: Rule("it is told to move and does not", Outcome.WARN),
+    Cause.STRAYING: Rule("it moves and is not told to", Outcome.LAND),
+    Cause.UNREACHABLE: Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True),
     Cause.CLOCK: Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5),  # not one late sample
 }
 
@@ -132,6 +138,16 @@ def rules(limits: Limits) -> dict[Cause, Rule]:
         Cause.LANDING: {"after_s": limits.landing_s},
     }
     return {cause: replace(rule, **chosen.get(cause, {})) for cause, rule in RULES.items()}  # type: ignore[arg-type]
+
+
+def failed(text: str) -> bool:
+    """Whether an incident's text tells that a robot does not do its part of an experiment any more.
+
+    It has landed, was cut, does not move although it is told to, or its device does not answer.
+    """
+    outcome, _, words = text.partition(": ")
+    severe = tuple(RULES[cause].words for cause in (Cause.STILL, Cause.UNREACHABLE))
+    return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe))
 
 
 class Observation(NamedTuple):

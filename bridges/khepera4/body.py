@@ -75,6 +75,7 @@ class KheperaBody:
             np.zeros(rows, dtype=bool),
             tuple(self._note(link, now) for link in self._links),
             Rays.gather([self._scan(link, now, t) for link in self._links]),
+            heard=odometry_time,
         )
         if len(self._external_rows):
             state.time = odometry_time.copy()

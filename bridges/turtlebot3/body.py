@@ -141,6 +141,7 @@ class TurtleBot3:
             flying=np.zeros(rows, dtype=bool),
             notes=tuple(robot.note(now, linked[robot.endpoints]) for robot in robots),
             rays=Rays.gather([robot.scan for robot in robots]),
+            heard=t - now + np.array([robot.odometry_received for robot in robots]),
         )
         if len(self._external_rows):
             odometry = state.time.copy()

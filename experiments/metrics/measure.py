@@ -17,6 +17,7 @@ import numpy as np
 
 from agents.arrays import norm
 from agents.formation.graph import Links
+from agents.safety.hazards import failed
 from experiments.definition import link_conditions
 from experiments.metrics import centralised
 from experiments.metrics.clearance import Clearance, collisions
@@ -58,6 +59,19 @@ def _mean(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
         complete = len(known) == len(robots) or index != "acquired_s"
         mean[index] = statistics.fmean(known) if known and complete else None
     return mean
+
+
+def _failures(trace: Trace, died: Sequence[str]) -> tuple[str, ...]:
+    """The first thing that kept each robot from its part of the experiment; `died` have no position for long."""
+    found: dict[str, str] = {}
+    for event in trace.events:
+        lost = event.kind == "lost" or (event.kind == "hazard" and failed(event.text))
+        if lost and event.source in trace.robots and event.source not in found:
+            what = f"was lost: {event.text}" if event.kind == "lost" else event.text.removeprefix("warn: ")
+            found[event.source] = f"{event.source} at {max(event.stamp, 0.0):.1f} s: {what}"
+    for name in died:
+        found.setdefault(name, f"{name}: its position was not known for {1.0 - KNOWN:.0%} of the time or more")
+    return tuple(found.values())
 
 
 def measure(trace: Trace) -> CaseMetrics:
@@ -136,6 +150,7 @@ def measure(trace: Trace) -> CaseMetrics:
         world_factor=_slowest(trace),
         away_s=network_away(errors.alive, trace.time)[0],
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
+        failures=_failures(trace, died),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=centralised.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),

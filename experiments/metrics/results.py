@@ -202,6 +202,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     away_s: float = 0.0
     # found by conductor and recorder: robots that began late, messages that could not be read
     troubles: tuple[str, ...] = ()
+    # robots that did not do their part: out of reach, lost, did not move, fell, landed or were cut; one sentence each
+    failures: tuple[str, ...] = ()
     network_messages: int = 0  # poses of all robots, leaders too, and goals of the central controller
     network_bytes: int = 0  # payload of these messages
     deliveries: int = 0  # the same messages, counted once for each receiver

@@ -34,7 +34,7 @@ from experiments.report.tables import (
     summary_table,
     whole_table,
 )
-from experiments.report.verdict import findings, interruptions, left_out
+from experiments.report.verdict import failures, findings, interruptions, left_out
 
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
@@ -150,14 +150,14 @@ def write(
         Section("The experiment", listing=listing, folded="Show the file"),
         Section("Definitions", terms=DEFINITIONS),
     ]
-    cut, verdict = interruptions(cases), findings(cases)
+    first_of_all, verdict = [*failures(cases), *interruptions(cases)], findings(cases)
     return render(
         folder / name,
         title=experiment.title,
         source=experiment.source,
         facts=facts,
         command=made.command,
-        verdict=[*cut, *(Finding("fair", note) for note in notes), *verdict[len(cut) :]],
+        verdict=[*first_of_all, *(Finding("fair", note) for note in notes), *verdict[len(first_of_all) :]],
         sections=sections,
         foot=() if made.made_by is None else made.made_by.words,
     )

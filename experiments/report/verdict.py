@@ -17,6 +17,7 @@ NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference."""
     return [
+        *failures(cases),
         *interruptions(cases),
         *_troubles(cases),
         *_nothing_lost(cases),
@@ -39,6 +40,17 @@ def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
     if not any(case.belief for case in cases):
         return []
     return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
+
+
+def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Robots that did not do their part; nothing else in a report means much before that is known."""
+    found = []
+    for case in cases:
+        more = len(case.failures) - NAMED
+        shown = [*case.failures[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
+        if shown:
+            found.append(Finding("bad", f"Failed in {case.case}: {'; '.join(shown)}."))
+    return found
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:

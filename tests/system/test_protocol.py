@@ -13,6 +13,8 @@ from mcap_ros2.decoder import DecoderFactory
 from experiments.real_time.hosts.launcher import LAND_S
 from experiments.recording import playback
 from tests.system.lab import NEAR, ROOT, Flight, gone, transmits_at_50_hz, until
+from tests.twins.loopback import Served, request
+from twins.devices import khepera4
 
 pytestmark = pytest.mark.system
 
@@ -92,3 +94,28 @@ def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) ->
     assert plain["CF01"].pop("body") == "crazyflie-twin"
     assert addressed == plain, "only the address differs"
     assert heard_of(twins) == heard_of(protocol)
+
+
+def test_a_robot_that_does_not_move_is_said_on_the_console_and_fails_the_run(tmp_path: Path) -> None:
+    """A Khepera whose server ignores `d`, and answers as one that obeys it."""
+    twin = Served(khepera4.open_device, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
+    file = tmp_path / "pair.toml"
+    with twin:
+        body = f"{twin.addresses[0]}?server=fork"
+        file.write_text(
+            f"""
+title = "A pair of which one does not move"
+duration_s = 6.0
+robots.KH01 = {{ kind = "khepera4", start = [0.8, 0.0, 0.0], body = "{body}" }}
+robots.KH02 = {{ kind = "khepera4", start = [-0.8, 0.0, 0.0] }}
+formation.links = {{ "KH01 - KH02" = 0.4 }}
+trigger = {{ kind = "periodic", period_s = 0.05 }}
+"""
+        )
+        flight = Flight(tmp_path / "run", str(file), "--no-report")
+        code, out = flight.finish(60.0)
+        assert abs(twin.truth()[0][0, 0]) < 0.001
+    assert code == 1, out + flight.said()
+    assert "hazard KH01: warn: it is told to move and does not: told 0." in flight.said()
+    assert "zenpark: Failed in default: KH01 at " in flight.said()
+    assert "error [m] KH01 0." in flight.said()

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 app: Final = typer.Typer()
 
-STOPPED: Final = 1  # exit code of a run that an emergency stop has ended
+STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
+FAILED: Final = 1  # and of one in which a robot did not do its part
 
 
 @app.command()
@@ -131,6 +132,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         _write(runs, folder, show)
         if stopped:
             print(f"zenpark: {stopped}", file=sys.stderr)
+        code = code or _report_failures(runs)
         return code if former is None else max(code, _print_differences(folder, former))
     finally:
         remove_unused(folder)
@@ -204,6 +206,15 @@ def _print_differences(folder: Path, former: Path) -> int:
     if not found:
         print("the same as in the bundle, to the last bit: figures and recordings")
     return int(bool(found))
+
+
+def _report_failures(runs: Sequence[Run]) -> int:
+    """Print which robots did not do their part; returns the exit code."""
+    from experiments.report import verdict
+
+    found = verdict.failures([case for each in runs for case in each.metrics.values()])
+    _warn([finding.text for finding in found])
+    return FAILED if found else 0
 
 
 def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> list[Run]:

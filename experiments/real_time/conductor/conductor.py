@@ -61,9 +61,10 @@ class Conductor:
         self._keys = Keys(experiment.network.realm)
         # of each case, for all its processes here, however late they start
         self._clock = context.launcher.clock = Clock()
-        guided = Plan(experiment).guided
+        plan = Plan(experiment)
+        linked = {plan.names[row] for row in plan.links.receiver.tolist()} - {*plan.guided}
         self._robots = {
-            name: RobotView(error=None if name in guided else 0.0, left_because="standby" if robot.standby else "")
+            name: RobotView(linked=name in linked, left_because="standby" if robot.standby else "")
             for name, robot in experiment.robots.items()
         }
         self._progress = Progress(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -36,7 +37,8 @@ class RobotView:
     """State of a robot as the conductor knows it."""
 
     status: messages.Status | None = None  # last received
-    error: float | None = 0.0  # [m] formation error by its own knowledge; None of a guided robot, which has none
+    error: float | None = None  # [m] formation error by its own knowledge; None until it reports one
+    linked: bool = True  # it has an error: it is not guided, and has links
     rate: float = 0.0  # [1/s] transmitted poses over the last second
     alive: bool = False  # its liveliness token stands
     # why the run goes on without it: process ended or token vanished, taken out, or not asked for yet
@@ -45,6 +47,7 @@ class RobotView:
     vanished: float = inf  # [s, monotonic] loss of its token; infinity while it stands, and once that was reported
     behind: float = inf  # [s] least time from a stamp to its arrival: small, if its clock is right
     last_incident: int = 0  # number of the last reported incident
+    note: str = ""  # last reported note of its body, without numbers
     place: messages.Vector | None = None  # [m] last known
     origin: messages.Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
     former: int | None = None  # process whose statuses are outdated: the robot has a new one, or will have
@@ -158,7 +161,7 @@ class NetworkView:
             self._receive_status(status)
         for state in self._states.read():
             view = self.robots[state.robot]
-            view.error = state.error if view.error is not None else None
+            view.error = state.error if view.linked else None
             view.place = state.true_position or state.position or view.place
         for token, there in self._watch.changes():
             if (known := self.robots.get(self._keys.whose(token) or "")) is not None:
@@ -224,6 +227,10 @@ class NetworkView:
             if incident.seq > view.last_incident:
                 view.last_incident = incident.seq
                 self.report("hazard", status.robot, incident.text)
+        note = re.sub(r"[\d.]+", "", status.body)  # of a silence whose seconds count up, one is reported
+        if note != view.note:
+            view.note = note
+            self.report("body", status.robot, status.body or "no trouble any more")
         since, sent = view.counted
         if status.stamp - since >= 0.9:
             view.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0

@@ -74,6 +74,9 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.CLOCK: [(50, "WARN")],
     Cause.BEHIND: [(0, "WARN")],
     Cause.STANDSTILL: [(0, "HOLD")],
+    Cause.STILL: [(0, "WARN")],
+    Cause.STRAYING: [(0, "LAND")],
+    Cause.UNREACHABLE: [(50, "WARN")],
 }
 
 
@@ -162,8 +165,9 @@ def test_who_is_on_the_ground_has_no_hazards_and_who_lands_only_those_of_landing
         Cause.TILT,
         Cause.LANDING,
         Cause.BELOW,
+        Cause.UNREACHABLE,
     }
-    cut = {each.outcome for each in bench.hazards.incidents if each.cause != Cause.BELOW}
+    cut = {each.outcome for each in bench.hazards.incidents if each.cause not in {Cause.BELOW, Cause.UNREACHABLE}}
     assert cut == {Outcome.CUT}
 
 
@@ -240,7 +244,7 @@ UNSAFE = {
         LANDING,
         13,
     ),
-    "low": ({"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.1]}, None, RUNNING, 300),
+    "low": ({"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.1]}, None, RUNNING, 150),
     "dips": ({"position": [0.0, 0.0, 0.4], "velocity": [0.0, 0.0, -0.2]}, None, RUNNING, 300),
     "down": ({"flying": False}, "land: it came down by itself: its motors are off", LANDING, 2),
 }
