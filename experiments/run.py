@@ -198,7 +198,7 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
             remarks.append(f"{case}: the recording was cut off; `zenpark recover {file}` mends it")
     source = folder / SOURCE
     arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
-    text = document.listed([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
+    text = document.join_texts([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
     title = next((trace.experiment.title for trace in traces.values()), "")
     return replace(_measured(title, traces, folder, text, remarks), made=min(made, default=0.0))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from agents.arrays import Array, norm
 from experiments.file.document import load
-from experiments.metrics.signals import beliefs
+from experiments.metrics.signals import belief_errors
 from experiments.recording.trace import Trace
 from experiments.run import folder, show, simulate
 from experiments.sweep.pareto import front
@@ -149,7 +149,7 @@ show(pictures["intervals"], OUT / "events-intervals")
 
 # %%
 net = event.plan.links
-believed = beliefs(event, net)  # (T, E) [m]
+believed = belief_errors(event, net)  # (T, E) [m]
 ground = np.array([not name.startswith("CF") for name in event.robots])[net.sender]
 worst_ground = float(np.nanmax(believed[:, ground]))
 print(f"worst belief of a ground robot {1e3 * worst_ground:.1f} mm, of a drone {1e3 * np.nanmax(believed):.1f} mm")

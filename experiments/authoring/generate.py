@@ -38,7 +38,7 @@ WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s
 
 
 @dataclass(frozen=True)
-class Wanted:
+class LayoutOptions:
     """Options of a generated experiment."""
 
     kind: str = "crazyflie"  # of all robots
@@ -49,7 +49,7 @@ class Wanted:
     law: str = "distance"  # distance, or displacement, which finds the shape from any starts
 
 
-def layout(what: str, size: str, wanted: Wanted, jumps: Sequence[int] = (1, 2)) -> Layout:
+def layout(what: str, size: str, wanted: LayoutOptions, jumps: Sequence[int] = (1, 2)) -> Layout:
     """A formation by name.
 
     Args:
@@ -80,7 +80,7 @@ def layout(what: str, size: str, wanted: Wanted, jumps: Sequence[int] = (1, 2)) 
     return layouts.hemisphere(count, wanted.spacing, 2.0 * kind.radius + PASSING)
 
 
-def experiment_file(made: Layout, wanted: Wanted) -> str:
+def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     """The text of an experiment file, one line for each robot and each link.
 
     Raises:
@@ -148,7 +148,9 @@ def experiment_file(made: Layout, wanted: Wanted) -> str:
     )
 
 
-def generate(what: str, size: str, target: str | None, wanted: Wanted, jumps: str = "1,2") -> tuple[Path, Layout]:
+def generate(
+    what: str, size: str, target: str | None, wanted: LayoutOptions, jumps: str = "1,2"
+) -> tuple[Path, Layout]:
     """Write the experiment file of a formation; return its path and its layout.
 
     Raises:
@@ -178,7 +180,7 @@ def _rates(count: int) -> tuple[str, ...]:
     return "[rates]", f"state_hz = {hz:g}".ljust(31) + "# telemetry", ""
 
 
-def _kind(wanted: Wanted) -> Kind:
+def _kind(wanted: LayoutOptions) -> Kind:
     if wanted.kind not in KINDS:
         raise LayoutError(f"no {wanted.kind!r} among the kinds of robots: {did_you_mean(wanted.kind, KINDS)}")
     return KINDS[wanted.kind]

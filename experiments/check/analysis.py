@@ -23,11 +23,11 @@ from experiments.check.ideal_run import Prediction, closed_shares
 from experiments.check.realisation import (
     Shape,
     algebraic_connectivity,
-    as_taken,
-    expendable,
-    realise,
-    stiffness,
-    unfolded,
+    find_shapes,
+    formation_redundancy,
+    formation_rigidity,
+    targets_of_law,
+    unfold_distances,
 )
 from experiments.check.stability import Modes, modes
 from experiments.definition import bodies
@@ -219,17 +219,19 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.present_at_start()
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
-    asked = as_taken(assignment.law, links)
+    asked = targets_of_law(assignment.law, links)
     if standing.any() or len(anchored):
         for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
             there = standing if pattern.presence is None else pattern.presence.planned_at(at)
-            stage = _shapes(experiment, assignment, as_taken(assignment.law, wanted), there, prediction, aloft, silent)
+            stage = _shapes(
+                experiment, assignment, targets_of_law(assignment.law, wanted), there, prediction, aloft, silent
+            )
             stages.append(stage)
         shape = _best(stages[0])
         here = asked.select(standing)
-        planar, spatial = stiffness(shape.position, here, silent, assignment.anchors)
+        planar, spatial = formation_rigidity(shape.position, here, silent, assignment.anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
-            spare = expendable(shape.position, here, silent)
+            spare = formation_redundancy(shape.position, here, silent)
         share = closed_shares(assignment.kinds, hz)
         within = experiment.duration_s
         loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
@@ -281,7 +283,7 @@ def _shapes(  # noqa: PLR0917 - one caller
 
     def guesses() -> Iterator[Array]:
         yield end
-        plane = unfolded(links, aloft[:, 2])
+        plane = unfold_distances(links, aloft[:, 2])
         anchor = silent[:1] if len(silent) else np.arange(rows)
         for mirror in (1.0, -1.0):
             flipped = plane * [1.0, mirror, 1.0]
@@ -293,7 +295,7 @@ def _shapes(  # noqa: PLR0917 - one caller
             yield _rest(np.column_stack([place, aloft[:, 2]]), end, moves)
 
     found = []
-    for each in realise(links, guesses(), moves, assignment.anchors):
+    for each in find_shapes(links, guesses(), moves, assignment.anchors):
         error = np.zeros(len(there))
         error[there] = each.error
         found.append(replace(each, error=error))

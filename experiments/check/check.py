@@ -197,7 +197,9 @@ def _figures(analysis: Analysis) -> Figures:
     return Figures(
         robots=len(analysis.names),
         arena=experiment.arena.size,
-        obstacles={name: surroundings.described(obstacle) for name, obstacle in experiment.arena.obstacles.items()},
+        obstacles={
+            name: surroundings.describe_obstacle(obstacle) for name, obstacle in experiment.arena.obstacles.items()
+        },
         links=len(assignment.links),
         edges=analysis.edges,
         parts=analysis.parts,

@@ -25,7 +25,7 @@ class Claim:
     path: Path = ()
 
 
-def listed(words: Sequence[str], most: int = 4) -> str:
+def join_names(words: Sequence[str], most: int = 4) -> str:
     """Words joined by commas; the last of many are counted."""
     more = len(words) - most
     return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"

@@ -10,7 +10,7 @@ import numpy as np
 from agents.arrays import Array, Index, Mask
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, listed
+from experiments.check.findings import FORGIVEN, Claim, join_names
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Robot
 from twins import scene as outlines
@@ -21,7 +21,7 @@ TWINS: Final = ("twin", WORLD)  # bodies that are simulated without the wire of 
 AVOID: Final = 'or let robots avoid it: [avoidance] with kind = "barrier"'
 
 
-def described(obstacle: Obstacle) -> str:
+def describe_obstacle(obstacle: Obstacle) -> str:
     """Description of an obstacle in a few words."""
     if obstacle.box is not None:
         what = f"box {obstacle.box[0]:g} × {obstacle.box[1]:g} m"
@@ -67,7 +67,7 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
     which = int(near.argmax(axis=0).argmin())
     first, at = int(rows[which]), int(near[:, which].argmax())
     x, y = prediction.position[at, first, :2]
-    subject = listed([names[row] for row in rows])
+    subject = join_names([names[row] for row in rows])
     when = f"at {prediction.time[at]:.1f} s, around ({x:.2f}, {y:.2f})"
     when = f", {names[first]} first {when}" if len(rows) > 1 else f" {when}"
     if keeps:
@@ -116,7 +116,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
         flies = analysis.assignment.kinds[row].flies
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
         if there:
-            message = f"{name} has no range sensors: it cannot avoid {listed(there)}"
+            message = f"{name} has no range sensors: it cannot avoid {join_names(there)}"
             yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
         elif name in isolated:
             message = f"{name} has neither neighbours nor range sensors: it avoids nothing"
@@ -146,7 +146,7 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
     alone = [name for name, robot in robots.items() if robot.body == "twin" and robot.ranges != "world"]
     if alone and (experiment.arena.obstacles or experiment.avoidance is not None):
-        subject = f"{listed(alone)} {'is' if len(alone) == 1 else 'are'}"
+        subject = f"{join_names(alone)} {'is' if len(alone) == 1 else 'are'}"
         message = f'in real time {subject} in no common place and without range sensors, unless body = "world"'
         yield Claim("note", "alone", message, "", ("robots", alone[0]))
 

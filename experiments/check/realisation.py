@@ -62,7 +62,7 @@ class Residuals:
         return square.transpose(0, 2, 1, 3).reshape(size, size), slope.ravel()
 
 
-def as_taken(law: Law, links: Links) -> Links:
+def targets_of_law(law: Law, links: Links) -> Links:
     """Links with the targets that the law reads: `distance` reads the distance of a relative position as well."""
     wants = TAKES.get(getattr(law, "NEEDS", "any"))
     if wants is None or links.wants is None:
@@ -71,7 +71,7 @@ def as_taken(law: Law, links: Links) -> Links:
 
 
 def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residuals:
-    """The equations at `position` (N, 3) [m]; of links as `as_taken` gives them."""
+    """The equations at `position` (N, 3) [m]; of links as `targets_of_law` gives them."""
     apart = position[links.receiver] - position[links.sender]
     wants = np.full(len(links), BY_DISTANCE) if links.wants is None else links.wants
     parts = [_of_lengths(apart, links, np.flatnonzero(wants == BY_DISTANCE))]
@@ -144,11 +144,11 @@ class Shape:
         return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
 
 
-def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
+def find_shapes(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
     """Places where links and anchors have what they ask for, one for each guess, until one is good.
 
     Args:
-        links: With what they ask for, see `residuals.as_taken`.
+        links: With what they ask for, see `residuals.targets_of_law`.
         guesses: (N, 3) each [m]; heights are held where they are.
         moves: (N,) rows that may be placed elsewhere in the plane.
         anchors: Distances to what stands still.
@@ -166,7 +166,7 @@ def realise(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchor
     return found
 
 
-def unfolded(links: Links, height: Array) -> Array:
+def unfold_distances(links: Links, height: Array) -> Array:
     """A first guess (N, 3) [m] at the shape: the two main axes of the distances through the network.
 
     Torgerson's scaling, with shortest ways through the network for the distances that no link gives; robots in
@@ -314,7 +314,7 @@ def _ring(one: int, other: int, above: dict[int, int]) -> tuple[int, ...]:
     return (*first, *reversed(second[:-1]))
 
 
-def stiffness(
+def formation_rigidity(
     position: Array, links: Links, led: Index, anchors: Anchors | None = None
 ) -> tuple[Rigidity, Rigidity | None]:
     """Infinitesimal rigidity when heights are held, and in full space if all links ask for distances.
@@ -332,7 +332,7 @@ def stiffness(
     return rigidity(position, pairs, moves), rigidity(position, pairs)
 
 
-def expendable(position: Array, links: Links, led: Index) -> Redundancy:
+def formation_redundancy(position: Array, links: Links, led: Index) -> Redundancy:
     """Links and robots without which a formation by distances stays rigid while heights are held.
 
     Bars between leaders, rows `led`, cannot be lost as links are; they go with their robots.

@@ -11,7 +11,7 @@ from agents.arrays import norm
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, listed
+from experiments.check.findings import FORGIVEN, Claim, join_names
 from experiments.definition import bodies
 
 SLOW_M_S: Final = 0.2  # no robot comes down more slowly
@@ -75,7 +75,7 @@ def architecture(analysis: Analysis) -> Iterator[Claim]:
     if not guided:
         return
     all_guided, rate = len(guided) == len(experiment.robots), experiment.rates.coordination_hz
-    subject = f"all {len(guided)} robots" if all_guided else listed(guided)
+    subject = f"all {len(guided)} robots" if all_guided else join_names(guided)
     rest = "" if all_guided else "; the others decide for themselves, and receive their poses as before"
     hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
     what = "centralised" if all_guided else "hybrid"

@@ -11,7 +11,7 @@ import numpy as np
 from agents.arrays import Index, Mask
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, components, reachable
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, Severity, listed
+from experiments.check.findings import FORGIVEN, Claim, Severity, join_names
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
 from experiments.file.problems import Path
 
@@ -39,8 +39,8 @@ def network(analysis: Analysis) -> Iterator[Claim]:
     if len(sources):
         lost = np.flatnonzero(~reachable(links, rows, sources) & receives)
         if len(lost):
-            subject = listed([names[row] for row in lost])
-            message = f"{subject} cannot be reached by the leader ({listed(leaders)}), directly or through others"
+            subject = join_names([names[row] for row in lost])
+            message = f"{subject} cannot be reached by the leader ({join_names(leaders)}), directly or through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
     linked = np.union1d(links.receiver, links.sender)
@@ -56,7 +56,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
     isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
     if isolated:
-        message = f"{listed(isolated)} has no neighbours and is no leader: it takes no part in the formation"
+        message = f"{join_names(isolated)} has no neighbours and is no leader: it takes no part in the formation"
         problems.append(Claim("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
     for name in leaders:
         if names.index(name) not in links.sender:
@@ -65,7 +65,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
     yield from problems
     if not problems:
         whole = "the network is whole; " if analysis.parts == 1 else ""
-        reached = f"every robot is reached by {listed(leaders)}"
+        reached = f"every robot is reached by {join_names(leaders)}"
         led = reached if leaders else "no leader: the formation finds its own place"
         yield Claim("note", "connected", whole + led)
 
@@ -115,7 +115,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
     rings = contradictions(analysis.asked.select(analysis.standing))
     for ring in rings[:1]:
         names = [analysis.names[row] for row in ring.rows]
-        way = f"around {listed([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
+        way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
         message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart; {off}"
         link = int(np.flatnonzero(analysis.standing)[ring.link])
         remedy = "give offsets of one drawing: those around a ring add up to zero"
@@ -134,7 +134,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         yield Claim(severity, "no-triangle", message, remedy, analysis.link_path(longest))
     if not found and not rings:
         worst = [int(k) for k in np.argsort(-shape.error) if shape.error[k] > shape.worst / 2]
-        at_fault = listed(list(dict.fromkeys(_pair(analysis, k) for k in worst)))
+        at_fault = join_names(list(dict.fromkeys(_pair(analysis, k) for k in worst)))
         message = f"{_asked(analysis)} contradict one another around {at_fault}; {off}"
         remedy = f"give {_asked(analysis)[4:]} that one drawing has, or fewer of them"
         if len(analysis.without_neighbours) > 1:
@@ -173,7 +173,7 @@ def _sides(analysis: Analysis, conflict: Conflict) -> str:
 
 def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Claim:
     names = analysis.names
-    subject = listed([names[row] for row in conflict.high])
+    subject = join_names([names[row] for row in conflict.high])
     held = max(float(np.nan_to_num(analysis.assignment.hover[row])) for row in conflict.high)
     message = f"{subject} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
     remedy = f"hover lower than {conflict.ceiling:.3f} m, or lengthen these links"
@@ -250,7 +250,7 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
         return f"it stays rigid only with every {what}"
     if len(needed) > FEW:
         return f"{len(spare) - len(needed)} of its {len(spare)} {what}s can be lost, one at a time"
-    return f"it stays rigid without any one {what} but {listed(needed)}"
+    return f"it stays rigid without any one {what} but {join_names(needed)}"
 
 
 def stability(analysis: Analysis) -> Iterator[Claim]:

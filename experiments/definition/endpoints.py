@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # numpy comes with it, and an emergency stop waits for nothin
     from experiments.definition.experiment import Experiment
 
 
-def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
+def lab_folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
     """Folder of the lab: that of the command line, or the one that the file names, beside the file."""
     if chosen is not None:
         return Path(chosen).absolute()
@@ -21,7 +21,9 @@ def folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Pat
     return None if own is None else file.absolute().parent / own
 
 
-def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None) -> list[str]:
+def router_endpoints(
+    experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None
+) -> list[str]:
     """Routers of an experiment, each with its lab if there is one; empty if neither file nor command names any.
 
     Args:
@@ -33,14 +35,14 @@ def routers(experiment: Experiment, file: Path, connect: Sequence[str], chosen: 
     Raises:
         EndpointError: If a router of a lab asks for no certificates.
     """
-    endpoints = listed(connect) or experiment.network.connect or []
+    endpoints = read_endpoints(connect) or experiment.network.connect or []
     try:
-        return lab.secured(endpoints, folder(experiment, file, chosen))
+        return lab.secured(endpoints, lab_folder(experiment, file, chosen))
     except lab.LabError as error:
         raise EndpointError(str(error)) from None
 
 
-def listed(given: Iterable[str]) -> list[str]:
+def read_endpoints(given: Iterable[str]) -> list[str]:
     """Endpoints, each as it is or, behind an @, line by line from a file.
 
     Raises:

@@ -62,7 +62,7 @@ class Document:
     @property
     def listing(self) -> str:
         """The text, and below it those of the arena files that it names: for people."""
-        return listed([self.text, *dict.fromkeys(each.text for each in self.arenas.values())])
+        return join_texts([self.text, *dict.fromkeys(each.text for each in self.arenas.values())])
 
 
 def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
@@ -169,7 +169,7 @@ class Source:
         return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
-def listed(texts: Sequence[str]) -> str:
+def join_texts(texts: Sequence[str]) -> str:
     """The text of an experiment file, and below it those of its arena files: for people."""
     return "\n\n# ---- the arena file ----\n\n".join(texts)
 

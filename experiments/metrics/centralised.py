@@ -34,7 +34,7 @@ def guided_rows(trace: Trace) -> Mask:
     return np.isin(np.array(trace.robots), trace.plan.guided)
 
 
-def centre_hears(trace: Trace) -> Mask:
+def received_by_centre(trace: Trace) -> Mask:
     """Robots (N,) whose poses the central controller receives: those that it guides, and their neighbours."""
     rows = guided_rows(trace)
     net = trace.plan.links
@@ -64,7 +64,7 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 def deliveries(trace: Trace, sent: Index) -> int:
     """Messages counted once per receiver, when robots `sent` (N,) poses: to each other, to the central controller, and
     its goals."""
-    listeners = np.bincount(trace.plan.pose_links.sender, minlength=len(sent)) + centre_hears(trace)
+    listeners = np.bincount(trace.plan.pose_links.sender, minlength=len(sent)) + received_by_centre(trace)
     return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
 
 

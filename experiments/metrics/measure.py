@@ -26,17 +26,17 @@ from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
     LinkErrors,
     after_last,
-    beliefs,
-    closest,
-    gaps,
+    belief_errors,
+    closest_approach,
     integrals,
     leaders,
+    link_passages,
     mean_known,
     net_rotation,
     network_away,
     outside_arena,
-    passages,
     phase_starts,
+    transmission_gaps,
     transmissions,
 )
 from experiments.recording.trace import Trace
@@ -87,7 +87,7 @@ def measure(trace: Trace) -> CaseMetrics:
     phases = _phases(trace, errors, bounds)
     clearance = Clearance.of_trace(trace)
     touched = collisions(trace, clearance)
-    passed = passages(trace)
+    passed = link_passages(trace)
     robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
 
     leading = leaders(trace)
@@ -100,10 +100,10 @@ def measure(trace: Trace) -> CaseMetrics:
         formed = k > 0 or together[k] is not None  # before, there is no shape that one could turn
         rotation.append(net_rotation(trace.true_position[after:end, kept], trace.time[after:end]) if formed else None)
 
-    held = beliefs(trace, errors.net)
+    held = belief_errors(trace, errors.net)
     rms = np.sqrt(mean_known(held**2))
     largest = np.where(np.isfinite(held), held, -np.inf).max(axis=0, initial=-np.inf)
-    gap, row, one, other = closest(trace.true_position)
+    gap, row, one, other = closest_approach(trace.true_position)
     beyond = outside_arena(trace)
     farthest = int(beyond.argmax())
     ticks = int(trace.ticks.sum())
@@ -202,11 +202,14 @@ def _robots(
     net, received = trace.plan.pose_links, trace.received.link
     counted = linked[net.receiver, net.sender][received]
     delivered = np.bincount(net.sender[received[counted]], minlength=rows)
-    listeners = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.centre_hears(trace)
+    listeners = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.received_by_centre(trace)
     if trace.goals is not None:
         delivered += trace.goals.received
     goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
-    waits = [(wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3 for wait in gaps(trace)]
+    waits = [
+        (wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3
+        for wait in transmission_gaps(trace)
+    ]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     agreements = agreement(trace)
     dropped = Counter(dict.fromkeys(trace.robots, 0))

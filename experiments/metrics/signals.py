@@ -17,7 +17,7 @@ from agents.arrays import Array, Index, Mask, norm
 from agents.formation.graph import Links
 from experiments.definition.formation import errors_over_time
 from experiments.metrics.results import Passage
-from experiments.recording.losses import unrecorded
+from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import Trace
 
 RETURN_S: Final = 3.0  # robots come back one after the other when the network does
@@ -186,7 +186,7 @@ def net_rotation(position: Array, time: Array) -> float | None:
     return float(t @ angle) / float(t @ t)
 
 
-def beliefs(trace: Trace, net: Links) -> Array:
+def belief_errors(trace: Trace, net: Links) -> Array:
     """Error (T, E) [m] of the believed position on each link: the newest pose received, extrapolated by the predictor.
 
     NaN before the first pose, and after a death.
@@ -213,7 +213,7 @@ def beliefs(trace: Trace, net: Links) -> Array:
     return error
 
 
-def closest(position: Array) -> tuple[float, int, int, int]:
+def closest_approach(position: Array) -> tuple[float, int, int, int]:
     """Smallest distance [m] between two robots, its row in time, and their rows; infinite if there are no two."""
     best = (math.inf, 0, 0, 0)
     for i in range(position.shape[1] - 1):
@@ -232,7 +232,7 @@ def outside_arena(trace: Trace) -> Array:
     return np.asarray(np.where(np.isfinite(beyond), beyond, -np.inf).max(axis=0))
 
 
-def gaps(trace: Trace) -> list[Array]:
+def transmission_gaps(trace: Trace) -> list[Array]:
     """Times between transmissions, per robot [s]."""
     return [np.diff(np.sort(trace.sent_by(row).stamp)) for row in range(len(trace.robots))]
 
@@ -240,12 +240,12 @@ def gaps(trace: Trace) -> list[Array]:
 def transmissions(trace: Trace) -> tuple[Index, Index]:
     """Per robot: poses sent, by the running numbers, and those of them in the recording."""
     tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.experiment.rates.pose_hz
-    missing = [unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
+    missing = [count_unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
     recorded = np.array([len(own) for own in tables], dtype=np.intp)
     return recorded + np.array(missing, dtype=np.intp), recorded
 
 
-def passages(trace: Trace) -> tuple[Passage, ...]:
+def link_passages(trace: Trace) -> tuple[Passage, ...]:
     """Delivery statistics of every link, those that only avoidance needs included."""
     links, received = trace.plan.pose_links, trace.received
     count, link, took = len(links), received.link, received.arrival - received.stamp

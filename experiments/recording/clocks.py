@@ -27,7 +27,7 @@ class Sample:
     back: float  # [s] our clock, when the answer came back
 
 
-def offset(samples: Sequence[Sample]) -> tuple[float, float]:
+def host_offset(samples: Sequence[Sample]) -> tuple[float, float]:
     """The host's clock less ours [s], and how far off that can be [s], by the sample of the shortest round trip."""
     best = min(samples, key=lambda sample: sample.back - sample.left)
     return best.there - (best.left + best.back) / 2, (best.back - best.left) / 2

@@ -19,7 +19,7 @@ from experiments.recording.trace import ROUNDING_S
 STATUS_S: Final = 1.0  # a status at most this much after the end of a run still counts for it
 
 
-def unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
+def count_unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
     """Poses that a robot sent between the recorded ones, given by stamp [s] and number in order of time.
 
     A robot transmits at most `rate` poses in a second [1/s]; see `agents.network.validation.missed`.
@@ -27,7 +27,7 @@ def unrecorded(poses: Iterable[tuple[float, int]], rate: float) -> int:
     return sum(missed(last, seq, then - before, rate) for (before, last), (then, seq) in pairwise(poses))
 
 
-def lost(
+def count_lost(
     robots: tuple[str, ...],
     poses: list[list[SentPose]],
     statuses: list[list[Status]],
@@ -47,7 +47,7 @@ def lost(
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
     for robot, own, reports in zip(robots, poses, statuses, strict=True):
         mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
-        total[robot] += unrecorded(mine, rate) + _tail(own, reports, run, rate)
+        total[robot] += count_unrecorded(mine, rate) + _tail(own, reports, run, rate)
         total.update(_by_sender(reports, run, "lost"))
     return np.array([total[robot] for robot in robots], dtype=np.intp)
 
@@ -63,7 +63,7 @@ def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float
     return max(0, min(last.sent - number, most_poses(last.stamp - stamp, rate)))
 
 
-def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
+def count_dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) -> Index:
     """(E,) poses that the modelled network dropped on each of `Plan.pose_links`; `statuses` of each robot."""
     links, robots = plan.pose_links, plan.names
     found = [_by_sender(reports, run, "dropped") for reports in statuses]
@@ -73,10 +73,10 @@ def dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, float]) 
 
 def _by_sender(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
     """Poses lost or dropped in the run by one receiver, by sender."""
-    return growth(((status.pid, status.stamp, getattr(status, what)) for status in statuses), *run)
+    return counter_growth(((status.pid, status.stamp, getattr(status, what)) for status in statuses), *run)
 
 
-def growth(counts: Iterable[tuple[int, float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
+def counter_growth(counts: Iterable[tuple[int, float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
     """How much counters grew in a run, by their names.
 
     Args:

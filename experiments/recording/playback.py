@@ -19,7 +19,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording.cdr import Codec, Undecodable, codec
 from experiments.recording.clocks import Correction
-from experiments.recording.losses import STATUS_S, dropped, growth, lost
+from experiments.recording.losses import STATUS_S, count_dropped, count_lost, counter_growth
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
@@ -212,9 +212,9 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
         time=time,
         sent=_sent(poses, start, duration),
         received=_received(states, plan, start, duration),
-        lost=lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
+        lost=count_lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
         + (0 if goals is None else goals.lost),
-        dropped=dropped(plan, statuses, (start, start + duration)),
+        dropped=count_dropped(plan, statuses, (start, start + duration)),
         missed_deadlines=_counted(last, "missed"),
         ticks=_counted(last, "ticks"),
         decisions=_counted(last, "decisions"),
@@ -324,7 +324,7 @@ def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], 
     pose = np.array([pose for _, _, pose, *_ in receipts], dtype=float).reshape(-1, 1) - start
     reports = sorted(content[CentreState], key=lambda each: each.stamp)
     counts = (
-        growth(((each.pid, each.stamp, getattr(each, what)) for each in reports), start, start + duration)
+        counter_growth(((each.pid, each.stamp, getattr(each, what)) for each in reports), start, start + duration)
         for what in ("heard", "lost", "dropped")
     )
     received, lost_poses, dropped_poses = (np.array([each[name] for name in row], dtype=np.intp) for each in counts)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from agents.arrays import Array
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import formation_errors, gaps, leaders, phase_starts
+from experiments.metrics.signals import formation_errors, leaders, phase_starts, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.style import (
@@ -197,7 +197,11 @@ def intervals(traces: Sequence[Trace]) -> Figure:
     for k, trace in enumerate(traces):
         colour = CASES[k % len(CASES)]
         out = leaders(trace)
-        waits = [wait for wait, name in zip(gaps(trace), trace.robots, strict=True) if name not in out and len(wait)]
+        waits = [
+            wait
+            for wait, name in zip(transmission_gaps(trace), trace.robots, strict=True)
+            if name not in out and len(wait)
+        ]
         for wait in waits if len(waits) > 1 else []:
             axes.plot(*_steps(wait), color=colour, linewidth=0.5, alpha=0.45, drawstyle="steps-post")
         if waits:

@@ -21,7 +21,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.standby import without_standby
 from experiments.file.structure import plugin_files
 from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
-from experiments.metrics.signals import LinkErrors, gaps, integrals, leaders, transmissions
+from experiments.metrics.signals import LinkErrors, integrals, leaders, transmission_gaps, transmissions
 from experiments.recording.trace import Trace
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import Logbook
@@ -127,7 +127,7 @@ def _figures(trace: Trace) -> Figures:
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
     acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)
     sent = transmissions(trace)[0].astype(float)
-    waits = [float(wait.min()) for wait in gaps(trace) if len(wait)]
+    waits = [float(wait.min()) for wait in transmission_gaps(trace) if len(wait)]
     leading = leaders(trace)
     kept = [i for i, name in enumerate(trace.robots) if name not in leading and errors.alive[:, i].mean() >= KNOWN]
     iae, itae, rmse = (_mean(each[kept].tolist()) for each in integrals(errors.per_robot(), trace.time))

@@ -120,7 +120,7 @@ def overrides() -> Iterator[Target]:
 
 def park_yaml() -> Iterator[Target]:
     """Files of Robotic Park's authors; what becomes of them is read."""
-    from experiments.authoring.robotic_park.convert import imported  # noqa: PLC0415
+    from experiments.authoring.robotic_park.convert import convert_text  # noqa: PLC0415
     from experiments.file.text import decoded  # noqa: PLC0415
     from tests.experiments import robotic_park_files as theirs  # noqa: PLC0415
 
@@ -129,7 +129,7 @@ def park_yaml() -> Iterator[Target]:
 
         def take(data: bytes) -> None:
             try:
-                text, _ = imported(decoded(data, "some.yaml"), "some.yaml", 20.0)
+                text, _ = convert_text(decoded(data, "some.yaml"), "some.yaml", 20.0)
                 file.write_text(text, encoding="utf-8")
             except DocumentError as error:
                 refused_well(error)

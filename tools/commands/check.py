@@ -230,7 +230,7 @@ def _rows(numbers: Mapping[str, Figures]) -> list[str]:
 def _worded(of: Figures) -> dict[str, str]:
     """Figures as they are printed."""
 
-    from experiments.check.findings import listed
+    from experiments.check.findings import join_names
 
     def number(value: float | None, form: str, unit: str = "") -> str:
         return "-" if value is None else f"{value:{form}}{unit}"
@@ -238,7 +238,7 @@ def _worded(of: Figures) -> dict[str, str]:
     return {
         "robots": f"{of.robots}, leader: {', '.join(of.leaders) or 'none'}",
         "arena": f"{' × '.join(f'{length:g}' for length in of.arena)} m",
-        "obstacles": listed([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
+        "obstacles": join_names([f"{name} ({what})" for name, what in of.obstacles.items()]) or "none",
         "links": f"{of.links} one-way, {of.edges} pairs",
         "algebraic connectivity": number(of.algebraic_connectivity, ".3f"),
         "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
@@ -317,7 +317,7 @@ def new(
     duration: Annotated[float, typer.Option(min=1.0, help="[s]")] = 60.0,
 ) -> None:
     """Begin an experiment file from a ready-made one, or with a formation of any size."""
-    from experiments.authoring.generate import Wanted, generate
+    from experiments.authoring.generate import LayoutOptions, generate
     from experiments.file import catalogue
 
     asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere, "henneberg": henneberg, "circulant": circulant}
@@ -331,7 +331,7 @@ def new(
     if len(formations) > 1 or target is not None:
         what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
         raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
-    wanted = Wanted(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
+    wanted = LayoutOptions(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
     path, made = generate(*formations[0], name, wanted, jumps)
     print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
 

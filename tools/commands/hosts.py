@@ -81,7 +81,7 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None)
     read = document.read(file, settings or [])
     experiment = read.experiment
     chosen = choose(experiment.hosts, on or [])
-    heading = HEADING if endpoints.folder(experiment, read.path, lab) is None else SECURED
+    heading = HEADING if endpoints.lab_folder(experiment, read.path, lab) is None else SECURED
     rows = [_without_address(name, experiment, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
         rows += [_row(each, experiment, heading) for each in found]
@@ -102,7 +102,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
 
     read = document.read(file, settings or [])
     experiment = read.experiment
-    folder = endpoints.folder(experiment, read.path, lab)
+    folder = endpoints.lab_folder(experiment, read.path, lab)
     chosen = {name: host for name, host in choose(experiment.hosts, on or []).items() if host.address is not None}
     code = 0
     with stations(read, chosen, lab, routed=False) as found:
@@ -169,15 +169,15 @@ def stations(
     experiment = read.experiment
     with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
         network, own = experiment.network, []
-        secure = endpoints.folder(experiment, read.path, lab) is not None
+        secure = endpoints.lab_folder(experiment, read.path, lab) is not None
         if not routed:
             routers = []
         elif network.connect is None:
             own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
-            routers = endpoints.routers(experiment, read.path, own, lab)
+            routers = endpoints.router_endpoints(experiment, read.path, own, lab)
             start_router(launcher, routers, write_rights(read.cases().values(), routers, Path(folder)))
         else:
-            routers = endpoints.routers(experiment, read.path, network.connect, lab)
+            routers = endpoints.router_endpoints(experiment, read.path, network.connect, lab)
         begun: list[Station | HostError] = []
         for name, host in hosts.items():
             try:

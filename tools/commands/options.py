@@ -53,9 +53,9 @@ def routers(connect: list[str] | None, lab: str | None) -> list[str]:
         LabError: If one of them asks for no certificate.
     """
     from agents.network.lab import secured
-    from experiments.definition.endpoints import listed
+    from experiments.definition.endpoints import read_endpoints
 
-    return secured(listed(connect or []), lab)
+    return secured(read_endpoints(connect or []), lab)
 
 
 @contextmanager

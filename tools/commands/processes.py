@@ -145,7 +145,7 @@ def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Pat
 
     read = document.read(file)
     cases = [choose_bodies(case, bodies) for case in read.cases().values()]
-    return access_rights.rights(cases), reach.folder(read.experiment, read.path, lab)
+    return access_rights.rights(cases), reach.lab_folder(read.experiment, read.path, lab)
 
 
 @app.command()

@@ -18,8 +18,8 @@ import numpy as np
 
 from agents.body.kinds import KINDS
 from experiments.authoring.robotic_park.file import Park, Robot, Threshold, read
-from experiments.authoring.robotic_park.heights import Heights, heights_of
-from experiments.authoring.robotic_park.links import Described, described, named
+from experiments.authoring.robotic_park.heights import Heights, find_heights
+from experiments.authoring.robotic_park.links import FormationLines, formation_lines, shorten_names
 from experiments.authoring.robotic_park.starts import starts_from
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
@@ -54,13 +54,13 @@ def convert(file: str, target: str | None, duration_s: float, poses: str | None 
     except FileNotFoundError:
         hint = "name an experiment file of Robotic Park's authors (.yaml)"
         raise refusal(file, "there is no such file", hint) from None
-    made, notes = imported(text, file, duration_s, poses)
+    made, notes = convert_text(text, file, duration_s, poses)
     path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
     document.read(path)
     return path, notes
 
 
-def imported(text: str, label: str, duration_s: float, poses: str | None = None) -> tuple[str, list[str]]:
+def convert_text(text: str, label: str, duration_s: float, poses: str | None = None) -> tuple[str, list[str]]:
     """The text of the experiment file, and what was not carried over.
 
     Args:
@@ -77,8 +77,8 @@ def imported(text: str, label: str, duration_s: float, poses: str | None = None)
     _tools(park, notes)
     rates = _rates(park, notes)
     trigger, update = _trigger(park, rates, notes), _update(park, notes)
-    found = heights_of(park, notes)
-    formation = described(park, found, notes)
+    found = find_heights(park, notes)
+    formation = formation_lines(park, found, notes)
     notes = list(dict.fromkeys(notes))
     return _written(park, label, duration_s, rates, (trigger, update), found, formation, notes), notes
 
@@ -90,7 +90,7 @@ def _written(  # noqa: PLR0917 - everything that was found out
     rates: Rates,
     triggers: tuple[str, str],
     found: Heights,
-    formation: Described,
+    formation: FormationLines,
     notes: Sequence[str],
 ) -> str:
     trigger, update = triggers
@@ -189,7 +189,9 @@ def _tools(park: Park, notes: list[str]) -> None:
         notes.append(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
     away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
     if away:
-        notes.append(f"{named(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead")
+        notes.append(
+            f"{shorten_names(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead"
+        )
     if len(away) < sum(robot.place != "virtual" for robot in park.robots):
         notes.append("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):
@@ -198,14 +200,14 @@ def _tools(park: Park, notes: list[str]) -> None:
         )
     gated = [robot.name for robot in park.robots if robot.gated]
     if gated:
-        notes.append(f"{named(gated)}: position controllers that act on events; zenpark's run at every tick")
+        notes.append(f"{shorten_names(gated)}: position controllers that act on events; zenpark's run at every tick")
     roles = Counter(task.role for _, task in park.tasks if task.role != "consensus")
     if roles:
         notes.append(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
     idle = [robot for robot in park.robots if robot.idle]
     if idle:
         count = sum(robot.idle for robot in idle)
-        names = named([robot.name for robot in idle])
+        names = shorten_names([robot.name for robot in idle])
         notes.append(
             f"task.enable is False for {names}: {count} relations are left out, and these robots have no neighbours"
         )

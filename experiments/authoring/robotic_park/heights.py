@@ -29,7 +29,7 @@ SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ShapeTargets:
     """Links of N robots, and distances that they keep to points."""
 
     pairs: Index  # (M, 2) i, j
@@ -39,13 +39,13 @@ class Wanted:
     point: Array  # (A, 3) [m]
     radius: Array  # (A,) [m]
 
-    def without_points(self) -> Wanted:
+    def without_points(self) -> ShapeTargets:
         """The same without distances to points."""
         return replace(self, row=self.row[:0], point=self.point[:0], radius=self.radius[:0])
 
 
 @dataclass(frozen=True)
-class Placed:
+class FoundShape:
     """Places (N, 3) [m], how far the worst link misses what it asks for, and how far the worst point [m]."""
 
     position: Array
@@ -58,7 +58,7 @@ class Placed:
         return max(self.links, self.points)
 
 
-def placed(wanted: Wanted, start: Array, climbs: Mask) -> Placed:
+def find_shape(wanted: ShapeTargets, start: Array, climbs: Mask) -> FoundShape:
     """Best places for the targets.
 
     A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
@@ -70,7 +70,7 @@ def placed(wanted: Wanted, start: Array, climbs: Mask) -> Placed:
         start: (N, 3) [m].
         climbs: (N,) robots whose height may be another; the others keep theirs.
     """
-    best: Placed | None = None
+    best: FoundShape | None = None
     for number, (guess, free) in enumerate(_beginnings(start, climbs), 1):
         found = _fitted(wanted, guess, free)
         if best is None or round(found.worst, 4) < round(best.worst, 4):
@@ -104,7 +104,7 @@ def _beginnings(start: Array, climbs: Mask) -> Iterator[tuple[Array, Mask]]:
         yield moved, climbs
 
 
-def _fitted(wanted: Wanted, guess: Array, climbs: Mask) -> Placed:
+def _fitted(wanted: ShapeTargets, guess: Array, climbs: Mask) -> FoundShape:
     """Least squares by Levenberg's and Marquardt's method."""
     free = np.ones_like(guess, dtype=bool)
     free[~climbs, 2] = False
@@ -126,10 +126,10 @@ def _fitted(wanted: Wanted, guess: Array, climbs: Mask) -> Placed:
             break
     off, lengths = np.abs(value), int(np.isfinite(wanted.distance).sum())
     points = slice(lengths, lengths + len(wanted.row))
-    return Placed(position, float(np.delete(off, points).max(initial=0.0)), float(off[points].max(initial=0.0)))
+    return FoundShape(position, float(np.delete(off, points).max(initial=0.0)), float(off[points].max(initial=0.0)))
 
 
-def _residuals(wanted: Wanted, position: Array) -> tuple[Array, Array]:
+def _residuals(wanted: ShapeTargets, position: Array) -> tuple[Array, Array]:
     """Equations (K,) and their slope (K, N, 3): distances to robots, then to points, then relative positions."""
     rows = len(position)
     place = np.concatenate([position, wanted.point])  # a point is a robot that does not move
@@ -161,7 +161,7 @@ class Heights:
     centre: tuple[float, float, float]  # place of the origin [m]
 
 
-def heights_of(park: Park, notes: list[str]) -> Heights:
+def find_heights(park: Park, notes: list[str]) -> Heights:
     """The heights, from the shape in space if links tell one.
 
     The origin of their files is a point about which drones spread while they climb: where the shape is not flat, no
@@ -177,10 +177,10 @@ def heights_of(park: Park, notes: list[str]) -> Heights:
     if not len(wanted.pairs):
         return plain
     given = any(relation.centre is not None for _, task in park.tasks for relation in task.relations)
-    found, anchored = placed(wanted, start, flies), len(wanted.row) > 0
+    found, anchored = find_shape(wanted, start, flies), len(wanted.row) > 0
     missed = found.worst
     if anchored and missed > SHAPE_MET:
-        found, anchored = placed(wanted.without_points(), start, flies), False
+        found, anchored = find_shape(wanted.without_points(), start, flies), False
         if found.links <= SHAPE_MET:
             notes.append(
                 "distances to the origin: no shape was found that meets them and those between robots; the best one"
@@ -226,7 +226,7 @@ def _starts(park: Park, notes: list[str]) -> Array:
     return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 
 
-def _wanted(park: Park, start: Array, flies: Mask) -> Wanted:
+def _wanted(park: Park, start: Array, flies: Mask) -> ShapeTargets:
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     pairs, distance, relative = [], [], []
     anchored, point, radius = [], [], []
@@ -244,7 +244,7 @@ def _wanted(park: Park, start: Array, flies: Mask) -> Wanted:
                 anchored.append(i)
                 point.append(relation.centre or (0.0, 0.0, 0.0))
                 radius.append(relation.values[0])
-    return Wanted(
+    return ShapeTargets(
         np.array(pairs, dtype=np.intp).reshape(-1, 2),
         np.array(distance, dtype=float),
         np.array(relative, dtype=float).reshape(-1, 3),

@@ -19,7 +19,7 @@ TASKS: Final = {"distance": "distance", "pose": "displacement"}  # their kinds o
 
 
 @dataclass
-class Described:
+class FormationLines:
     """The formation, in lines of the file: `[formation]` itself, its links and its anchors."""
 
     settings: list[str] = field(default_factory=list)
@@ -27,7 +27,7 @@ class Described:
     anchors: list[str] = field(default_factory=list)
 
 
-def described(park: Park, found: Heights, notes: list[str]) -> Described:
+def formation_lines(park: Park, found: Heights, notes: list[str]) -> FormationLines:
     """Links, anchors, law and gains.
 
     The gradient law of their drivers is u = k (d² − ‖x‖²) x for each neighbour with x = p_i − p_j, which is zenpark's
@@ -36,7 +36,7 @@ def described(park: Park, found: Heights, notes: list[str]) -> Described:
     distance: only links of robots with another μ than most get one of their own.
     """
     jobs = park.tasks
-    made = Described()
+    made = FormationLines()
     if not jobs:
         made.settings.append('law = "distance"')
         return made
@@ -63,7 +63,7 @@ def described(park: Park, found: Heights, notes: list[str]) -> Described:
         scaled = [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]
         if scaled:
             notes.append(
-                f"gain of {named(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
+                f"gain of {shorten_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
                 " the distance that is wanted and weaker beyond"
             )
     if usual["pose"] is not None:
@@ -108,7 +108,7 @@ def _gain(park: Park, robot: Robot, task: Task, distance: float) -> float:
     return 2.0 * task.gain / (distance if _divides(park, robot) else 1.0)
 
 
-def named(names: Sequence[str]) -> str:
+def shorten_names(names: Sequence[str]) -> str:
     """Names for a sentence, the first ones of many."""
     return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 

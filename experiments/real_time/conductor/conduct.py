@@ -154,10 +154,10 @@ def staged(
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed
-    of_lab = reach.folder(read.experiment, read.path, staging.lab)
+    of_lab = reach.lab_folder(read.experiment, read.path, staging.lab)
     secure = of_lab is not None
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
-    listening = reach.routers(read.experiment, read.path, own if own_router else [], staging.lab)
+    listening = reach.router_endpoints(read.experiment, read.path, own if own_router else [], staging.lab)
     if own_router and not secure:
         for endpoint in listening:
             check_loopback(endpoint)

@@ -165,7 +165,7 @@ class Station:
         for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
             trips.append(clocks.Sample(left, answer.clock, back))
-        offset, uncertainty = clocks.offset(trips)
+        offset, uncertainty = clocks.host_offset(trips)
         self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
         return self.clock
 

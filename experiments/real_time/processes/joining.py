@@ -26,7 +26,7 @@ from agents.network.shutdown import held
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
-from experiments.definition.endpoints import routers
+from experiments.definition.endpoints import router_endpoints
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen_case
@@ -53,7 +53,7 @@ class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
         """
         read = document.read(self.file)
         experiment = chosen_case(read, self.case)
-        return experiment, routers(experiment, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]
+        return experiment, router_endpoints(experiment, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]
 
 
 class Network(NamedTuple):

@@ -38,7 +38,7 @@ from agents.runtime import command_line
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Ranging, Setup
 from experiments.definition import bodies, link_conditions, mesh
-from experiments.definition.endpoints import routers
+from experiments.definition.endpoints import router_endpoints
 from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -95,7 +95,7 @@ def fly(launch: RobotLaunch) -> int:
         if unknown:
             hint = registry.did_you_mean(unknown[0], experiment.robots)
             raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
-        endpoints = routers(experiment, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
+        endpoints = router_endpoints(experiment, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
         return _run(experiment, launch, endpoints)
 
 

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.authoring.generate import Wanted, experiment_file, generate, layout
+from experiments.authoring.generate import LayoutOptions, experiment_file, generate, layout
 from experiments.authoring.layouts import LayoutError
 from experiments.check.check import check, figures
 from experiments.definition import bodies
@@ -14,7 +14,7 @@ from experiments.virtual_time import simulation
 
 
 def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
-    wanted = wanted or Wanted()
+    wanted = wanted or LayoutOptions()
     path = tmp_path / f"{what}.toml"
     path.write_text(experiment_file(layout(what, size, wanted, jumps), wanted))
     return document.read(path)
@@ -36,7 +36,7 @@ def written(tmp_path, what, size, wanted=None, jumps=(1, 2)):
     ],
 )
 def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):
-    read = written(tmp_path, what, size, Wanted(kind=kind))
+    read = written(tmp_path, what, size, LayoutOptions(kind=kind))
     assert [found for found in check(read) if found.severity != "note"] == []
     numbers = figures(read.experiment)
     assert numbers.residual_mm < 0.3
@@ -50,8 +50,8 @@ def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):
 
 
 def test_every_robot_and_every_link_has_a_line(tmp_path):
-    made = layout("hemisphere", "100", Wanted())
-    lines = experiment_file(made, Wanted()).splitlines()
+    made = layout("hemisphere", "100", LayoutOptions())
+    lines = experiment_file(made, LayoutOptions()).splitlines()
     assert 'CF001 = { kind = "crazyflie", start = [' in "\n".join(lines)
     assert sum(line.startswith("CF") for line in lines) == 100
     assert sum(line.startswith('"CF') for line in lines) == len(made.pairs)
@@ -75,7 +75,7 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
-    experiment = written(tmp_path, "hemisphere", "100", Wanted(duration_s=25.0)).experiment
+    experiment = written(tmp_path, "hemisphere", "100", LayoutOptions(duration_s=25.0)).experiment
     log = simulation.simulate(experiment, [seed])
     net = Plan(experiment).links
     apart = np.linalg.norm(log.true_position[:, net.receiver] - log.true_position[:, net.sender], axis=2)
@@ -87,7 +87,7 @@ def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, see
 
 @pytest.mark.slow
 def test_by_offsets_they_come_from_anywhere(tmp_path):
-    wanted = Wanted(law="displacement", scatter=3.0, duration_s=30.0)
+    wanted = LayoutOptions(law="displacement", scatter=3.0, duration_s=30.0)
     read = written(tmp_path, "hemisphere", "20", wanted)
     assert [found for found in check(read) if found.severity != "note"] == []
     log = simulation.simulate(read.experiment, [1])
@@ -109,7 +109,7 @@ def test_large_formations_say_less_of_themselves(tmp_path):
 def test_another_seed_is_another_frame_and_the_same_one_the_same():
     one, same, other = (
         experiment_file(layout("henneberg", "12", wanted), wanted)
-        for wanted in (Wanted(seed=1), Wanted(seed=1), Wanted(seed=2))
+        for wanted in (LayoutOptions(seed=1), LayoutOptions(seed=1), LayoutOptions(seed=2))
     )
     assert one == same
     assert one.replace("seed = 1", "") != other.replace("seed = 2", "")
@@ -127,19 +127,19 @@ def test_another_seed_is_another_frame_and_the_same_one_the_same():
     ],
 )
 def test_what_cannot_be_had(what, size, wanted, said):
-    chosen = dataclasses.replace(Wanted(), **wanted)
+    chosen = dataclasses.replace(LayoutOptions(), **wanted)
     with pytest.raises(LayoutError, match=said):
         experiment_file(layout(what, size, chosen), chosen)
 
 
 def test_the_command_writes_a_file_and_never_over_another(tmp_path):
     target = tmp_path / "nine.toml"
-    path, made = generate("polygon", "9", str(target), Wanted())
+    path, made = generate("polygon", "9", str(target), LayoutOptions())
     assert (path, len(made.pairs)) == (target, 18)
     assert (tmp_path / "zenpark.schema.json").exists()
     with pytest.raises(DocumentError, match="exists already"):
-        generate("polygon", "9", str(target), Wanted())
+        generate("polygon", "9", str(target), LayoutOptions())
     with pytest.raises(DocumentError, match="--jumps 1;2"):
-        generate("circulant", "9", str(tmp_path / "other.toml"), Wanted(), "1;2")
+        generate("circulant", "9", str(tmp_path / "other.toml"), LayoutOptions(), "1;2")
     with pytest.raises(DocumentError, match="cannot be written"):
-        generate("polygon", "9", str(tmp_path / "no" / "where.toml"), Wanted())
+        generate("polygon", "9", str(tmp_path / "no" / "where.toml"), LayoutOptions())

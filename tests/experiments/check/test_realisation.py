@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.formation.graph import Links, links
-from experiments.check.realisation import algebraic_connectivity, conflicts, realise, stiffness, unfolded
+from experiments.check.realisation import (
+    algebraic_connectivity,
+    conflicts,
+    find_shapes,
+    formation_rigidity,
+    unfold_distances,
+)
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.experiments.traces import link_errors
@@ -36,7 +42,7 @@ def reference() -> Links:
 
 def test_the_published_shape_meets_the_published_distances(reference):
     assert link_errors(reference, PUBLISHED).max() < 1e-4  # four decimals were printed
-    found = realise(reference, [PUBLISHED], np.arange(7) > 0)
+    found = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)
     assert len(found) == 1
     assert found[0].worst < 1e-9
     assert found[0].position[0].tolist() == [0.0, 0.0, 0.0]
@@ -44,7 +50,7 @@ def test_the_published_shape_meets_the_published_distances(reference):
 
 
 def test_rigid_only_while_heights_are_held(reference):
-    planar, spatial = stiffness(PUBLISHED, reference, np.array([0]))
+    planar, spatial = formation_rigidity(PUBLISHED, reference, np.array([0]))
     assert (planar.rank, planar.needed) == (11, 2 * 7 - 3)
     assert (spatial.rank, spatial.needed) == (12, 3 * 7 - 6)
     assert planar.rigid
@@ -54,8 +60,8 @@ def test_rigid_only_while_heights_are_held(reference):
 def test_two_leaders_stand_in_for_a_bar():
     net = links([(2, 0), (2, 1)], [1.0, 1.0], [1.0, 1.0])
     position = np.array([(0, 0, 0), (1, 0, 0), (0.5, math.sqrt(0.75), 0)])
-    assert stiffness(position, net, np.array([0, 1]))[0].rigid
-    assert stiffness(position, net, np.array([0]))[0].rank == 2
+    assert formation_rigidity(position, net, np.array([0, 1]))[0].rigid
+    assert formation_rigidity(position, net, np.array([0]))[0].rank == 2
 
 
 def test_the_height_at_which_the_reference_closes(reference):
@@ -96,6 +102,6 @@ def test_distances_of_a_drawing_are_met_again(seed, rows):
     pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j]
     distance = [float(np.linalg.norm(drawn[i] - drawn[j])) for i, j in pairs]
     net = links(pairs, distance, [1.0] * len(pairs))
-    found = realise(net, [unfolded(net, height)], np.ones(rows, dtype=bool))
+    found = find_shapes(net, [unfold_distances(net, height)], np.ones(rows, dtype=bool))
     assert found[-1].worst < 1e-6
     assert conflicts(net, height) == []

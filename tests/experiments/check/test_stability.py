@@ -9,7 +9,7 @@ from agents.formation.anchors import Anchors
 from agents.formation.graph import BY_RELATIVE, Links, links
 from agents.plugins.laws import Displacement, Distance
 from experiments.authoring import layouts
-from experiments.check.realisation import realise
+from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -50,7 +50,7 @@ def by_hand(law, net, position, share, anchors=None):
 
 def test_stiffest_and_slowest_mode_of_the_reference():
     reference = Plan(document.read("robotic-park").experiment).links
-    shape = realise(reference, [PUBLISHED], np.arange(7) > 0)[0]
+    shape = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz
     found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)
     gain = 3.0
@@ -63,7 +63,7 @@ def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
     made = layouts.hemisphere(8, 0.6, 0.25)
     net = both_ways(made, 1.5)
     rounded = Links(net.receiver, net.sender, np.round(net.distance, 4), net.gain)
-    shape = realise(rounded, [made.position], np.ones(8, dtype=bool))[0]
+    shape = find_shapes(rounded, [made.position], np.ones(8, dtype=bool))[0]
     share = np.full(8, 0.18)
     found = modes(Distance(), rounded, shape.position, share, 10.0)
     values = np.sort(by_hand(Distance(), rounded, shape.position, share).real)
@@ -90,7 +90,7 @@ def test_rounded_lengths_make_no_slow_mode_of_a_turn(digits, led):
         share, moves = np.full(rows, 0.18), np.arange(rows) >= led
         exact = modes(Distance(), net, position, share, 10.0)
         rounded = Links(net.receiver, net.sender, np.round(net.distance, digits), net.gain)
-        shape = realise(rounded, [position], moves)[0]
+        shape = find_shapes(rounded, [position], moves)[0]
         found = modes(Distance(), rounded, shape.position, share, 10.0)
         assert found.slowest_s == pytest.approx(exact.slowest_s, rel=10.0**-digits * 300.0)
 

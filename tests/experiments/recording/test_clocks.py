@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.network.messages import GoalReceipt, HostClock, State
-from experiments.recording.clocks import Correction, Sample, offset
+from experiments.recording.clocks import Correction, Sample, host_offset
 
 SMALL = st.floats(0.0, 0.5)
 
@@ -16,14 +16,14 @@ def test_the_offset_is_within_its_uncertainty_however_unlike_both_ways_are(true,
     samples = [
         Sample(100.0 + k, 100.0 + k + there + true, 100.0 + k + there + back) for k, (there, back) in enumerate(ways)
     ]
-    found, uncertainty = offset(samples)
+    found, uncertainty = host_offset(samples)
     assert abs(found - true) <= uncertainty + 1e-9
     assert uncertainty == pytest.approx(min(there + back for there, back in ways) / 2, abs=1e-9)
 
 
 def test_the_shortest_way_tells_most():
     slow, quick = Sample(0.0, 0.2, 1.0), Sample(2.0, 2.2005, 2.001)
-    assert offset([slow, quick, slow]) == (pytest.approx(0.2), pytest.approx(0.0005))
+    assert host_offset([slow, quick, slow]) == (pytest.approx(0.2), pytest.approx(0.0005))
 
 
 def measured(host, stamp, lies, robots=("CF01",)):

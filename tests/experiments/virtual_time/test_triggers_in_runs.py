@@ -132,7 +132,7 @@ def test_what_is_said_is_smoothed(flown):
 def test_belief_error_is_that_of_the_prediction(flown):
     _, trace = flown
     net = trace.plan.links
-    found = signals.beliefs(trace, net)
+    found = signals.belief_errors(trace, net)
     listener, speaker, heard, ends = net.receiver, net.sender, trace.received, trace.plan.pose_links
     for link in np.flatnonzero(speaker > 0)[::5]:  # the leader stands, and says nothing after the start
         asked = (ends.receiver == listener[link]) & (ends.sender == speaker[link])
@@ -143,7 +143,7 @@ def test_belief_error_is_that_of_the_prediction(flown):
             wanted = math.dist(ahead, trace.true_position[k, speaker[link]])
             assert found[k, link] == pytest.approx(wanted, abs=1e-12)
     held = dataclasses.replace(trace, experiment=changed(trace.experiment, trigger="send-on-delta"))
-    assert np.nanmean(signals.beliefs(held, net) ** 2) > 4.0 * np.nanmean(found**2)
+    assert np.nanmean(signals.belief_errors(held, net) ** 2) > 4.0 * np.nanmean(found**2)
 
 
 def test_updates_are_counted_for_each_robot(park):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.authoring.robotic_park.convert import convert, imported
+from experiments.authoring.robotic_park.convert import convert, convert_text
 from experiments.authoring.robotic_park.starts import starts_from
 from experiments.check.check import check, figures
 from experiments.definition.plan import Plan
@@ -22,7 +22,7 @@ FILES = {
 
 
 def converted(tmp_path, text, name="park"):
-    made, notes = imported(text, f"{name}.yaml", 20.0)
+    made, notes = convert_text(text, f"{name}.yaml", 20.0)
     path = tmp_path / f"{name}.toml"
     path.write_text(made)
     return document.read(path), notes
@@ -298,7 +298,7 @@ def test_an_error_names_the_key_or_the_line(old, new, said, line):
     assert old in text
     broken = text.replace(old, new)
     with pytest.raises(DocumentError) as raised:
-        imported(broken, "park.yaml", 20.0)
+        convert_text(broken, "park.yaml", 20.0)
     assert said in str(raised.value)
     problem = raised.value.problems[0]
     assert problem.file == "park.yaml"
@@ -310,12 +310,12 @@ def test_an_error_names_the_key_or_the_line(old, new, said, line):
 )
 def test_other_files_are_refused(text):
     with pytest.raises(DocumentError):
-        imported(text, "park.yaml", 20.0)
+        convert_text(text, "park.yaml", 20.0)
 
 
 def test_a_table_within_itself_ends():
     with pytest.raises(DocumentError):
-        imported("Robots: &r\n  Robot01: *r\n", "park.yaml", 20.0)
+        convert_text("Robots: &r\n  Robot01: *r\n", "park.yaml", 20.0)
 
 
 def test_the_command(tmp_path):
@@ -381,7 +381,7 @@ def test_a_flat_file_of_2023_with_starts_from_a_table(tmp_path):
     marker = "dron09:\n  name: khepera01\n  control_mode: None\n  task:\n    enable: False\n    relationship: Null\n"
     poses = tmp_path / "poses.txt"
     poses.write_text("# name x y\ndron01 0.1 0.5\nkhepera01, -0.4, 0.0\nkhepera02 0.5 0.1 3.1\n")
-    made, notes = imported("".join(map(flat, OTHERS)) + marker, "AA.yaml", 20.0, str(poses))
+    made, notes = convert_text("".join(map(flat, OTHERS)) + marker, "AA.yaml", 20.0, str(poses))
     (tmp_path / "aa.toml").write_text(made)
     experiment = document.read(tmp_path / "aa.toml").experiment
     assert list(experiment.robots) == ["dron01", "khepera01", "khepera02"]
@@ -402,7 +402,7 @@ def test_a_flat_file_of_2023_with_starts_from_a_table(tmp_path):
 
 
 def test_starts_that_nobody_tells_are_marked(tmp_path):
-    made, notes = imported("".join(map(flat, OTHERS)), "AA.yaml", 20.0)
+    made, notes = convert_text("".join(map(flat, OTHERS)), "AA.yaml", 20.0)
     assert made.count("# start made up") == 3
     assert any("MADE UP" in note and "--poses" in note for note in notes)
     (tmp_path / "aa.toml").write_text(made)
@@ -422,7 +422,7 @@ def index(tmp_path, **settings):
 
 
 def test_an_index_of_2023_follows_the_files_that_it_names(tmp_path):
-    made, _ = imported(index(tmp_path), str(tmp_path / "AC.yaml"), 20.0)
+    made, _ = convert_text(index(tmp_path), str(tmp_path / "AC.yaml"), 20.0)
     (tmp_path / "ac.toml").write_text(made)
     experiment = document.read(tmp_path / "ac.toml").experiment
     assert experiment.robots["khepera01"].body == "khepera4://192.168.0.1:50000"
@@ -454,14 +454,14 @@ def test_what_is_wrong_in_an_index_is_said_with_its_file(tmp_path, broken, said,
     text = index(tmp_path)
     broken(tmp_path)
     with pytest.raises(DocumentError) as raised:
-        imported(text, str(tmp_path / "AC.yaml"), 20.0)
+        convert_text(text, str(tmp_path / "AC.yaml"), 20.0)
     assert said in str(raised.value)
     assert raised.value.problems[0].file.endswith(where)
 
 
 def test_one_robot_of_an_experiment_names_what_to_import(tmp_path):
     with pytest.raises(DocumentError, match="is one robot of an experiment"):
-        imported(flat("dron01"), "AC_dron01.yaml", 20.0)
+        convert_text(flat("dron01"), "AC_dron01.yaml", 20.0)
 
 
 WORLD = """#VRML_SIM R2023a utf8
