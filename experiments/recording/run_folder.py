@@ -1,13 +1,16 @@
-"""The folder of a run: its place and name, and the copy of its experiment file."""
+"""The folder of a run: its place and name, the copy of its experiment file, its origin; and runs as a collection."""
 
 from __future__ import annotations
 
 import itertools
 import shutil
+import statistics
+import tomllib
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -18,6 +21,8 @@ from experiments.recording.version import Provenance
 RUNS: Final = Path("runs")
 SOURCE: Final = "experiment.toml"
 ORIGIN: Final = "run.json"
+METRICS: Final = "metrics.json"
+KEY_FIGURES: Final = ("f_hz", "iae", "rmse", "acquired_s")  # means over the robots of a case, see `metrics.json`
 
 
 class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -91,3 +96,121 @@ def remove_unused(folder: Path) -> None:
     """Removes the folder of a run without a recording and without a process's log."""
     if not any(folder.glob("*.mcap")) and not any(folder.glob("logs/*")):
         shutil.rmtree(folder, ignore_errors=True)
+
+
+class PastRun(msgspec.Struct, frozen=True):
+    """A run that is over, as its folder tells."""
+
+    folder: str
+    origin: RunOrigin
+    made: float  # [s] UTC
+    megabytes: float  # of all files
+    recorded: bool  # whether it has a recording
+    seeds: list[int]
+    cases: dict[str, dict[str, float | None]]  # `KEY_FIGURES` of each case: means over seeds; None: not known
+
+    def matches(self, words: Sequence[str]) -> bool:
+        """Whether each word is one of its tags, or stands in its folder's name, its title or a case, in any case."""
+        text = " ".join([Path(self.folder).name, self.origin.title, self.origin.file, *self.cases]).lower()
+        tags = {tag.lower() for tag in self.origin.tags}
+        return all(word.lower() in tags or word.lower() in text for word in words)
+
+
+def past_runs(folders: Sequence[Path]) -> list[PastRun]:
+    """The runs in some folders, and one level below them, the oldest first; folders of no run are passed over."""
+    places = [place for folder in folders for place in (folder, *_below(folder))]
+    found = [run for place in dict.fromkeys(places) if (run := _past_run(place)) is not None]
+    return sorted(found, key=lambda run: run.made)
+
+
+def _below(folder: Path) -> list[Path]:
+    try:
+        return sorted(place for place in folder.iterdir() if place.is_dir() and not place.is_symlink())
+    except OSError:
+        return []
+
+
+def _past_run(folder: Path) -> PastRun | None:
+    """The run in a folder; None without the files that every run leaves."""
+    source = folder / SOURCE
+    if not source.is_file():
+        return None
+    origin = read_origin(folder) or RunOrigin()
+    cases = _cases(folder)
+    recorded = any(folder.glob("*.mcap"))
+    if not (recorded or cases or origin.begun):
+        return None
+    figures: dict[str, dict[str, float | None]] = {}
+    for case in dict.fromkeys(each["case"] for each in cases):
+        means = [each["mean"] for each in cases if each["case"] == case]
+        figures[case] = {name: _mean([mean.get(name) for mean in means]) for name in KEY_FIGURES}
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    seeds = sorted({each["seed"] for each in cases})
+    return PastRun(str(folder), origin, origin.begun or source.stat().st_mtime, size / 1e6, recorded, seeds, figures)
+
+
+def _cases(folder: Path) -> list[dict[str, Any]]:
+    """The metrics of each case and seed; empty if there are none that can be read."""
+    try:
+        read = msgspec.json.decode((folder / METRICS).read_bytes(), type=list[dict[str, Any]])
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [each for each in read if {"case", "seed", "mean"} <= each.keys() and isinstance(each["mean"], dict)]
+
+
+def _mean(values: Sequence[Any]) -> float | None:
+    known = [value for value in values if isinstance(value, int | float)]
+    return statistics.fmean(known) if known else None
+
+
+def differences(first: PastRun, other: PastRun) -> list[str]:
+    """How the file, the options, the seeds, the code and the versions of a run differ from those of another one."""
+    before, after = (dict(_flat(_document(Path(run.folder)), "")) for run in (first, other))
+    found = [
+        f"{key} {_shown(before.get(key))} → {_shown(after.get(key))}"
+        for key in dict.fromkeys([*before, *after])
+        if before.get(key) != after.get(key)
+    ]
+    for name in ("virtual", "bodies", "changes", "cases"):
+        old, new = getattr(first.origin, name), getattr(other.origin, name)
+        if old != new:
+            found.append(f"{name}: {_shown(old)} → {_shown(new)}")
+    if first.seeds != other.seeds:
+        found.append(f"seeds: {_shown(first.seeds)} → {_shown(other.seeds)}")
+    old_code, new_code = first.origin.made_by, other.origin.made_by
+    if old_code is not None and new_code is not None:
+        found += [f"made with {each}" for each in new_code.differences(old_code)]
+    return found
+
+
+def _document(folder: Path) -> Any:  # noqa: ANN401 - whatever stands there
+    try:
+        text = (folder / SOURCE).read_text("utf-8")
+        return msgspec.json.decode(text) if text.lstrip().startswith("{") else tomllib.loads(text)
+    except (OSError, ValueError, RecursionError):
+        return {}
+
+
+def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
+    """Values of a document by their paths."""
+    if isinstance(value, dict) and value:
+        for key, each in value.items():
+            yield from _flat(each, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, value
+
+
+def _shown(value: object) -> str:
+    if value in (None, [], {}):
+        return "-"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def age_days(run: PastRun, now: float) -> float:
+    """Age of a run at `now` [s, UTC], in days."""
+    return (now - run.made) / 86400.0
+
+
+def day_of(run: PastRun) -> str:
+    """When a run was made, to the minute, in UTC."""
+    return f"{datetime.fromtimestamp(run.made, UTC):%Y-%m-%d %H:%M}"

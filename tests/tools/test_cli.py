@@ -35,6 +35,8 @@ def test_commands():
                 "agent",
                 "router",
                 "check",
+                "clean",
+                "compare",
                 "preflight",
                 "report",
                 "export",

@@ -1,4 +1,4 @@
-"""`zenpark estop`: cut the motors of every robot. `zenpark runs`: the runs that are up on this machine."""
+"""`zenpark estop`: cut the motors of every robot. `zenpark runs`, `clean`: the runs of this machine, up and past."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tools.commands.options import AsJson, Lab, routers
 
 if TYPE_CHECKING:
     from experiments.real_time.conductor.orders import EmergencyStop
+    from experiments.recording.run_folder import PastRun
 
 app: Final = typer.Typer()
 
@@ -89,9 +90,27 @@ def _stop_all(stops: Sequence[EmergencyStop], reason: str) -> int:
     return 1
 
 
+Words = Annotated[
+    list[str] | None, typer.Argument(metavar="[WORD...]", help="Runs with all of these as tag, or in name and title.")
+]
+Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Where to look for runs. [runs]")]
+
+
 @app.command()
-def runs(as_json: AsJson = False) -> None:
-    """Show which runs are up on this machine: routers, robots, since when, folders."""
+def runs(
+    words: Words = None,
+    *,
+    past: Annotated[bool, typer.Option("--past", help="Those that are over.")] = False,
+    below: Below = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
+    if past or words or below:
+        return _show_past(words or [], below, as_json=as_json)
+    return _show_running(as_json=as_json)
+
+
+def _show_running(*, as_json: bool) -> None:
     import msgspec
 
     from agents.runtime import run_registry
@@ -111,3 +130,81 @@ def runs(as_json: AsJson = False) -> None:
             print("  " + ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items()))
     if not found:
         print("no run is up on this machine")
+
+
+def _past(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
+    from pathlib import Path
+
+    from experiments.recording.run_folder import RUNS, past_runs
+
+    folders = [Path(each) for each in below] if below else [RUNS]
+    return [run for run in past_runs(folders) if run.matches(words)]
+
+
+def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
+    import msgspec
+
+    from experiments.recording.run_folder import day_of
+    from tools.progress import columns
+
+    found = _past(words, below)
+    if as_json:
+        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        return
+    if not found:
+        print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
+        return
+    head = ("when, UTC", "run", "case", "1/s", "IAE", "RMSE, m", "acquired, s", "MB", "tags")
+    rows = []
+    for run in found:
+        clock = " (virtual)" * run.origin.virtual
+        first = [day_of(run), f"{run.folder}{clock}"]
+        for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
+            values = ["-" if value is None else f"{value:.3g}" for value in figures.values()] or ["-"] * 4
+            last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
+            rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
+    print("\n".join(columns([head, *rows])))
+    print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB")
+
+
+@app.command()
+def clean(
+    words: Words = None,
+    *,
+    older: Annotated[float | None, typer.Option(min=0.0, metavar="DAYS", help="Older than this.")] = None,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Only recordings and logs; figures, report and file stay.")
+    ] = False,
+    tagged: Annotated[bool, typer.Option("--tagged", help="Also runs that have a tag.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Does it; else it is only shown.")] = False,
+    below: Below = None,
+) -> int:
+    """Remove folders of past runs: those of some words or age, never one with a tag or one that is up."""
+    import shutil
+    from pathlib import Path
+
+    from agents.runtime import run_registry
+    from experiments.recording.run_folder import age_days
+
+    if not words and older is None:
+        raise typer.BadParameter("say which: words, or --older DAYS (0: all)")
+    up = {Path(run.folder).resolve() for run in run_registry.runs() if run.folder}
+    now = time.time()
+    chosen = [
+        run
+        for run in _past(words or [], below)
+        if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
+        if older is None or age_days(run, now) > older
+    ]
+    for run in chosen:
+        folder = Path(run.folder)
+        parts = [*folder.glob("*.mcap"), *folder.glob("logs")] if recordings else [folder]
+        try:
+            for part in parts if yes else ():
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
+        except OSError as error:
+            print(f"zenpark: {error.filename}: cannot be removed: {error.strerror}", file=sys.stderr)
+            return 1
+        print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
+    print(f"runs: {len(chosen)}" + ("" if yes or not chosen else "; --yes does it"))
+    return 0

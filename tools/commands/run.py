@@ -343,6 +343,50 @@ def report(
 
 
 @app.command()
+def compare(
+    folders: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or folders full of them.")],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Write a page with figures as well.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
+    import msgspec
+
+    from experiments.recording.reader import RecordingError
+    from experiments.recording.run_folder import differences, past_runs
+    from tools.progress import columns
+
+    # in the given order: the first one is the reference
+    found = [run for folder in folders for run in past_runs([Path(folder)])]
+    found = list({run.folder: run for run in found}.values())
+    if len(found) < 2:
+        raise RecordingError(f"{', '.join(folders)}: {len(found)} runs there; name two or more (`zenpark runs --past`)")
+    first = found[0]
+    differ = {run.folder: differences(first, run) for run in found[1:]}
+    if as_json:
+        said = {"reference": first.folder, "runs": msgspec.to_builtins(found), "differences": differ}
+        print(msgspec.json.format(msgspec.json.encode(said), indent=2).decode())
+    else:
+        print(f"reference: {first.folder}")
+        for folder, each in differ.items():
+            print(f"{folder}: {'; '.join(each) or 'the same file, seeds, code and versions'}")
+        reference = next(iter(first.cases.values()), {})
+        rows = []
+        for run in found:
+            for case, figures in run.cases.items():
+                cells = [f"{_figure(figures[name])}{_ratio(figures[name], reference.get(name))}" for name in figures]
+                rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
+        head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s")
+        print()
+        print("\n".join(columns([head, *rows])))
+    return report([run.folder for run in found], out) if out is not None else 0
+
+
+def _ratio(value: float | None, reference: float | None) -> str:
+    """A figure as a multiple of the reference's, behind it; empty if one is not known."""
+    return f" ({value / reference:.3g}×)" if value is not None and reference else ""
+
+
+@app.command()
 def export(
     folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
     target: Annotated[

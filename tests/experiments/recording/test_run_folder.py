@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from typer.testing import CliRunner
 
 from agents.body.interface import Disturbance, Jitter
 from experiments import run
@@ -15,7 +16,10 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.recording import run_folder
+from experiments.recording.run_folder import RunOrigin
+from experiments.recording.version import provenance
 from tests.agents.few import pair
+from tools.main import app
 
 
 def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
@@ -77,3 +81,89 @@ def test_whether_seeds_change_anything() -> None:
     assert not Plan(msgspec.structs.replace(bare, disturbance={"all": Disturbance(latency_s=0.1)})).uses_chance
     for parts in random:
         assert Plan(msgspec.structs.replace(bare, **parts)).uses_chance
+
+
+def kept(folder: Path, *, seed: int = 1, text: str = 'title = "Two"\n[trigger]\nkind = "periodic"\n', **origin) -> Path:
+    """The folder of a run, without a recording that could be read."""
+    folder.mkdir(parents=True)
+    (folder / run_folder.SOURCE).write_text(text)
+    run_folder.keep_origin(folder, RunOrigin(title="Two", file="two.toml", **{"begun": 1e9, **origin}))
+    mean = {"f_hz": 10.0 * seed, "iae": 1.5, "rmse": None}
+    figures = [{"case": "event", "seed": seed, "mean": mean}, {"case": "event", "seed": seed + 1, "mean": mean}]
+    (folder / "metrics.json").write_bytes(msgspec.json.encode(figures))
+    (folder / "event.mcap").write_bytes(b"0" * 1000)
+    return folder
+
+
+def test_past_runs_with_their_figures_sizes_and_tags(tmp_path: Path) -> None:
+    kept(tmp_path / "later", begun=2e9, tags=["paper"])
+    kept(tmp_path / "earlier", virtual=True)
+    (tmp_path / "no run").mkdir()
+    (tmp_path / "no run" / "notes.txt").write_text("mine")
+    earlier, later = run_folder.past_runs([tmp_path])
+    assert [Path(run.folder).name for run in (earlier, later)] == ["earlier", "later"]
+    assert earlier.cases == {"event": {"f_hz": 10.0, "iae": 1.5, "rmse": None, "acquired_s": None}}
+    assert (earlier.seeds, earlier.recorded, earlier.megabytes > 0.001) == ([1, 2], True, True)
+    assert [later.matches(words) for words in (["paper"], ["EVENT", "two"], ["pape"], ["paper", "other"])] == [
+        True, True, False, False,
+    ]  # fmt: skip
+
+
+def test_a_folder_whose_files_are_damaged_is_listed_without_figures(tmp_path: Path) -> None:
+    folder = kept(tmp_path / "damaged")
+    for name in ("run.json", "metrics.json"):
+        (folder / name).write_text("[1, 2")
+    (run,) = run_folder.past_runs([tmp_path])
+    assert (run.cases, run.origin) == ({}, RunOrigin())
+
+
+def test_how_runs_differ(tmp_path: Path) -> None:
+    made = provenance()
+    other = msgspec.structs.replace(made, code="0" * 64)
+    text = 'title = "Two"\n[trigger]\nkind = "send-on-delta"\nthreshold = 0.01\n'
+    kept(tmp_path / "a", made_by=made)
+    kept(tmp_path / "b", made_by=made, begun=2e9)
+    kept(tmp_path / "c", made_by=other, begun=3e9, text=text, seed=5, changes=["safety.margin=0.1"], bodies="world")
+    a, b, c = run_folder.past_runs([tmp_path])
+    assert run_folder.differences(a, b) == []
+    assert run_folder.differences(a, c) == [
+        "trigger.kind periodic → send-on-delta",
+        "trigger.threshold - → 0.01",
+        "bodies: - → world",
+        "changes: - → safety.margin=0.1",
+        "seeds: 1, 2 → 5, 6",
+        f"made with code 00000000, not {made.code[:8]}",
+    ]
+
+
+def zenpark(*words: str):
+    return CliRunner().invoke(app, [*words])
+
+
+def test_past_runs_on_the_command_line(tmp_path: Path) -> None:
+    a, b = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b", seed=3)
+    lines = zenpark("runs", "--past", "--in", str(tmp_path)).stdout.splitlines()
+    assert [line.split()[2] for line in lines[1:3]] == [str(a), str(b)]
+    assert lines[1].endswith("paper")
+    assert len(msgspec.json.decode(zenpark("runs", "paper", "--in", str(tmp_path), "--json").stdout)) == 1
+    said = zenpark("compare", str(tmp_path)).stdout
+    assert f"{b}: seeds: 1, 2 → 3, 4" in said
+    assert "30 (3×)" in said
+    alone = zenpark("compare", str(a))
+    assert "name two or more" in str(alone.exception)
+
+
+def test_clean_removes_what_is_named_and_nothing_with_a_tag(tmp_path: Path) -> None:
+    a, b, c = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b"), kept(tmp_path / "c")
+    (tmp_path / "mine").mkdir()
+    where = ["--in", str(tmp_path)]
+    assert zenpark("clean", *where).exit_code == 2
+    assert f"would remove {b}" in zenpark("clean", "two", *where).stdout
+    assert b.exists()
+    assert zenpark("clean", "b", "--recordings", "--yes", *where).exit_code == 0
+    assert sorted(file.name for file in b.iterdir()) == ["experiment.toml", "metrics.json", "run.json"]
+    assert zenpark("clean", "--older", "1", "--yes", *where).exit_code == 0
+    assert sorted(tmp_path.iterdir()) == [a, tmp_path / "mine"]
+    assert not c.exists()
+    assert zenpark("clean", "paper", "--tagged", "--yes", *where).exit_code == 0
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "mine"]
