@@ -16,7 +16,7 @@ from tools.main import app
 COMMAND = re.compile(r"^ {4,}(?:\./)?zenpark (?P<words>[^#\n]*)", re.MULTILINE)
 BLOCK = re.compile(r"^```toml\n(title = .*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = typer.main.get_command(app)
-BOOTSTRAP = {"hardware", "install", "test"}  # of the script `zenpark`, before Python's packages are there
+BOOTSTRAP = {"docs", "hardware", "install", "test"}  # of the script `zenpark`, before Python's packages are there
 
 
 def commands(page) -> list[str]:

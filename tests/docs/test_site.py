@@ -27,7 +27,7 @@ def site(tmp_path_factory):
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=500,
     )
     assert built.returncode == 0, built.stderr
     return folder
@@ -38,6 +38,7 @@ def text(page: Path) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_site_has_every_page_and_fetches_nothing(site):
     pages = {page.stem for page in (ROOT / "docs").glob("*.md")}
     assert pages <= {page.stem for page in site.glob("*.html")}
@@ -52,6 +53,7 @@ def test_the_site_has_every_page_and_fetches_nothing(site):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_reference_has_every_key_command_topic_and_column(site):
     file = (site / "reference" / "experiment-file.html").read_text("utf-8")
     assert not [entry.key for entry in reference.entries() if entry.words[-1] not in file]
