@@ -26,11 +26,12 @@ from agents.network.messages import Setpoint
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.plugins.registry import FAILURES, PluginError
 from agents.plugins.triggers import LastEvent, Trigger
-from agents.safety.detection import Detector, ProcessHealth, RowStatus
+from agents.safety.detection import Detector, RowStatus
 from agents.safety.hazards import Hazards, Outcome
 from agents.safety.landing import Landing
 from agents.safety.preflight import Preflight
-from agents.safety.setpoint_filter import PoseValidity, SetpointFilter
+from agents.safety.setpoint_filter import SetpointFilter
+from agents.safety.situation import ProcessHealth, Situation
 
 
 class Actions(msgspec.Struct, frozen=True):
@@ -98,14 +99,13 @@ class Agent:
         self._ordered = np.zeros(rows, dtype=bool)
         self._controller = PositionController(assignment.kinds)
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
-        self._perception = _perception(assignment)
+        self._perception = None if assignment.avoidance is None else Perception(assignment)
         self._landing = Landing(assignment)
         self.origins = {}
         self._no_row: Mask = np.zeros(rows, dtype=bool)
         self._every_row: Mask = np.ones(rows, dtype=bool)
         self._not_finite = self._no_row
-        self._where: PoseValidity
-        self._age: Array
+        self._now: Situation
 
     # ------------------------------------------------------------------ inputs
 
@@ -200,12 +200,10 @@ class Agent:
         """First half of a tick: advance the phases, and decide which rows transmit their measured pose."""
         self.goal_computer.update_links(t)
         life = self.lifecycle
-        self._age = t - state.time
-        self._where = self._safety.validate_poses(state.position, state.yaw, self._age)
-        commands = life.advance(t, self._ready(t, state), state.position, state.velocity, state.flying)
-        self._commands = self._landing.filter_commands(
-            t, commands, state, self._where, neighbours=self.neighbours, late=self.health.loop_failing, phase=life.phase
-        )
+        where = self._safety.validate_poses(state.position, state.yaw, t - state.time)
+        self._now = Situation(t, state, where, self.neighbours, self.health)
+        commands = life.advance(t, self._ready(self._now), state.position, state.velocity, state.flying)
+        self._commands = self._landing.filter_commands(self._now, commands, life.phase)
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
             since = t - float(life.start_at[life.phase == RUNNING].min())
@@ -227,7 +225,7 @@ class Agent:
     def act(self, t: float, state: BodyState, transmission: Transmission) -> Actions:
         """Second half of a tick: goals, setpoints and commands."""
         held = self.hazards.held
-        self._apply_hazards(t, state)
+        self._apply_hazards(self._now)
         if self.decision_due:
             self._decide(t, state)
         elif self.lifecycle.moved or held is not self.hazards.held:
@@ -240,7 +238,7 @@ class Agent:
         aside = self._landing.aside
         if self._landing.any_aside:
             goal = np.where(aside[:, None], self._landing.place, goal)
-        age, where = self._age, self._where
+        age, where = t - state.time, self._now.where
         avoidance = self.assignment.avoidance
         if avoidance is None or self._perception is None:
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
@@ -249,7 +247,9 @@ class Agent:
             own, near = self._perception.sense(t, state, self.neighbours.poses)
             wanted, goal = goal, self._deviate(avoidance, goal, own, near)
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
-            filtered = self._safety.check(setpoint, state.position, state.yaw, age, avoidance, own, near, where)
+            filtered = self._safety.check(
+                setpoint, state.position, state.yaw, age, where=where, avoidance=(avoidance, own, near)
+            )
             avoided = filtered.avoided
             if goal is not wanted:
                 avoided = avoided | (np.abs(goal - wanted) > 0.0).any(axis=1)
@@ -264,7 +264,8 @@ class Agent:
             transmission.rows, setpoint, self._commands, changed, avoided, transmission.position, transmission.velocity
         )
 
-    def _ready(self, t: float, state: BodyState) -> Mask:
+    def _ready(self, now: Situation) -> Mask:
+        t, state = now.t, now.state
         life, assignment = self.lifecycle, self.assignment
         if not life.waiting:
             return self._no_row  # all rows have taken off
@@ -273,9 +274,7 @@ class Agent:
             lacks[assignment.links.receiver[assignment.unreceived(self.neighbours.stamp_once_alive)]] = True
             if self.guidance is not None:
                 lacks |= self.guidance.rows_without_goal()
-        failing = self._preflight.check(
-            t, state, self._where, self.neighbours, self.health, (lacks, self.missing_neighbours)
-        )
+        failing = self._preflight.check(now, (lacks, self.missing_neighbours))
         lost = self._preflight.lost(t, failing)
         ready = np.ones(len(lacks), dtype=bool)
         for row, reason in failing.items():
@@ -289,7 +288,7 @@ class Agent:
                 life.set_missing(row, "its law wants something that is not finite")
         return ready
 
-    def _apply_hazards(self, t: float, state: BodyState) -> None:
+    def _apply_hazards(self, now: Situation) -> None:
         """Detect hazards and apply their outcomes: rows hold, land, or have their motors cut."""
         life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
@@ -303,15 +302,14 @@ class Agent:
             cruising,
             landing,
             self.goal_computer.without_neighbours() if neighbours.incomplete else None,
-            None if guidance is None else running & guidance.unguided(t),
+            None if guidance is None else running & guidance.unguided(now.t),
             None if guidance is None else guidance.stamp,
             self.goal[:, 2],
             self._setpoint,
             self._not_finite,
             self._landing,
         )
-        seen = self._detector.detect(t, state, self._where, neighbours, rows, self.health)
-        for incident in self.hazards.update(t, seen, active, landing):
+        for incident in self.hazards.update(now.t, self._detector.detect(now, rows), active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.row, self.hazards.words(incident.cause))
 
@@ -323,7 +321,7 @@ class Agent:
             self.decisions += 1
             if not self.all_guided:
                 own = running if self.guidance is None else running & ~self._guided
-                own = own if self._where.all_valid else own & ~self._where.invalid
+                own = own if self._now.where.all_valid else own & ~self._now.where.invalid
                 new = self.goal_computer.decide(
                     t, state.position, state.velocity, state.yaw, start=self.lifecycle.start_at, running=own
                 )
@@ -376,11 +374,3 @@ class Agent:
                 f"`deviate` of the avoidance {name} must give a goal per row, {wanted.shape}, not {np.shape(goal)}"
             )
         return goal
-
-
-def _perception(assignment: Assignment) -> Perception | None:
-    avoidance = assignment.avoidance
-    if avoidance is None:
-        return None
-    kinds, others, limits = assignment.kinds, assignment.robot_kinds, assignment.limits
-    return Perception(kinds, others, assignment.links, limits, avoidance.clearance, assignment.avoids)

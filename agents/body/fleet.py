@@ -50,7 +50,7 @@ class Fleet:
     def _merged(self, name: str, parts: Sequence[tuple[Index, Any]]) -> Any:  # noqa: ANN401 - the type of that field
         """A field of the state of all rows, from bodies of which some may lack it."""
         if name == "rays":
-            return Rays.joined(parts)
+            return Rays.of_bodies(parts)
         if name == "notes":
             notes = [""] * self._rows
             for group, own in parts:

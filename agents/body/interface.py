@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array, Columns, Index, Mask
 from agents.body.kinds import Kind
 from agents.clock import Clock
 from agents.network.keys import Keys
@@ -91,8 +91,7 @@ class RangeScan:
     distance: Array  # (m,) from the robot's centre [m]; NaN where nothing is in reach
 
 
-@dataclass(frozen=True)
-class Rays:
+class Rays(Columns, frozen=True):
     """The newest readings of the range sensors of any rows, one entry per ray (R)."""
 
     row: Index  # (R,) whose ray it is; rays of one row follow one another
@@ -117,16 +116,10 @@ class Rays:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
+    def of_bodies(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
         """The rays of several bodies, whose rows are rows `group` of the whole; None without any."""
-        there = [(group, rays) for group, rays in parts if rays is not None]
-        if not there:
-            return None
-        columns = ("time", "bearing", "elevation", "distance")
-        return cls(
-            np.concatenate([group[rays.row] for group, rays in there]),
-            *(np.concatenate([getattr(rays, column) for _, rays in there]) for column in columns),
-        )
+        there = [msgspec.structs.replace(rays, row=group[rays.row]) for group, rays in parts if rays is not None]
+        return cls.joined(there) if there else None
 
     def scan_of(self, row: int) -> RangeScan | None:
         """The scan of one row; None if it has no rays."""

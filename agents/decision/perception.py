@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, clamp, every, some
+from agents.arrays import Array, Columns, Index, Mask, clamp, every, some
 from agents.body.interface import BodyState, Rays
 from agents.body.kinds import Kind
-from agents.body.limits import Limits
-from agents.formation.graph import Links
+from agents.decision.assignment import Assignment
 from agents.network.validation import MAX_SPEED
 from agents.plugins.avoidance import Nearby, OwnState
 
@@ -33,22 +31,17 @@ STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down
 class Perception:
     """Collects the inputs of `Avoidance`."""
 
-    def __init__(  # noqa: PLR0917
-        self,
-        kinds: Sequence[Kind],  # of the rows (N)
-        robot_kinds: Sequence[Kind],  # of all robots of the experiment; `links.sender` points here
-        links: Links,  # on which the rows receive, for the formation or only for this (E)
-        limits: Limits,  # of safety
-        clearance: float,  # things farther above or below than this are ignored [m]
-        avoids: Mask | None = None,  # (N,) rows that avoid; None: all
-    ) -> None:
-        """Perceive for rows of `kinds` that receive on `links`."""
-        self._limits, self._clearance, self._avoids = limits, clearance, avoids
+    def __init__(self, assignment: Assignment) -> None:
+        """Perceive for the rows of an assignment with an avoidance."""
+        assert assignment.avoidance is not None
+        kinds, robot_kinds, links = assignment.kinds, assignment.robot_kinds, assignment.links
+        self._limits, self._avoids = assignment.limits, assignment.avoids
+        self._clearance = assignment.avoidance.clearance  # things farther above or below are ignored [m]
         self._takes = tuple(kind.takes for kind in kinds)
         takes = np.array(self._takes)
         self._by_position, self._by_twist = takes == "position", takes == "twist"
         self._radius, self._height = _column(kinds, "radius"), _column(kinds, "height")
-        self._speed = np.minimum(_column(kinds, "speed"), limits.top_speed)
+        self._speed = np.minimum(_column(kinds, "speed"), self._limits.top_speed)
         self._turn_rate, self._response = _column(kinds, "turn_rate"), _column(kinds, "response")
         self._lag = _column(kinds, "lag")
         self._flies = np.array([kind.flies for kind in kinds], dtype=bool)
@@ -57,7 +50,7 @@ class Perception:
         self._their_radius, self._their_lag = _column(senders, "radius"), _column(senders, "lag")
         self._their_height = _column(senders, "height")
         self._rays: Rays | None = None
-        self._points = _Points.nothing()
+        self._points = _no_points()
 
     def sense(self, t: float, state: BodyState, poses: NeighbourPoses) -> tuple[OwnState, Nearby]:
         """Own state and near things of the rows at `t` [s].
@@ -114,7 +107,7 @@ class Perception:
         before, rays = self._rays, state.rays
         self._rays = rays
         if rays is None:
-            self._points = _Points.nothing()
+            self._points = _no_points()
             return
         fresh = np.ones(len(rays.row), dtype=bool)
         if before is not None and len(before.time) == len(rays.time) and (before.row == rays.row).all():
@@ -122,8 +115,11 @@ class Perception:
             if not some(fresh):
                 return
         found = self._ends(rays, fresh, state)
-        found = found.of(~self._known(found, poses, state.position))
-        self._points = found if every(fresh) else self._points.of(~fresh[self._points.ray]).and_then(found)
+        found = found.take(~self._known(found, poses, state.position))
+        if not every(fresh):
+            found = _Points.joined([self._points.take(~fresh[self._points.ray]), found])
+            found = found.take(np.argsort(found.ray))  # in the order of the readings
+        self._points = found
 
     def _ends(self, rays: Rays, fresh: Mask, state: BodyState) -> _Points:
         """End points of the fresh readings that hit something near."""
@@ -169,7 +165,7 @@ class Perception:
         near = (up < self._height[row] + self._clearance) & (up > -self._clearance)
         near &= aware[row] & (t - points.time <= SCAN_S)
         if not every(near):
-            points = points.of(near)
+            points = points.take(near)
         many = len(points.ray)
         nothing = np.zeros(many)
         return Nearby(
@@ -178,8 +174,7 @@ class Perception:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Points:
+class _Points(Columns, frozen=True):
     """End points of range readings in the room (P)."""
 
     ray: Index  # (P,) number of the reading
@@ -189,19 +184,10 @@ class _Points:
     place: Array  # (P, 2) [m]
     height: Array  # (P,) [m]
 
-    @classmethod
-    def nothing(cls) -> _Points:
-        none, no_row = np.zeros(0), np.zeros(0, dtype=np.intp)
-        return cls(no_row, no_row, none, none, np.zeros((0, 2)), none)
 
-    def of(self, which: Mask | Index) -> _Points:
-        return _Points(*(getattr(self, field.name)[which] for field in fields(_Points)))
-
-    def and_then(self, others: _Points) -> _Points:
-        """These points and others, sorted by reading."""
-        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(_Points))
-        both = _Points(*(np.concatenate(pair) for pair in pairs))
-        return both.of(np.argsort(both.ray))
+def _no_points() -> _Points:
+    none, no_row = np.zeros(0), np.zeros(0, dtype=np.intp)
+    return _Points(no_row, no_row, none, none, np.zeros((0, 2)), none)
 
 
 def _column(kinds: Sequence[Kind], name: str) -> Array:

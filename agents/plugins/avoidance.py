@@ -7,14 +7,14 @@ after all other limits (safety level; the barrier).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, every, norm
+from agents.arrays import Array, Columns, Index, Mask, every, norm
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -23,8 +23,7 @@ COINCIDENT = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING = 1e-3  # [m] smallest gap in a force: forces stay finite
 
 
-@dataclass(frozen=True)
-class Nearby:
+class Nearby(Columns, frozen=True):
     """Things near rows, one entry per thing and row that knows it (K).
 
     Things are upright cylinders: a robot whose pose was received, or the point (radius 0) where a range reading ended.
@@ -39,19 +38,11 @@ class Nearby:
     is_robot: Mask  # (K,) robot of this experiment, which may avoid as well; else a range reading
     lag: Array  # (K,) time constant of its velocity [s]; 0 for range readings
 
-    def __len__(self) -> int:
-        return len(self.row)
-
-    def select(self, which: Mask) -> Nearby:
-        return Nearby(*(getattr(self, field.name)[which] for field in fields(Nearby)))
-
     def append(self, others: Nearby) -> Nearby:
+        """These things and others."""
         if not len(others):
             return self
-        if not len(self):
-            return others
-        both = (np.concatenate([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Nearby))
-        return Nearby(*both)
+        return Nearby.joined([self, others]) if len(self) else others
 
     def bearing(self, own: OwnState) -> tuple[Array, Array]:
         """Unit vectors (K, 2) from each thing to the row that knows it, and the distances (K,) of their axes [m].

@@ -92,7 +92,7 @@ class Barrier(Avoidance, frozen=True):
         mine = own.by_twist[near.row]
         if not some(mine):
             return goal
-        near = near if every(mine) else near.select(mine)
+        near = near if every(mine) else near.take(mine)
         here, response = own.position[:, :2], own.response[:, None]
         wanted = response * (goal[:, :2] - here)
         wanted *= np.minimum(1.0, own.speed / np.maximum(norm(wanted), SLACK))[:, None]
@@ -111,8 +111,8 @@ class Barrier(Avoidance, frozen=True):
         driving = some(twist)
         if driving and every(twist):
             return self._along_heading(setpoint, own, near)
-        others = near.select(~twist) if driving else near
-        restrained = self._along_heading(setpoint, own, near.select(twist)) if driving else setpoint
+        others = near.take(~twist) if driving else near
+        restrained = self._along_heading(setpoint, own, near.take(twist)) if driving else setpoint
         response, here = own.response[:, None], own.position[:, :2]
         aims = own.by_position[:, None]
         wanted = np.where(aims, response * (setpoint[:, :2] - here), setpoint[:, :2])

@@ -28,15 +28,10 @@ def replace_rows(own: Rays | None, received: Rays | None, rows: Index) -> Rays |
     """The readings of the bodies, with those of `rows` replaced by received ones, or removed."""
     if own is None:
         return received
-    kept = ~np.isin(own.row, rows)
-    parts = [Rays(own.row[kept], own.time[kept], own.bearing[kept], own.elevation[kept], own.distance[kept])]
-    parts += [received] if received is not None else []
-    columns = ("row", "time", "bearing", "elevation", "distance")
-    row, time, bearing, elevation, distance = (np.concatenate([getattr(rays, c) for rays in parts]) for c in columns)
-    if not len(row):
-        return None
-    order = np.argsort(row, kind="stable")  # rays of one row follow one another
-    return Rays(row[order], time[order], bearing[order], elevation[order], distance[order])
+    parts = [own.take(~np.isin(own.row, rows)), *([received] if received is not None else [])]
+    rays = Rays.joined(parts)
+    # rays of one row follow one another
+    return rays.take(np.argsort(rays.row, kind="stable")) if len(rays) else None
 
 
 class RangeInbox:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import partial
-from math import asin, degrees, expm1, hypot, sin
+from itertools import chain
+from math import asin, degrees, hypot, sin
 from typing import Final
 
 import msgspec
@@ -18,7 +18,8 @@ from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause, Observation
 from agents.safety.landing import Landing
 from agents.safety.obedience import Obedience
-from agents.safety.setpoint_filter import OUTSIDE_M, PoseValidity
+from agents.safety.setpoint_filter import OUTSIDE_M
+from agents.safety.situation import ProcessHealth, Situation
 
 
 class Separation:
@@ -43,12 +44,6 @@ class Separation:
         there = np.isfinite(apart) & (t - neighbours.poses.lost_since <= assignment.limits.link_silence_s)
         return np.where(there, apart, np.inf)
 
-    def receivers_of(self, which: Mask) -> Mask:
-        """Rows (N,) that receive on a link of `which` (E,)."""
-        rows = np.zeros(len(self._assignment.names), dtype=bool)
-        rows[self._assignment.links.receiver[which]] = True
-        return rows
-
     def nearest_robot(self, row: int, distances: Array) -> tuple[float, str]:
         """Distance of the nearest robot from a row [m], and its name."""
         links = self._assignment.links
@@ -61,47 +56,6 @@ SUNK: Final = 0.15  # [m] below its goal
 SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
-# a neighbour silent for this long after a suspension had nothing new: missed poses come with the next heartbeat of its
-# publisher, 0.5 s after its last pose, or with the history that is requested after a reconnection
-SILENT_S: Final = 1.0
-LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
-LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
-
-
-@dataclass
-class ProcessHealth:
-    """State of the process around a decision, set by the process."""
-
-    offline_since: float = np.inf  # loss of the router [s]; infinity while connected
-    conductor_lost_since: float = np.inf  # loss of the conductor [s]; infinity while alive, or never seen
-    missed_share: float = 0.0  # of the last ticks, 0 to 1
-    resumed_at: float = -np.inf  # end of the last suspension [s]
-    suspended_s: float = 0.0  # its duration [s]
-    connected_since: float = -np.inf  # begin of the connection to a router after it [s]
-
-    def mark_resumed(self, t: float, slept: float) -> None:
-        """The process resumed at `t` [s] after a suspension of `slept` [s]."""
-        self.resumed_at, self.suspended_s, self.connected_since = t, slept, t
-
-    def just_resumed(self, t: float) -> bool:
-        """Whether poses missed in a suspension may still be on their way at `t` [s]; call it on every tick."""
-        recent = t < self.connected_since + SILENT_S
-        if recent and self.offline_since < np.inf:
-            self.connected_since = t
-        return recent
-
-    @property
-    def loop_failing(self) -> bool:
-        """Whether the control loop misses so many ticks that it controls nothing."""
-        return self.missed_share > LATE_SHARE
-
-    def count_tick(self, missed: int, period: float) -> None:
-        """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
-        if missed or self.missed_share > 0.0:
-            forget = -expm1(-period * (1 + missed) / LATE_WINDOW_S)
-            self.missed_share += forget * (missed / (1 + missed) - self.missed_share)
-            if self.missed_share < 1e-3:
-                self.missed_share = 0.0
 
 
 class RowStatus(msgspec.Struct, frozen=True):
@@ -137,146 +91,112 @@ class Detector:
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
 
-    def detect(  # noqa: PLR0917 - what there is to look at
-        self,
-        t: float,
-        state: BodyState,
-        where: PoseValidity,
-        neighbours: NeighbourStates,
-        rows: RowStatus,
-        health: ProcessHealth,
-    ) -> list[Observation]:
-        """Causes present at `t` [s]."""
-        seen: list[Observation] = []
-        if not where.all_valid:
-            self._outside(t, state, where, seen)
-        if some(rows.ordered):
-            seen.append(Observation(Cause.ORDERED, rows.ordered, lambda _: "by an operator"))
-        if some(rows.not_finite):
-            seen.append(
-                Observation(Cause.SETPOINT, rows.not_finite & rows.cruising, lambda _: "not made of finite numbers")
-            )
-        self._measured(state, rows, seen)
-        self._disobedient(t, state, where, rows, seen)
+    def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
+        """Causes that are present."""
+        neighbours, health = now.neighbours, now.health
+        found = [self._orders(rows), self._measured(now.state, rows), self._disobedient(now, rows)]
+        if not now.where.all_valid:
+            found.append(self._outside(now))
         if self._limits.separation is not None:
-            self._near(t, state, neighbours, seen)
+            found.append(self._near(now, self._limits.separation))
         if neighbours.incomplete:
-            self._lost_neighbours(t, neighbours, rows, seen)
+            found.append(self._lost_neighbours(now, rows))
         if neighbours.clock_lag is not None:
-            self._lagging(neighbours, neighbours.clock_lag, seen)
-        if rows.unguided is not None and some(rows.unguided):
-            seen.append(Observation(Cause.CENTRE, rows.unguided, lambda _: "its centre is gone, or its goals are old"))
-        if health.just_resumed(t):
-            self._not_refreshed(neighbours, rows, health, seen)
-        self._surroundings(t, health, seen)
-        return seen
+            found.append(self._lagging(neighbours, neighbours.clock_lag))
+        if health.just_resumed(now.t):
+            found.append(self._not_refreshed(now, rows))
+        found.append(self._surroundings(now.t, health))
+        return [each for each in chain.from_iterable(found) if some(each.rows)]
 
-    def _not_refreshed(
-        self, neighbours: NeighbourStates, rows: RowStatus, health: ProcessHealth, seen: list[Observation]
-    ) -> None:
+    def _receivers(self, links: Mask) -> Mask:
+        """Rows (N,) that receive on `links` (E,)."""
+        rows = np.zeros(len(self._flies), dtype=bool)
+        rows[self._assignment.links.receiver[links]] = True
+        return rows
+
+    def _orders(self, rows: RowStatus) -> Iterator[Observation]:
+        """Operator, decision and central controller."""
+        yield Observation(Cause.ORDERED, rows.ordered, lambda _: "by an operator")
+        yield Observation(Cause.SETPOINT, rows.not_finite & rows.cruising, lambda _: "not made of finite numbers")
+        if rows.unguided is not None:
+            yield Observation(Cause.CENTRE, rows.unguided, lambda _: "its centre is gone, or its goals are old")
+
+    def _not_refreshed(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
         """Rows without a new pose of every alive neighbour, or a new goal, since the process was suspended."""
-        poses, links = neighbours.poses, self._assignment.links
+        poses, health = now.neighbours.poses, now.health
         silent = (poses.stamp < health.resumed_at) & np.isfinite(poses.stamp) & np.isinf(poses.lost_since)
-        waits = np.zeros(len(self._flies), dtype=bool)
-        waits[links.receiver[silent]] = True
+        waits = self._receivers(silent)
         if rows.goal_stamp is not None:
             waits |= (rows.goal_stamp < health.resumed_at) & np.isfinite(rows.goal_stamp)
-        if some(waits):
-            seen.append(
-                Observation(
-                    Cause.STANDSTILL, waits, lambda _: f"for {health.suspended_s:.1f} s; it waits for its neighbours"
-                )
-            )
+        text = f"for {health.suspended_s:.1f} s; it waits for its neighbours"
+        yield Observation(Cause.STANDSTILL, waits, lambda _: text)
 
-    def _outside(self, t: float, state: BodyState, where: PoseValidity, seen: list[Observation]) -> None:
+    def _outside(self, now: Situation) -> Iterator[Observation]:
         """Position, and the arena."""
+        t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
         def age(row: int) -> str:
             return f"the last is {t - state.time[row]:.2f} s old" if np.isfinite(state.position[row]).all() else "none"
 
-        def out(limit: float, row: int) -> str:
+        def excess(limit: float, row: int) -> str:
             return f"{where.excess[row]:.2f} m outside (limit {limit:g} m)"
 
-        cut = self._limits.cut_outside
-        seen += [
-            Observation(Cause.POSITION, where.invalid, age),
-            Observation(Cause.MARGIN, where.outside_wall & ~where.outside, lambda row: out(0.0, row)),
-            Observation(Cause.OUTSIDE, where.outside, lambda row: out(OUTSIDE_M, row)),
-            Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, lambda row: out(cut, row)),
-        ]
+        yield Observation(Cause.POSITION, where.invalid, age)
+        yield Observation(Cause.MARGIN, where.outside_wall & ~where.outside, partial(excess, 0.0))
+        yield Observation(Cause.OUTSIDE, where.outside, partial(excess, OUTSIDE_M))
+        yield Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, partial(excess, cut))
 
-    def _measured(self, state: BodyState, rows: RowStatus, seen: list[Observation]) -> None:
+    def _measured(self, state: BodyState, rows: RowStatus) -> Iterator[Observation]:
         """Speed, battery, motors, sinking, clock, tilt and landing, as the body measures them."""
         limits = self._limits
         squared = np.vecdot(state.velocity, state.velocity)
-        moving = not every(squared < self._slow_squared)
-        if moving and some(fast := squared > self._fastest_squared):
-            speed = norm(state.velocity)
-            seen.append(
-                Observation(
-                    Cause.OVERSPEED, fast, lambda row: f"{speed[row]:.2f} m/s (limit {self._fastest[row]:.2f} m/s)"
-                )
-            )
+        if not every(squared < self._slow_squared):
+            yield from self._moving(state, squared, rows)
         low = state.battery < limits.battery_low
-        if some(low):
-            seen.append(
-                Observation(
-                    Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})"
-                )
-            )
-        if state.flying.tobytes() != self._all_fly and some(fallen := (self._flies > state.flying) & rows.cruising):
-            seen.append(Observation(Cause.FALLEN, fallen, lambda _: "its motors are off"))
-        if moving and some(sinks := (state.velocity[:, 2] < -SINKS) & rows.cruising & self._flies):
-            short = rows.goal_height - state.position[:, 2]
-            if some(sinks := sinks & (short > SUNK)):
-                text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
-                seen.append(
-                    Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
-                )
-        if state.ahead is not None and some(off := clock_off(state.ahead, limits.own_silence_s)):
-            seen.append(Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead)))
+        yield Observation(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})")
+        if state.flying.tobytes() != self._all_fly:
+            fallen = (self._flies > state.flying) & rows.cruising
+            yield Observation(Cause.FALLEN, fallen, lambda _: "its motors are off")
+        if state.ahead is not None:
+            off = clock_off(state.ahead, limits.own_silence_s)
+            yield Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead))
         if state.attitude is not None:
-            leans = tilted(state.attitude, limits.tilt)
-            if some(leans) and some(leans := leans & self._flies & state.flying):
-                attitude = state.attitude
-                seen.append(
-                    Observation(
-                        Cause.TILT,
-                        leans,
-                        lambda row: (
-                            f"it leans {degrees(tilt_angle(attitude, row)):.0f}° (limit {degrees(limits.tilt):.0f}°)"
-                        ),
-                    )
-                )
+            attitude, leans = state.attitude, tilted(state.attitude, limits.tilt) & self._flies & state.flying
+            text = "it leans {:.0f}° (limit {:.0f}°)"
+            yield Observation(
+                Cause.TILT, leans, lambda row: text.format(degrees(tilt_angle(attitude, row)), degrees(limits.tilt))
+            )
         if some(rows.landing):
             late = rows.landing & self._flies & state.flying
-            seen.append(Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s"))
-            if some(rows.landing_places.aside):
-                seen.append(Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below))
+            yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s")
+            yield Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below)
 
-    def _disobedient(
-        self, t: float, state: BodyState, where: PoseValidity, rows: RowStatus, seen: list[Observation]
-    ) -> None:
+    def _moving(self, state: BodyState, squared: Array, rows: RowStatus) -> Iterator[Observation]:
+        """Speed and sinking, of rows that move."""
+        speed, short = np.sqrt(squared), rows.goal_height - state.position[:, 2]
+        yield Observation(
+            Cause.OVERSPEED,
+            squared > self._fastest_squared,
+            lambda row: f"{speed[row]:.2f} m/s (limit {self._fastest[row]:.2f} m/s)",
+        )
+        sinks = (state.velocity[:, 2] < -SINKS) & rows.cruising & self._flies & (short > SUNK)
+        text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
+        yield Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
+
+    def _disobedient(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
         """Rows whose devices do not answer, that do not move as they are told, or move otherwise."""
-        if state.heard is not None and some(gone := t - state.heard > self._limits.own_silence_s):
+        t, state, obedience = now.t, now.state, self._obedience
+        if state.heard is not None:
             heard = state.heard
-            seen.append(Observation(Cause.UNREACHABLE, gone, lambda row: f"for {t - heard[row]:.1f} s"))
-        obedience = self._obedience
-        obedience.update(t, rows.setpoint, state.position, state.yaw, rows.cruising & ~where.invalid)
-        if some(obedience.still):
-            seen.append(
-                Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
-            )
-        if some(obedience.strays):
-            seen.append(
-                Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
-            )
+            silent = t - heard > self._limits.own_silence_s
+            yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
+        obedience.update(t, rows.setpoint, state.position, state.yaw, rows.cruising & ~now.where.invalid)
+        yield Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
+        yield Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
 
-    def _near(self, t: float, state: BodyState, neighbours: NeighbourStates, seen: list[Observation]) -> None:
+    def _near(self, now: Situation, limit: float) -> Iterator[Observation]:
         """Separation from other robots at their extrapolated places."""
-        limit = self._limits.separation
-        assert limit is not None
-        apart = self._separation.distances(t, state.position, neighbours)
+        apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit
         if not some(near):
             return
@@ -286,58 +206,46 @@ class Detector:
             return f"{distance:.2f} m from {other} (limit {limit:g} m)"
 
         inner = apart < np.maximum(0.5 * limit, self._separation.touching)
-        seen.append(Observation(Cause.SEPARATION, self._separation.receivers_of(near), detail))
-        seen.append(Observation(Cause.TOUCHING, self._separation.receivers_of(inner), detail))
+        yield Observation(Cause.SEPARATION, self._receivers(near), detail)
+        yield Observation(Cause.TOUCHING, self._receivers(inner), detail)
 
-    def _lost_neighbours(self, t: float, neighbours: NeighbourStates, rows: RowStatus, seen: list[Observation]) -> None:
+    def _lost_neighbours(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
         """Lost neighbours."""
-        links, assignment = self._assignment.links, self._assignment
-        since = neighbours.poses.lost_since
-        gone = self._in_law & np.isfinite(since) & (t - since > self._limits.link_silence_s)
+        links, robots = self._assignment.links, self._assignment.robots
+        since = now.neighbours.poses.lost_since
+        lost = self._in_law & np.isfinite(since) & (now.t - since > self._limits.link_silence_s)
 
         def names(row: int) -> str:
-            return ", ".join(assignment.robots[s] for s in links.sender[gone & (links.receiver == row)].tolist())
+            return ", ".join(robots[sender] for sender in links.sender[lost & (links.receiver == row)].tolist())
 
-        if some(gone):
-            without = np.zeros(len(self._flies), dtype=bool)
-            without[links.receiver[gone]] = True
-            seen.append(Observation(Cause.NEIGHBOUR, without & rows.cruising, names))
-        if rows.without_neighbours is not None and some(rows.without_neighbours):
-            seen.append(
-                Observation(
-                    Cause.ALONE, rows.without_neighbours & rows.cruising, lambda row: names(row) or "none was received"
-                )
-            )
+        yield Observation(Cause.NEIGHBOUR, self._receivers(lost) & rows.cruising, names)
+        if rows.without_neighbours is not None:
+            alone = rows.without_neighbours & rows.cruising
+            yield Observation(Cause.ALONE, alone, lambda row: names(row) or "none was received")
 
-    def _lagging(self, neighbours: NeighbourStates, behind: Array, seen: list[Observation]) -> None:
+    def _lagging(self, neighbours: NeighbourStates, behind: Array) -> Iterator[Observation]:
         """Neighbours whose clocks lag."""
-        links = self._assignment.links
+        links, robots = self._assignment.links, self._assignment.robots
         late = (behind > 0.0) & (neighbours.poses.lost_since == np.inf)
 
         def names(row: int) -> str:
-            mine = np.flatnonzero(late & (links.receiver == row))
             return ", ".join(
-                f"the poses of {self._assignment.robots[links.sender[link]]} are "
-                f"{behind[link]:.1f} s old when they arrive"
-                for link in mine.tolist()
+                f"the poses of {robots[links.sender[link]]} are {behind[link]:.1f} s old when they arrive"
+                for link in np.flatnonzero(late & (links.receiver == row)).tolist()
             )
 
-        if some(late):
-            rows = np.zeros(len(self._flies), dtype=bool)
-            rows[links.receiver[late]] = True
-            seen.append(Observation(Cause.BEHIND, rows, names))
+        yield Observation(Cause.BEHIND, self._receivers(late), names)
 
-    def _surroundings(self, t: float, health: ProcessHealth, seen: list[Observation]) -> None:
+    def _surroundings(self, t: float, health: ProcessHealth) -> Iterator[Observation]:
         """Router, conductor and control loop."""
-        every_row = self._every_row
         if health.offline_since < np.inf:
-            gone = t - health.offline_since
-            seen.append(Observation(Cause.ROUTER, every_row, lambda _: f"for {gone:.1f} s"))
+            yield Observation(Cause.ROUTER, self._every_row, lambda _: f"for {t - health.offline_since:.1f} s")
         elif health.conductor_lost_since < np.inf:
             since = t - health.conductor_lost_since
-            seen.append(Observation(Cause.CONDUCTOR, every_row, lambda _: f"for {since:.1f} s"))
+            yield Observation(Cause.CONDUCTOR, self._every_row, lambda _: f"for {since:.1f} s")
         if health.loop_failing:
-            seen.append(Observation(Cause.LATE, every_row, lambda _: f"{health.missed_share:.0%} of the last second's"))
+            text = f"{health.missed_share:.0%} of the last second's"
+            yield Observation(Cause.LATE, self._every_row, lambda _: text)
 
 
 def clock_off(ahead: Array, silence_s: float) -> Mask:

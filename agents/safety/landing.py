@@ -15,8 +15,7 @@ from agents.arrays import Array, Index, Mask, norm, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import LANDING, BodyCommands
-from agents.decision.neighbours import NeighbourStates
-from agents.safety.setpoint_filter import PoseValidity
+from agents.safety.situation import Situation
 
 NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a row does not land in place
 ROOM: Final = 0.12  # [m] the same at the place aside
@@ -53,18 +52,13 @@ class Landing:
         self._until = np.full(rows, -np.inf)
         self._apart = np.full(len(links), np.inf)
 
-    def filter_commands(
-        self,
-        t: float,  # now [s]
-        commands: BodyCommands | None,  # commands of the lifecycle
-        state: BodyState,  # of the bodies
-        where: PoseValidity,  # validity of their poses: a row without a valid one lands in place
-        *,
-        neighbours: NeighbourStates,  # of the rows
-        late: bool,  # whether the control loop misses so many ticks that no row should move aside
-        phase: Index,  # (N,) of the rows; one that does not land any more stops moving aside
-    ) -> BodyCommands | None:
-        """Commands of this tick without the landings that must wait, and with those that need not any more."""
+    def filter_commands(self, now: Situation, commands: BodyCommands | None, phase: Index) -> BodyCommands | None:
+        """Commands of the lifecycle without the landings that must wait, and with those that need not any more.
+
+        A row whose `phase` (N,) is not landing any more stops moving aside. A row without a valid pose, or of a control
+        loop that misses its ticks, lands in place.
+        """
+        t, state, where, neighbours = now.t, now.state, now.where, now.neighbours
         ordered = commands is not None and len(commands.land) > 0
         if not (ordered or self.any_aside):
             return commands
@@ -76,7 +70,7 @@ class Landing:
         lost = neighbours.poses.lost_since < np.inf
         place = neighbours.extrapolate_all(self._assignment.predictor, t)
         able = due & self._flies & state.flying & ~where.invalid & ~where.outside_wall & (t <= self._until)
-        able &= (state.position[:, 2] > LOW) & (not late)
+        able &= (state.position[:, 2] > LOW) & (not now.health.loop_failing)
         self.aside = able & self._must_wait(state, place, lost)
         self.any_aside = some(self.aside)
         for row in np.flatnonzero(self.aside).tolist():

@@ -9,12 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, some
+from agents.arrays import Index, Mask, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.neighbours import NeighbourStates
-from agents.safety.detection import ProcessHealth, Separation, clock_off, clock_text, tilt_angle, tilted
-from agents.safety.setpoint_filter import PoseValidity
+from agents.safety.detection import Separation, clock_off, clock_text, tilt_angle, tilted
+from agents.safety.situation import Situation
 
 LOST_S: Final = 0.5  # a ready robot whose check failed for this long is not ready any more
 FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems differ about the floor
@@ -34,23 +33,15 @@ class Preflight:
         self._separation = Separation(assignment)
         self._since = np.full(len(self._flies), np.inf)
 
-    def check(  # noqa: PLR0917 - what there is to look at
-        self,
-        t: float,
-        state: BodyState,
-        where: PoseValidity,
-        neighbours: NeighbourStates,
-        health: ProcessHealth,
-        lacking: tuple[Mask, Callable[[int], Sequence[str]]],
-    ) -> dict[int, str]:
-        """Rows that must not take off at `t` [s], each with the first reason.
+    def check(self, now: Situation, lacking: tuple[Mask, Callable[[int], Sequence[str]]]) -> dict[int, str]:
+        """Rows that must not take off, each with the first reason.
 
         `lacking`: (N,) rows without a pose of a neighbour, and the names of the missing ones of a row.
         """
         failing: dict[int, str] = {}
-        checks = [self._situation(t, state, where, health, lacking), self._at_start(state), self._at_rest(state)]
+        checks = [self._situation(now, lacking), self._at_start(now.state), self._at_rest(now.state)]
         if self._limits.separation is not None:
-            checks.append(self._near(t, state.position, neighbours, self._limits.separation))
+            checks.append(self._near(now, self._limits.separation))
         for rows, reason in chain.from_iterable(checks):
             for row in np.flatnonzero(rows).tolist():
                 failing.setdefault(row, reason(row))
@@ -64,16 +55,10 @@ class Preflight:
         self._since = since
         return rows[t - since[rows] >= LOST_S]
 
-    def _situation(
-        self,
-        t: float,
-        state: BodyState,
-        where: PoseValidity,
-        health: ProcessHealth,
-        lacking: tuple[Mask, Callable[[int], Sequence[str]]],
-    ) -> Iterator[Failing]:
+    def _situation(self, now: Situation, lacking: tuple[Mask, Callable[[int], Sequence[str]]]) -> Iterator[Failing]:
         """Own position, neighbours, router, arena."""
-        known = np.isfinite(state.position).all(axis=1) & (t - state.time <= self._limits.own_silence_s)
+        state, where = now.state, now.where
+        known = np.isfinite(state.position).all(axis=1) & (now.t - state.time <= self._limits.own_silence_s)
         ahead = np.zeros(len(known)) if state.ahead is None else state.ahead
 
         def nowhere(row: int) -> str:
@@ -85,7 +70,7 @@ class Preflight:
         yield where.invalid, nowhere
         waits, missing = lacking
         yield waits, lambda row: "never heard " + ", ".join(missing(row))
-        if health.offline_since < np.inf:
+        if now.health.offline_since < np.inf:
             yield np.ones(len(self._flies), dtype=bool), lambda _: "no connection to a router"
         if not where.all_valid:
             yield where.excess > WALL_M, lambda row: f"it is {where.excess[row]:.2f} m outside the arena"
@@ -111,8 +96,8 @@ class Preflight:
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
-    def _near(self, t: float, position: Array, neighbours: NeighbourStates, limit: float) -> Iterator[Failing]:
-        apart = self._separation.distances(t, position, neighbours)
+    def _near(self, now: Situation, limit: float) -> Iterator[Failing]:
+        apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit
         if some(near):
 
@@ -120,4 +105,6 @@ class Preflight:
                 distance, other = self._separation.nearest_robot(row, apart)
                 return f"it is {distance:.2f} m from {other}, nearer than {limit:g} m"
 
-            yield self._separation.receivers_of(near), reason
+            rows = np.zeros(len(self._flies), dtype=bool)
+            rows[self._assignment.links.receiver[near]] = True
+            yield rows, reason

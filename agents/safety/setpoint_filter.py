@@ -79,16 +79,15 @@ class SetpointFilter:
         outside = np.asarray((off > self._half + OUTSIDE_M).any(axis=1))
         return PoseValidity(False, invalid, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
 
-    def check(  # noqa: PLR0917 - the four that always are, and those of avoidance
+    def check(
         self,
         setpoint: Array,  # (N, 4) as decided, in the meaning of each row's kind
         position: Array,  # (N, 3) measured [m]
         yaw: Array,  # (N,) measured [rad]
         age: Array,  # (N,) of that measurement [s]
-        avoidance: Avoidance | None = None,  # applied after all limits
-        own: OwnState | None = None,  # for the avoidance
-        nearby: Nearby | None = None,  # for the avoidance
+        *,
         where: PoseValidity | None = None,  # validity of the pose, if known already
+        avoidance: tuple[Avoidance, OwnState, Nearby] | None = None,  # applied after all limits, with its inputs
     ) -> FilteredSetpoint:
         """Safe setpoints."""
         where = self.validate_poses(position, yaw, age) if where is None else where
@@ -106,12 +105,15 @@ class SetpointFilter:
         late = np.where(invalid, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
         self._limit(safe, here, yaw, late)
         avoided = no_row
-        if avoidance is not None and own is not None and nearby is not None:
-            limited = safe
-            wished = _wished(avoidance, limited, own, nearby)
-            safe = self._restrained(limited, wished, here, yaw, late, invalid | not_finite)
-            if safe is not limited:
-                avoided = np.asarray((np.abs(safe - limited) > ROUNDING).any(axis=1))
+        if avoidance is not None:
+            wished = _wished(safe, *avoidance)
+            other = np.asarray((wished != safe).any(axis=1) & np.isfinite(wished).all(axis=1))
+            other &= ~(invalid | not_finite)
+            if some(other):
+                again = np.where(other[:, None], wished, safe)
+                self._limit(again, here, yaw, late)
+                again = np.where(other[:, None], again, safe)  # limits twice over may differ in the last bit
+                avoided, safe = np.asarray((np.abs(again - safe) > ROUNDING).any(axis=1)), again
         other = np.abs(safe - setpoint) > ROUNDING
         changed = np.asarray(other.any(axis=1)) if some(other) else no_row
         if troubled:
@@ -131,21 +133,6 @@ class SetpointFilter:
         if self._any_twist:
             rows = self._twist
             setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
-
-    def _restrained(  # noqa: PLR0917 - what limits take
-        self, setpoint: Array, wished: Array, here: Array, yaw: Array, age: Array, unknown: Mask
-    ) -> Array:
-        """Setpoints (N, 4) that avoidance wishes instead of the limited ones, within the limits again.
-
-        Rows that are not finite, and `unknown` rows (N,) without a pose or a setpoint, stay as they are.
-        """
-        other = np.asarray((wished != setpoint).any(axis=1) & np.isfinite(wished).all(axis=1))
-        other &= ~unknown
-        if not some(other):
-            return setpoint
-        again = np.where(other[:, None], wished, setpoint)
-        self._limit(again, here, yaw, age)
-        return np.where(other[:, None], again, setpoint)  # limits twice over may differ in the last bit
 
     def _near(self, target: Array, here: Array, rows: Rows) -> Array:
         """Goals inside the arena and not too far ahead of the robot."""
@@ -185,7 +172,7 @@ class SetpointFilter:
         return twist
 
 
-def _wished(avoidance: Avoidance, setpoint: Array, own: OwnState, nearby: Nearby) -> Array:
+def _wished(setpoint: Array, avoidance: Avoidance, own: OwnState, nearby: Nearby) -> Array:
     """Setpoints (N, 4) after avoidance.
 
     Raises:

@@ -1,6 +1,7 @@
 """What rows know of the things around them: heard robots where they are now, rays where they ended, nothing twice."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from agents.body.limits import Limits
 from agents.decision.neighbours import NeighbourPoses
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
 from agents.formation.graph import links
+from agents.plugins.avoidance import Avoidance
 
 LIMITS = Limits(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 2.5]), speed=0.5)
 
@@ -39,13 +41,22 @@ def rays(row, bearing, distance, *, elevation=0.0, time=0.0):
     return Rays(np.array(row, dtype=np.intp), *full, np.array(distance, dtype=float))
 
 
+def perception(kinds, robot_kinds, net, clearance=0.1, avoids=None):
+    avoidance = Avoidance(clearance=clearance)
+    return Perception(
+        SimpleNamespace(
+            kinds=kinds, robot_kinds=robot_kinds, links=net, limits=LIMITS, avoids=avoids, avoidance=avoidance
+        )
+    )
+
+
 def pair(kind=KHEPERA4, other=TURTLEBOT3, clearance=0.1, **parts):
     """One row, that hears another robot."""
-    return Perception((kind,), (kind, other), links([(0, 1)], [1.0], [1.0]), LIMITS, clearance, **parts)
+    return perception((kind,), (kind, other), links([(0, 1)], [1.0], [1.0]), clearance, **parts)
 
 
 def alone(kind=KHEPERA4):
-    return Perception((kind,), (kind,), links([], [], []), LIMITS, 0.1)
+    return perception((kind,), (kind,), links([], [], []))
 
 
 def placed(sight, t, now, told=None):
@@ -63,7 +74,7 @@ def test_a_velocity_that_no_robot_has_is_not_known(absurd):
 
 
 def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
-    sight = Perception((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []), LIMITS, 0.1)
+    sight = perception((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []))
     now = state([[0, 0, 0], [1, 0, 1], [2, 0, 1]], yaw=[1, 2, 3], velocity=[[0.1, 0, 0], [np.nan] * 3, [0, 0.2, 0]])
     own, near = sight.sense(0.0, now, NeighbourPoses.none_received(0))
     assert own.speed.tolist() == [KHEPERA4.speed, 0.5, 0.5]
@@ -235,7 +246,7 @@ def test_rows_see_for_themselves_whatever_the_order_of_their_rays():
 
     def seen(order):
         scan = rays(np.array(row)[order], np.array(bearing)[order], np.array(distance)[order])
-        _, near = Perception(kinds, kinds, net, LIMITS, 0.1).sense(0.0, state(place, rays=scan), told)
+        _, near = perception(kinds, kinds, net).sense(0.0, state(place, rays=scan), told)
         return sorted(zip(near.row.tolist(), near.position.round(9).tolist(), near.is_robot.tolist(), strict=True))
 
     first = seen([0, 1, 2, 3, 4])

@@ -99,7 +99,7 @@ def judged(kinds, setpoint, answer, position, age=0.0):
     here = own(kinds, position)
     asked = np.array(setpoint, dtype=float)
     return SetpointFilter(kinds, LIMITS).check(
-        asked, here.position, here.yaw, np.full(len(kinds), age), Wild(answer=answer), here, NOTHING
+        asked, here.position, here.yaw, np.full(len(kinds), age), avoidance=(Wild(answer=answer), here, NOTHING)
     )
 
 
@@ -135,7 +135,9 @@ def test_setpoints_that_are_left_alone_are_the_same_bits():
     answer = plain.setpoint.copy()
     answer[7, 0] += 0.01
     wild = Wild(answer=tuple(map(tuple, answer.tolist())))
-    verdict = SetpointFilter(kinds, LIMITS).check(setpoint, here.position, here.yaw, np.zeros(60), wild, here, NOTHING)
+    verdict = SetpointFilter(kinds, LIMITS).check(
+        setpoint, here.position, here.yaw, np.zeros(60), avoidance=(wild, here, NOTHING)
+    )
     same = np.arange(60) != 7
     np.testing.assert_array_equal(verdict.setpoint[same], plain.setpoint[same])
     assert not verdict.avoided[same].any()

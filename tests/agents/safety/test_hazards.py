@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from agents.body.limits import Limits, Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
-from agents.safety.detection import LATE_SHARE, SILENT_S, ProcessHealth, tilt_angle, tilted
+from agents.safety.detection import tilt_angle, tilted
 from agents.safety.hazards import RULES, Cause, Hazards, Observation, Outcome, rules
 from agents.safety.landing import PATIENCE_S
+from agents.safety.situation import LATE_SHARE, SILENT_S, ProcessHealth
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair, triangle
 from tests.agents.swarm import Swarm

@@ -11,6 +11,7 @@ from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import SetpointFilter
+from agents.safety.situation import ProcessHealth, Situation
 from experiments.definition.experiment import Arena, Experiment, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.swarm import Swarm
@@ -71,9 +72,8 @@ class Bench:
         where = self.safety.validate_poses(state.position, state.yaw, self.t - state.time)
         duties = BodyCommands(NOBODY, np.flatnonzero(self.asked), NOBODY) if self.asked.any() else None
         self.asked[:] = False
-        out = self.landing.filter_commands(
-            self.t, duties, state, where, neighbours=self.hearing, late=self.late, phase=self.phase
-        )
+        health = ProcessHealth(missed_share=float(self.late))
+        out = self.landing.filter_commands(Situation(self.t, state, where, self.hearing, health), duties, self.phase)
         if out is not None:
             self.sinking[out.land] = True
             self.told_at[out.land] = self.t
