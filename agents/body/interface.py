@@ -7,7 +7,7 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
 
 import msgspec
@@ -64,21 +64,9 @@ class BodyRequest:
 
     def select(self, rows: Index) -> BodyRequest:
         """The request for some of the rows."""
-        return BodyRequest(
-            tuple(self.names[row] for row in rows),
-            tuple(self.kinds[row] for row in rows),
-            tuple(self.addresses[row] for row in rows),
-            self.start[rows],
-            self.yaw[rows],
-            self.rate_hz,
-            tuple(self.seeds[row] for row in rows),
-            tuple(self.disturbance[row] for row in rows),
-            tuple(self.external[row] for row in rows),
-            tuple(self.device[row] for row in rows),
-            self.endpoints,
-            self.keys,
-            self.clock,
-        )
+        per_row = ("names", "kinds", "addresses", "seeds", "disturbance", "external", "device")
+        columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in per_row}
+        return replace(self, start=self.start[rows], yaw=self.yaw[rows], **columns)
 
 
 @dataclass(frozen=True)

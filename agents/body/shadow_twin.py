@@ -144,12 +144,10 @@ class Shadowed:
 
 
 def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
-    """The body with undisturbed twins beside it; the body itself without any.
+    """The body, made for `request`, with undisturbed twins beside it; the body itself without any.
 
-    Args:
-        body: Of the rows of `request`.
-        request: What it was opened with.
-        restart_s: (n,) how often the twin is put onto the robot [s]: infinite for once, NaN for robots without one.
+    `restart_s` (n,) is the period with which the twin is put onto its robot [s]: infinite for once, NaN for robots
+    without a twin.
 
     Raises:
         plugins.PluginError: If no twin is installed.

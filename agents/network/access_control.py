@@ -103,9 +103,7 @@ def _kept(keys: Iterable[str]) -> list[str]:
 def rules(rights: Rights, register: Register) -> dict[str, Any]:
     """The `access_control` of a router: default deny, one subject for each valid certificate.
 
-    Args:
-        rights: Of the experiment.
-        register: Of the lab; robots that are not in it get no rights.
+    Robots that are not in the register get no rights.
 
     Raises:
         LabError: If the name of a robot belongs to an identity of another role.

@@ -119,9 +119,7 @@ def require(folder: Path, names: Sequence[str]) -> None:
 def secured(endpoints: Sequence[str], lab: str | Path | None) -> list[str]:
     """The endpoints, each with the lab that it needs; as they are without a lab.
 
-    Args:
-        endpoints: Routers; none: the usual one on this machine. Those that name a lab already keep it.
-        lab: The folder.
+    Without endpoints the usual one on this machine is meant. Those that name a lab already keep it.
 
     Raises:
         LabError: If one is neither tls/ nor quic/, so that certificates would not be asked for.

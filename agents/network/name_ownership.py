@@ -32,23 +32,16 @@ class NameTaken(RuntimeError):
 
 def claim(
     session: zenoh.Session,
-    alive: Sequence[str],
+    alive: Sequence[str],  # liveliness key of each name
     *,
-    began: float,
-    endpoints: Sequence[str] = (),
-    stop: threading.Event | None = None,
+    began: float,  # start of the process, UTC [s]
+    endpoints: Sequence[str] = (),  # routers; if there are several, tokens get `SETTLE_S` to travel between them
+    stop: threading.Event | None = None,  # ends the wait when it is set
 ) -> list[zenoh.LivelinessToken]:
     """Takes the ownership of names; returns the tokens that keep it, as long as they are referenced.
 
     The decision has two rounds, before and after the token of the owner is declared. Of two processes, the one whose
     token a router got later sees the other one's in its round, so that exactly one passes both.
-
-    Args:
-        session: Of the process.
-        alive: Liveliness key of each name.
-        began: Start of the process, UTC [s].
-        endpoints: Routers; if there are several, tokens get `SETTLE_S` to travel between them.
-        stop: Ends the wait when it is set.
 
     Raises:
         NameTaken: If another process owns one of the names, or claimed it earlier; the tokens of a killed process are
@@ -115,12 +108,8 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
 
     One answer is not enough: a link that is lost ends its questions as an answer does, and a process that takes the
     name may be between its two rounds. No other owner must be seen for `SETTLE_S`. One that is seen may still give way
-    to the claim of this process, for `OWNER_VANISH_S`.
-
-    Args:
-        session: Of the process, whose tokens are declared, and declared anew by Zenoh when it was cut off.
-        alive: Liveliness key of each name.
-        pause: Ends the wait when it is set.
+    to the claim of this process, for `OWNER_VANISH_S`. `pause` ends the wait when it is set. The tokens of the session
+    are declared, and Zenoh declares them anew when it was cut off.
 
     Raises:
         NameTaken: If another process owns one of the names.

@@ -118,19 +118,11 @@ class Inbox(Generic[M]):
         subscription: Subscription,
         kind: type[M],
         *,
-        keys: Keys | None = None,
-        robots: Container[str] | None = None,
-        on_refusal: Callable[[str, str], object] | None = None,
+        keys: Keys | None = None,  # if given, a message must carry the name of the robot of its key
+        robots: Container[str] | None = None,  # messages of others are left out; None: of none
+        on_refusal: Callable[[str, str], object] | None = None,  # called with key and reason of each refusal
     ) -> None:
-        """Reads `kind` from a subscription.
-
-        Args:
-            subscription: Its queue is emptied by `read`.
-            kind: Of the messages.
-            keys: If given, a message must carry the name of the robot of its key.
-            robots: Messages of others are left out; None: of all.
-            on_refusal: Called with key and reason of each refusal.
-        """
+        """Reads `kind` from the queue of a subscription."""
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
         self._robots = robots
         self.malformed, self.trouble = 0, ""

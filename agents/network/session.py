@@ -136,30 +136,20 @@ class Polled(Protocol[T_co]):
 
 
 def open_session(
-    endpoints: Sequence[str],
+    endpoints: Sequence[str],  # routers, best first; or members of a mesh
     *,
-    name: str,
-    wait_s: float = 10.0,
-    stop: threading.Event | None = None,
-    lease_s: float = LEASE_S,
-    identity: str | None = None,
-    rights: access_control.Rights | None = None,
-    gather_s: float = GATHER_S,
+    name: str,  # as `zenpark keys` shows it
+    wait_s: float = 10.0,  # limit for an answer [s]
+    stop: threading.Event | None = None,  # ends the wait when it is set
+    lease_s: float = LEASE_S,  # see `agents.network.zenoh_config`
+    identity: str | None = None,  # name in the certificate, in a lab; `name` if left out
+    rights: access_control.Rights | None = None,  # of all identities, enforced by the members of a mesh in a lab
+    gather_s: float = GATHER_S,  # limit for further members of a mesh to answer when one has [s]
 ) -> zenoh.Session:
     """A session on the network of some endpoints; use it in a `with`.
 
     It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all
     members, also with later ones.
-
-    Args:
-        endpoints: Routers, best first; or members of a mesh.
-        name: As `zenpark keys` shows it.
-        wait_s: How long to try [s].
-        stop: Ends the wait when it is set.
-        lease_s: See `agents.network.zenoh_config`.
-        identity: Name in the certificate, if the endpoints belong to a lab; `name` if left out.
-        gather_s: Limit for further members of a mesh to answer when one has [s].
-        rights: Of all identities; a member of a mesh needs them in a lab, since no router enforces them.
 
     Raises:
         EndpointError: If an endpoint is malformed, or its lab has no such identity, or it cannot listen there.

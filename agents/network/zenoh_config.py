@@ -45,28 +45,18 @@ def config(settings: Mapping[str, object]) -> zenoh.Config:
 
 
 def settings(
-    mode: Mode,
+    mode: Mode,  # robots are clients: a router forwards between clients, but not between two peers
     *,
-    connect: Sequence[str] = (),
-    listen: Sequence[str] = (),
-    name: str | None = None,
-    lease_s: float = LEASE_S,
-    identity: str | None = None,
-    rights: access_control.Rights | None = None,
+    connect: Sequence[str] = (),  # routers: a client uses the first that answers, a router is linked with each
+    listen: Sequence[str] = (),  # loopback endpoints; a client needs none
+    name: str | None = None,  # shown by `zenpark keys`
+    lease_s: float = LEASE_S,  # silence after which the others consider this session dead [s]
+    identity: str | None = None,  # name in the certificate, in a lab; `name` if left out
+    rights: access_control.Rights | None = None,  # of all identities; a router of a lab needs them
 ) -> dict[str, object]:
     """Settings of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 
     With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed.
-
-    Args:
-        mode: Robots are clients: a router forwards between clients, but not between two peers.
-        connect: Endpoints of the routers; a client uses the first that answers and fails over to the others, and a
-            router is linked with every one.
-        listen: Loopback endpoints to listen on; a client needs none.
-        name: Shown by `zenpark keys`.
-        lease_s: Silence after which the others consider this session dead [s]. A killed process is noticed at once.
-        identity: Name in the certificate, in a lab; `name` if left out.
-        rights: Of all identities; a router of a lab needs them.
 
     Raises:
         EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine

@@ -20,18 +20,7 @@ Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the 
 
 
 def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Answer:
-    """Carries out an order to one row.
-
-    Args:
-        agent: The decision that the row belongs to.
-        row: Of the robot.
-        order: To carry out.
-        t: Now, on the process's clock [s].
-        utc: UTC time at which that clock stood at 0 [s].
-
-    Returns:
-        Reason of a refusal (empty: none), and the value of a parameter that was read or set.
-    """
+    """Carries out an order to one row at `t` [s] of a clock that was 0 at `utc` [s]."""
     match order.order:
         case "takeoff":
             return agent.lifecycle.takeoff(row), None

@@ -36,23 +36,16 @@ LOOK_AGAIN_S: Final = 0.5
 
 
 def serve(
-    endpoints: Sequence[str],
+    endpoints: Sequence[str],  # to listen on: on loopback, or anywhere with a lab
     *,
-    link: Sequence[str] = (),
-    lifeline: bool = False,
-    linger_s: float = 0.0,
-    rights: Rights | None = None,
+    link: Sequence[str] = (),  # other routers, with which it shares all keys
+    lifeline: bool = False,  # standard input is a lifeline
+    linger_s: float = 0.0,  # time that it stays after its loss, for robots that land [s]; less without clients
+    rights: Rights | None = None,  # of all identities, in a lab
 ) -> int:
     """Runs a router until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
 
     Prints one line when clients can connect.
-
-    Args:
-        endpoints: Where to listen: on loopback, or anywhere with a lab.
-        link: Other routers, with which it shares all keys.
-        lifeline: Whether standard input is a lifeline.
-        linger_s: Time that it stays after its lifeline was lost, for robots that land [s]; less without clients.
-        rights: Of all identities, in a lab.
 
     Raises:
         EndpointError: If it cannot listen there, or the lab cannot be used.
@@ -101,14 +94,8 @@ def serve_router(
     """Runs a router on loopback endpoints, or on those of a lab, until `stop` is set.
 
     When the register of its lab changes, the router restarts with the new rules: revoked certificates have no rights
-    from then on. Clients reconnect by themselves.
-
-    Args:
-        endpoints: Where it listens.
-        stop: Ends it.
-        link: Other routers, sought until they answer.
-        ready: Gets the router as soon as clients can connect, also after a restart.
-        rights: Who may do what, in a lab.
+    from then on. Clients reconnect by themselves. `ready` gets the router as soon as clients can connect, also after a
+    restart; the rest as of `serve`.
 
     Raises:
         EndpointError: If an endpoint is malformed, not on loopback though there is no lab, or taken, or if the lab

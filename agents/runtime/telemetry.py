@@ -69,25 +69,14 @@ class Telemetry:
         encoding: messages.Encoding,
         *,
         agent: Agent,
-        neighbours: PoseInbox,
-        counts: Counts,
-        malformed: Callable[[], int],
-        ranged: Sequence[bool],
+        neighbours: PoseInbox,  # poses received since the last state are sent with it, and removed
+        counts: Counts,  # kept by the runtime
+        malformed: Callable[[], int],  # number of refused payloads, other than poses
+        ranged: Sequence[bool],  # (n) rows whose bodies measure ranges: those of the others come from the network
+        # goals received by each row since the last state, removed here; None: no row is guided
         receipts: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
-        """Declares the publishers.
-
-        Args:
-            session: Of the process.
-            keys: Of the realm.
-            encoding: Of payloads.
-            agent: Whose rows they are.
-            neighbours: Poses received since the last state are sent with it, and removed.
-            counts: Kept by the runtime.
-            malformed: Number of payloads that were refused, other than poses.
-            ranged: (n) rows whose bodies measure ranges: those of the others come from the network already.
-            receipts: Goals received by each row since the last state, removed here; None: no row is guided.
-        """
+        """Declares the publishers."""
         self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
         self._encoding = encoding
         names = self._names = agent.assignment.names

@@ -39,21 +39,12 @@ class Watchdog:
         body: Body,
         rows: Index,
         *,
-        alarm: Callable[[str], object],
-        silence_s: float = SILENCE_S,
-        down_s: float = DOWN_S,
-        end: Callable[[int], object] = os._exit,
+        alarm: Callable[[str], object],  # reports the reason to the other processes
+        silence_s: float = SILENCE_S,  # longest time without a beat [s]
+        down_s: float = DOWN_S,  # from then until the motors are cut [s]
+        end: Callable[[int], object] = os._exit,  # ends the process with an exit code
     ) -> None:
-        """Prepares the watchdog.
-
-        Args:
-            body: `land` and `stop` of it are called.
-            rows: All of its rows.
-            alarm: Tells the other processes the reason.
-            silence_s: Longest time without a beat [s].
-            down_s: From then until the motors are cut [s].
-            end: Ends the process with an exit code.
-        """
+        """Prepares the watchdog of a body with these rows."""
         self.tripped = ""
         self._body, self._rows, self._alarm, self._end = body, rows, alarm, end
         self._silence_s, self._down_s = silence_s, down_s

@@ -202,10 +202,10 @@ def twin(
     identity: As = "twin",
 ) -> int:
     """Stand in for hardware: protocol twins, to which vendor libraries connect."""
-    from experiments.real_time.processes.protocol_twins import command
+    from experiments.real_time.processes.protocol_twins import by_hand
 
     endpoints = routers(connect, lab)
-    return command(kind, count, faults=faults, device=device, tables=table or [], connect=endpoints, identity=identity)
+    return by_hand(kind, count, faults=faults, device=device, tables=table or [], connect=endpoints, identity=identity)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})

@@ -70,24 +70,14 @@ def joined(
     experiment: Experiment,
     endpoints: list[str],
     *,
-    name: str,
-    stop: threading.Event,
-    on_signal: Callable[[], object],
-    lost: threading.Event | None = None,
-    token: str = "",
-    taken: str = "",
+    name: str,  # of the session, and of its certificate in a lab
+    stop: threading.Event,  # ends the wait for a router when it is set
+    on_signal: Callable[[], object],  # called by SIGINT and SIGTERM
+    lost: threading.Event | None = None,  # set when the lifeline is lost; None: standard input is no lifeline
+    token: str = "",  # liveliness key that only one process may own; empty: none
+    taken: str = "",  # text of the error if another process owns it
 ) -> Iterator[Network]:
     """Inside, the network of an experiment is joined; at the end it is left.
-
-    Args:
-        experiment: The case.
-        endpoints: Routers.
-        name: Of the session, and of its certificate in a lab.
-        stop: Ends the wait for a router when it is set.
-        on_signal: Called by SIGINT and SIGTERM.
-        lost: Set when the lifeline is lost; None: standard input is no lifeline.
-        token: Liveliness key that only one process may own; empty: none.
-        taken: Says what to do if another process owns it.
 
     Raises:
         NameTaken: If another process owns `token`.
@@ -137,13 +127,7 @@ class ConductorWatch:
     """
 
     def __init__(self, session: zenoh.Session, keys: Keys, silence_s: float = SILENCE_S) -> None:
-        """Starts to watch.
-
-        Args:
-            session: Open until `close`.
-            keys: Of the realm.
-            silence_s: A conductor that is gone for this long is gone [s].
-        """
+        """Starts to watch; a conductor whose token is missing for `silence_s` [s] is gone."""
         self._session, self._silence_s = session, silence_s
         self._watch = pubsub.AliveWatch(session, keys.conductor)
         self._over = threading.Event()

@@ -125,57 +125,56 @@ def stand_in(launch: TwinLaunch) -> int:
     request = DeviceRequest(
         bodies.body_request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults)
     )
-    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
-    return _serve(words.pop(), request, keys=keys, rate_hz=rate, connect=endpoints, lifeline=launch.lifeline)
+    return _serve(words.pop(), request, experiment, endpoints, lifeline=launch.lifeline)
 
 
 def by_hand(
     kind: str,
     count: int,
     *,
-    faults: Faults,
-    device: dict[str, object],
+    faults: str,
+    device: str,
     connect: Sequence[str],
+    tables: Sequence[str] = (),
     identity: str = "twin",
 ) -> int:
-    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment.
+    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment: `zenpark twin`.
 
-    Args:
-        kind: Of robot.
-        count: How many.
-        faults: Injected faults.
-        device: Settings of the device.
-        connect: Routers for true poses, and for twins that are reached by Zenoh; may be none.
-        identity: Name in the certificate, in a lab.
+    `faults` and the settings of the `device` are JSON. `connect` are routers for true poses, and for twins that are
+    reached by Zenoh; may be none. `tables` are the setting of this name, `identity` is the name in the certificate, in
+    a lab.
 
     Raises:
-        DocumentError: If there is no such protocol twin.
+        DocumentError: If there is no such protocol twin, or the JSON is wrong.
         Unreachable: If no router answers.
     """
+    settings = structure.parse_object("--device", device)
+    if tables:
+        settings["tables"] = list(tables)
     word = f"{kind}-twin"
     if word not in (known := registry.names(registry.DEVICES)):
         hint = registry.did_you_mean(kind, [name.removesuffix("-twin") for name in known])
         raise DocumentError([Problem(f"zenpark twin {kind}", 0, 0, "there is no such protocol twin", hint)])
     hover = 0.8 if KINDS[kind].flies else None
     robots = {
-        f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=device)
+        f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings)
         for k in range(count)
     }
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
-    request = DeviceRequest(bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), faults)
-    keys, rate = Keys(experiment.network.realm), experiment.rates.body_hz
-    return _serve(word, request, keys=keys, rate_hz=rate, connect=connect, lifeline=False, identity=identity)
+    request = DeviceRequest(
+        bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), _faults(faults)
+    )
+    return _serve(word, request, experiment, connect, identity=identity)
 
 
 def _serve(
     word: str,
     request: DeviceRequest,
-    *,
-    keys: Keys,
-    rate_hz: float,
+    experiment: Experiment,
     connect: Sequence[str],
-    lifeline: bool,
+    *,
+    lifeline: bool = False,
     identity: str = "twin",
 ) -> int:
     """Runs a device until a signal, or until its lifeline is lost and the robots are gone."""
@@ -192,27 +191,11 @@ def _serve(
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
+        keys, rate_hz = Keys(experiment.network.realm), experiment.rates.body_hz
         process = DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost)
         declared.append(process)
         process.run(over)
     return 0
-
-
-def command(
-    kind: str,
-    count: int,
-    *,
-    faults: str,
-    device: str,
-    connect: Sequence[str],
-    tables: Sequence[str] = (),
-    identity: str = "twin",
-) -> int:
-    """`zenpark twin`: as `by_hand`, with faults and settings as JSON; `tables` are the setting of this name."""
-    settings = structure.parse_object("--device", device)
-    if tables:
-        settings["tables"] = list(tables)
-    return by_hand(kind, count, faults=_faults(faults), device=settings, connect=connect, identity=identity)
 
 
 def _faults(text: str) -> Faults:
