@@ -82,10 +82,14 @@ class Correction:
 
     def __call__(self, robot: str, stamp: float) -> float:
         """A stamp [s] that a robot's process made, on the conductor's clock."""
+        return float(self.stamps(robot, np.array(stamp))) if robot in self._series else stamp
+
+    def stamps(self, robot: str, made: Array) -> Array:
+        """As a call, for stamps (...) [s]."""
         if robot not in self._series:
-            return stamp
+            return made
         stamps, offsets, when, what = self._series[robot]
-        return stamp - float(np.interp(stamp, stamps, offsets) - np.interp(stamp, when, what))
+        return np.asarray(made - (np.interp(made, stamps, offsets) - np.interp(made, when, what)))
 
     def state(self, state: State) -> State:
         """Telemetry with all stamps corrected: its own, and those of received poses and goals.

@@ -44,6 +44,12 @@ S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status)
 
 
+def common_start(events: Iterable[Event], statuses: Iterable[Status], announced: float | None) -> float | None:
+    """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
+    said = next((each.stamp for each in events if each.kind == "start" and math.isfinite(each.stamp)), announced)
+    return min((each.started for each in statuses if each.started > 0.0), default=None) if said is None else said
+
+
 class NotStarted(RecordingError):
     """The recording of a run that ended before its common start, so that there is nothing to show."""
 
@@ -139,11 +145,7 @@ class _Content:
 
     def start(self, announced: float | None) -> float | None:
         """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
-        starts = [event.stamp for event in self[Event] if event.kind == "start" and math.isfinite(event.stamp)]
-        began = [status.started for status in self[Status] if status.started > 0.0]
-        if starts or announced is not None:
-            return starts[0] if starts else announced
-        return min(began, default=None)
+        return common_start(self[Event], self[Status], announced)
 
     def length(self, start: float, duration: float) -> float:
         """Length of the run from the common start on [s], at most `duration`."""

@@ -38,7 +38,7 @@ class Look:
 
 
 LIGHT: Final = Look((255, 255, 255), (226, 228, 232), (190, 193, 200), (90, 94, 102), (168, 172, 180))
-DARK: Final = Look((27, 28, 31), (52, 54, 60), (78, 82, 90), (150, 155, 165), (105, 110, 120))
+DARK: Final = Look((20, 20, 20), (52, 54, 60), (95, 100, 110), (150, 155, 165), (105, 110, 120))
 
 
 @dataclass
@@ -62,6 +62,14 @@ class _Kind:
     ghosts: Any
     shadows: Any | None
     shadow_rows: Index
+
+
+def light(server: viser.ViserServer) -> None:
+    """Even light without pictures of surroundings, which would cost a browser time and make colours pale."""
+    server.scene.set_up_direction("+z")
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(cast_shadow=True)
+    server.scene.add_light_ambient("/light", intensity=1.1)
 
 
 class SceneDrawing:
@@ -92,7 +100,7 @@ class SceneDrawing:
         self._broken = self._lines("broken", hidden[:1], thickness=2.0)
         self._drops = self._lines("drops", np.tile(np.array(NOWHERE), (rows, 2, 1)), look.section, thickness=1.0)
         self._trails = self._ranges = self._margins = None
-        ring = models.annulus(1.55, 1.95)
+        ring = models.annulus(1.5, 2.1)
         self._rings = self._batch("rings", ring, rows, scales=stage.radius, cast=False)
         self._labels: dict[int, Any] = {}
         self._texts: dict[int, str] = {}
@@ -106,6 +114,13 @@ class SceneDrawing:
     def offset(self, place: tuple[float, float, float]) -> None:
         self._offset = place
         self._frame.position = place
+
+    def name(self, text: str) -> None:
+        """Writes a name in front of the arena."""
+        low = self.stage.scene.low
+        self._scene.add_label(
+            f"{self._root}/name", text, position=(0.0, float(low[1]) - 0.12, 0.0), anchor="top-center"
+        )
 
     def remove(self) -> None:
         """Removes everything."""
@@ -170,7 +185,7 @@ class SceneDrawing:
         return self._scene.add_batched_meshes_simple(
             f"{self._root}/{name}", mesh.vertices.astype(np.float32), mesh.faces,
             np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1)), np.tile(np.array(NOWHERE), (count, 1)),
-            batched_scales=scales, batched_colors=np.full((count, 3), 128, np.uint8) if colours is None else colours,
+            batched_scales=scales, batched_colors=_linear(np.full((count, 3), 128) if colours is None else colours),
             opacity=opacity, lod="off", flat_shading=True, cast_shadow=cast and len(self.stage.names) <= SHADOWS,
             receive_shadow=False,
         )  # fmt: skip
@@ -183,7 +198,11 @@ class SceneDrawing:
 
     def _lines(self, name: str, ends: Array, colours: Any = (140, 140, 140), thickness: float = 1.5) -> Any:  # noqa: ANN401
         return self._scene.add_line_segments(
-            f"{self._root}/{name}", ends.astype(np.float32), colours, thickness=thickness, thickness_units="screen"
+            f"{self._root}/{name}",
+            ends.astype(np.float32),
+            _linear(colours),
+            thickness=thickness,
+            thickness_units="screen",
         )
 
     # ------------------------------------------------------------------ what moves
@@ -309,9 +328,16 @@ def _same(handle: Any, pose: Array) -> bool:  # noqa: ANN401
     )
 
 
+def _linear(colours: Colours | Array | Colour) -> Colours:
+    """Colours as viser shows them unchanged: it takes those of lines and batches for linear light."""
+    return np.asarray(np.round(255.0 * (np.asarray(colours) / 255.0) ** 2.2), dtype=np.uint8)
+
+
 def _update(handle: Any, name: str, value: Array | Colours) -> None:  # noqa: ANN401
     """Sends an array if it differs from what was sent last."""
     last = getattr(handle, name)
+    if name in ("colors", "batched_colors"):
+        value = _linear(value.astype(np.uint8))
     value = value.astype(last.dtype)
     if last.shape != value.shape or not np.array_equal(last, value):
         setattr(handle, name, value)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from functools import partial
+from io import StringIO
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -15,7 +17,7 @@ import zenoh
 
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown
+from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
 from experiments.scene.stage import Condition, LinkTracker, Moment
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer, RobotReport
@@ -41,11 +43,17 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
     """
     import viser  # noqa: PLC0415 - an extra
 
-    server = viser.ViserServer(host=LOOPBACK, port=port, label=title, verbose=False)
+    with redirect_stdout(StringIO()):  # its own banner
+        server = viser.ViserServer(host=LOOPBACK, port=port, label=title, verbose=False)
     server.gui.configure_theme(
-        dark_mode=dark, show_logo=False, show_share_button=False, control_width="large", brand_color=(0, 114, 178)
+        dark_mode=dark,
+        show_logo=False,
+        show_share_button=False,
+        control_layout="collapsible",
+        control_width="large",
+        brand_color=(0, 114, 178),
     )
-    server.scene.set_up_direction("+z")
+    light(server)
     return server
 
 
@@ -53,10 +61,16 @@ def look_at(server: viser.ViserServer, size: Sequence[float], *, centre: Sequenc
     """Camera of pages that are opened from now on, and of those that are open: the whole of `size` x, y, z [m]."""
     x, y = centre[0], centre[1]
     reach = max(size[0], size[1])
-    place, at = (x - 0.75 * reach, y - 1.15 * reach, 0.85 * reach), (x, y, 0.12 * reach)
+    place, at = (x - 0.45 * reach, y - 0.9 * reach, 0.68 * reach), (x, y, 0.14 * reach)
     server.initial_camera.position, server.initial_camera.look_at = place, at
     for client in server.get_clients().values():
         client.camera.position, client.camera.look_at = place, at
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """Ends the page."""
+    with redirect_stdout(StringIO()):
+        server.stop()
 
 
 class ShowFolder:
@@ -102,7 +116,6 @@ class LiveView:
         self._errors = LinkTracker(self.observer.stage)
         if acting is not None:
             acting.build(server)
-        server.scene.configure_default_lights(cast_shadow=True)
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Draws at 30 Hz while a page is open, until `ended`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -56,7 +57,40 @@ def view(
     with on_termination(ended.set):
         if seconds is not None:
             threading.Timer(seconds, ended.set).start()
+        replayed = None if run is None else _recorded(Path(run))
+        if replayed is not None:
+            return _replay(replayed, ended, port=port, dark=dark, open_page=open_page)
         _live(_watched(connect, realm, lab, identity), ended, port=port, dark=dark, open_page=open_page)
+    return 0
+
+
+def _recorded(folder: Path) -> Path | None:
+    """The folder of a run, if it is over; None if the run is still up."""
+    from agents.runtime import run_registry
+
+    here = str(folder.absolute())
+    return None if any(run.folder == here and run.alive for run in run_registry.runs()) else folder
+
+
+def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
+    from experiments.recording import tracks
+    from experiments.recording.reader import RecordingError
+    from experiments.view import live, replay
+
+    if folder.suffix == ".mcap":
+        files = [folder]
+    else:
+        files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
+    if not files:
+        raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
+    films = [replay.Film(tracks.read(file)) for file in files]
+    server = live.open_server(port, "zenpark", dark=dark)
+    page = replay.ReplayView(server, films, str(folder), dark=dark)
+    _tell(server.get_port(), str(folder), open_page=open_page)
+    try:
+        page.run(ended.is_set)
+    finally:
+        live.close_server(server)
     return 0
 
 
@@ -106,7 +140,7 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
         try:
             page.run(ended.is_set)
         finally:
-            server.stop()
+            live.close_server(server)
 
 
 def _tell(port: int, what: str, *, open_page: bool) -> None:

@@ -1,0 +1,320 @@
+"""Replay of recordings in the live view's scene: a clock with play, pause, speed and a slider; cases side by side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from math import inf, nan
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from agents.arrays import Array, Index, Mask
+from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
+from agents.network.messages import EMERGENCY, Status
+from experiments.definition.formation import errors_over_time
+from experiments.recording.trace import ROUNDING_S
+from experiments.recording.tracks import LOST_S, Track, Tracks
+from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
+from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
+from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder, look_at
+from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row
+
+if TYPE_CHECKING:
+    import viser
+
+SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
+STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
+APART: Final = 0.15  # between words on the slider, in its lengths
+GAP: Final = 1.15  # from arena to arena, in its lengths
+
+
+class Film:
+    """A recorded case as moments."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        self.tracks, self.stage = tracks, Stage.of_experiment(tracks.experiment)
+        self._links = LinkTracker(self.stage)
+        self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
+
+    def moment(self, t: float) -> Moment:
+        """The case at `t` [s] since the common start: between two samples, positions are interpolated."""
+        tracks = self.tracks.tracks
+        at = [track.at(t) for track in tracks]
+        trail = np.stack([track.positions(t - self._ages) for track in tracks])
+        position = trail[:, 0]
+        conditions = np.array([_condition(track, k, t) for track, k in zip(tracks, at, strict=True)], dtype=np.intp)
+        attitude, shadow = _taken(tracks, at, "attitude", 4), _taken(tracks, at, "shadow", 3)
+        goal = _taken(tracks, at, "goal", 3)
+        goal[np.isin(conditions, (Condition.WAITING, Condition.DONE))] = nan
+        return Moment(
+            position=position,
+            yaw=_taken(tracks, at, "yaw", 1)[:, 0],
+            goal=goal,
+            condition=conditions,
+            silent_for=np.array([_since(track.sent, t) for track in tracks]),
+            error=self._links.errors(t, position),
+            broken=self._broken(conditions, t),
+            obstacles=self._obstacles(t),
+            trail=trail,
+            attitude=attitude if np.isfinite(attitude).any() else None,
+            shadow=shadow if np.isfinite(shadow).any() else None,
+            shadow_yaw=_taken(tracks, at, "shadow_yaw", 1)[:, 0],
+            time=t,
+        )
+
+    def rows(self, t: float) -> list[Row]:
+        """The table at `t` [s]."""
+        moment = self.moment(t)
+        errors = self._links.of_robots(moment.error)
+        return [
+            _row(name, track, Condition(int(moment.condition[k])), float(errors[k]), t)
+            for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True))
+        ]
+
+    def history(self) -> History:
+        """Errors and rates of the whole case, four times a second."""
+        tracks, stage = self.tracks, self.stage
+        history = History(len(stage.names))
+        grid = np.arange(tracks.begin, tracks.end, PLOT_S)
+        position = np.stack([track.positions(grid) for track in tracks.tracks], axis=1)
+        error = np.zeros((len(grid), len(stage.links)))
+        if stage.plan is not None and len(stage.links):
+            error = np.nan_to_num(errors_over_time(stage.plan.law, stage.plan.formation, grid, position))
+        sent = [np.searchsorted(each.sent, grid) - np.searchsorted(each.sent, grid - 1.0) for each in tracks.tracks]
+        history.time = grid.tolist()
+        history.error = [self._links.of_robots(each) for each in error]
+        history.rate = list(np.stack(sent, axis=1).astype(float))
+        return history
+
+    def _broken(self, conditions: Index, t: float) -> Mask:
+        """Links (E,) whose ends are gone, or whose sender the receiver misses."""
+        net, names = self.stage.links, self.stage.names
+        gone = np.isin(conditions, (Condition.SILENT, Condition.STOPPED, Condition.DEAD))
+        last = [_last(track.statuses, t) for track in self.tracks.tracks]
+        missing = {(row, name) for row, status in enumerate(last) if status is not None for name in status.missing}
+        named = [(i, names[j]) in missing for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
+        return np.asarray(gone[net.sender] | gone[net.receiver] | np.array(named, dtype=bool))
+
+    def _obstacles(self, t: float) -> Array:
+        scene = self.stage.scene
+        pose = scene.at(t)
+        said = [each for each in self.tracks.world if each.stamp <= t]
+        for each in said[-1].obstacles if said else []:
+            if each.name in scene.names and scene.plans[k := scene.names.index(each.name)] is None:
+                pose[k] = each.pose
+        return pose
+
+
+def _condition(track: Track, sample: int, t: float) -> Condition:
+    """Condition of a robot by its sample and its last status."""
+    if sample < 0:
+        return Condition.WAITING
+    phase, status = int(track.phase[sample]), _last(track.statuses, t)
+    if status is not None and status.reason.startswith(EMERGENCY):
+        return Condition.STOPPED
+    if t - track.time[sample] > LOST_S and phase != DONE:
+        return Condition.DEAD if sample == len(track.time) - 1 else Condition.SILENT
+    known = {IDLE: Condition.WAITING, READY: Condition.WAITING, LANDING: Condition.LANDING, DONE: Condition.DONE}
+    held = status is not None and status.hazard.startswith("hold")
+    return known.get(phase, Condition.HELD if held else Condition.ACTIVE)
+
+
+def _last(statuses: Sequence[Status], t: float) -> Status | None:
+    """The last status at or before `t` [s]."""
+    low, high = 0, len(statuses)
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if statuses[middle].stamp <= t else (low, middle)
+    return statuses[low - 1] if low else None
+
+
+def _since(sent: Array, t: float) -> float:
+    """Time since the last of some events at or before `t` [s]."""
+    k = int(np.searchsorted(sent, t + ROUNDING_S, side="right"))
+    return t - float(sent[k - 1]) if k else inf
+
+
+def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) -> Array:
+    """A column of the samples `at` (N, width); unknown before the first."""
+    blank = np.full(width, nan)
+    rows = [np.atleast_1d(getattr(track, name)[k]) if k >= 0 else blank for track, k in zip(tracks, at, strict=True)]
+    return np.array(rows, dtype=float).reshape(-1, width)
+
+
+def _row(name: str, track: Track, condition: Condition, error: float, t: float) -> Row:
+    status = _last(track.statuses, t)
+    rate = float(np.searchsorted(track.sent, t, side="right") - np.searchsorted(track.sent, t - 1.0, side="right"))
+    if status is None:
+        return Row(name, condition, error, rate)
+    note = status.hazard or (status.reason if condition > Condition.DONE else "")
+    return Row(name, condition, error, rate, status.battery, status.missed, None, note)
+
+
+class Clock:
+    """Time of a replay or a paced run: plays, pauses, goes by steps, at any speed."""
+
+    def __init__(self, begin: float, end: float, t: float = 0.0) -> None:
+        self.begin, self.end, self.t = begin, end, t  # [s]
+        self.playing, self.speed, self.loop = False, 1.0, False
+
+    def advance(self, elapsed: float) -> None:
+        """`elapsed` [s] have passed outside; at the end it stops, or begins again."""
+        if not self.playing:
+            return
+        self.t += self.speed * elapsed
+        if self.t >= self.end:
+            self.t = self.begin if self.loop else self.end
+            self.playing = self.loop
+
+    def toggle(self) -> None:
+        """Play, from the beginning if it is at the end, or pause."""
+        if not self.playing and self.t >= self.end:
+            self.t = self.begin
+        self.playing = not self.playing
+
+    def seek(self, t: float) -> None:
+        self.t = min(max(t, self.begin), self.end)
+
+
+class ReplayView:
+    """The page of the recordings of a run."""
+
+    def __init__(self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool) -> None:
+        """Draws all cases beside one another.
+
+        Args:
+            server: From `live.open_server`.
+            films: The cases, at least one.
+            where: Which run it is, for people.
+            dark: Dark colours.
+        """
+        self._server, self._films, self._where = server, list(films), where
+        self.clock = Clock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
+        self._drawn: object = None
+        self._tabled = -inf
+        self._build_controls()
+        self._panel = Panel(server)
+        self._show = ShowFolder(server)
+        self._shown = -1
+        look = DARK if dark else LIGHT
+        self._drawings = []
+        sizes = [film.stage.scene.high - film.stage.scene.low for film in films]
+        pitch = GAP * max(float(size[0]) for size in sizes)
+        with server.atomic():
+            for k, film in enumerate(films):
+                drawing = SceneDrawing(server, film.stage, look, root=f"/case{k}")
+                drawing.offset = ((k - 0.5 * (len(films) - 1)) * pitch, 0.0, 0.0)
+                drawing.shown = self._show.shown
+                if len(films) > 1:
+                    drawing.name(film.tracks.case)
+                self._drawings.append(drawing)
+        largest = np.max(sizes, axis=0)
+        look_at(server, (float(largest[0]) + 0.55 * pitch * (len(films) - 1), float(largest[1]), float(largest[2])))
+        self._histories = [film.history() for film in films]
+        self._choose(0)
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Draws at 30 Hz while a page is open and something moves, until `ended`."""
+        before = time.monotonic()
+        while not ended():
+            now = time.monotonic()
+            self.clock.advance(now - before)
+            before = now
+            pages = bool(self._server.get_clients())
+            if pages:
+                self.draw()
+            time.sleep(max(0.001, now + (FRAME_S if pages else IDLE_S) - time.monotonic()))
+
+    def draw(self) -> None:
+        """Draws the present time, if it is not drawn already."""
+        t = self.clock.t
+        shown = tuple(vars(self._show.shown).values())
+        if (t, shown) == self._drawn:
+            return
+        self._drawn = (t, shown)
+        with self._server.atomic():
+            for film, drawing in zip(self._films, self._drawings, strict=True):
+                drawing.draw(film.moment(min(t, film.tracks.end)))
+        now = time.monotonic()
+        if not self.clock.playing or now - self._tabled >= TABLE_S:
+            self._tabled = now
+            self._tabulate(t)
+
+    # ------------------------------------------------------------------ controls
+
+    def _build_controls(self) -> None:
+        import viser  # noqa: PLC0415 - an extra
+
+        gui, clock = self._server.gui, self.clock
+        with gui.add_folder("Replay", order=5.0):
+            self._slider: Any = gui.add_slider(
+                "time [s]", min=round(clock.begin, 2), max=max(round(clock.end, 2), round(clock.begin, 2) + STEP_S),
+                step=STEP_S, initial_value=0.0, marks=marks(self._films),
+            )  # fmt: skip
+            self._play = gui.add_button("Play (Space)", icon=viser.Icon.PLAYER_PLAY)
+            steps = gui.add_button_group("step", ("-1 s", "-1", "+1", "+1 s"))
+            speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+            if len(self._films) > 1:
+                case = gui.add_dropdown("table of", tuple(film.tracks.case for film in self._films))
+                case.on_update(self._choose_case)
+        self._slider.on_update(self._seek)
+        self._play.on_click(lambda _: self.clock.toggle())
+        steps.on_click(lambda event: self._step(event.target.value))
+        speed.on_update(lambda event: setattr(self.clock, "speed", float(event.target.value)))
+        key = gui.add_command("Play or pause", hotkey="space", icon=viser.Icon.PLAYER_PLAY)
+        key.on_trigger(lambda _: self.clock.toggle())
+
+    def _seek(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:  # moved by a hand, not by the clock
+            self.clock.playing = False
+            self.clock.seek(float(event.target.value))
+
+    def _step(self, what: str) -> None:
+        self.clock.playing = False
+        by = float(what.split(maxsplit=1)[0]) * (1.0 if what.endswith("s") else STEP_S)
+        self.clock.seek(self.clock.t + by)
+
+    def _choose_case(self, event: viser.GuiEvent[Any]) -> None:
+        self._choose([film.tracks.case for film in self._films].index(event.target.value))
+
+    def _choose(self, number: int) -> None:
+        """Shows table and plots of one case."""
+        self._shown = number
+        self._panel.set_stage(self._films[number].stage)
+        self._drawn = None
+
+    def _tabulate(self, t: float) -> None:
+        film, history, panel = self._films[self._shown], self._histories[self._shown], self._panel
+        tracks = film.tracks
+        if abs(self._slider.value - t) > 0.5 * STEP_S:
+            self._slider.value = round(t, 2)
+        said = [event for event in tracks.events if event.stamp <= t]
+        phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
+        panel.show_head(f"{tracks.case}: {phase}", t, tracks.experiment.duration_s, self._where)
+        panel.show_robots(film.rows(min(t, tracks.end)))
+        panel.show_events(said, 0.0)
+        first, last = np.searchsorted(history.time, (t - HISTORY_S, t))
+        first = min(int(first), int(last) - 2)
+        if first >= 0:
+            window = slice(first, int(last))
+            for name in ("time", "error", "rate"):
+                setattr(panel.history, name, getattr(history, name)[window])
+            panel.show_plots()
+
+
+def marks(films: Sequence[Film]) -> tuple[Any, ...]:
+    """Events on the slider: phases of the first case with their words, incidents of all as points."""
+    worded = [(event.stamp, event.text) for event in films[0].tracks.events if event.kind == "phase"]
+    begin, end = min(film.tracks.begin for film in films), max(film.tracks.end for film in films)
+    found: dict[float, Any] = {}
+    for film in films:
+        for event in film.tracks.events:
+            if event.kind in ("hazard", "lost", "stop", "order", "contact") and begin <= event.stamp <= end:
+                found[round(event.stamp, 1)] = round(event.stamp, 2)
+    last = -inf
+    for stamp, text in worded:
+        if begin <= stamp <= end and stamp - last >= APART * (end - begin):  # words must not overlap
+            last = stamp
+            found[round(stamp, 1)] = (round(stamp, 2), text.removesuffix(" under way").removesuffix(" (interrupted)"))
+    return tuple(found.values())

@@ -1,0 +1,122 @@
+"""Replay of a recording: tracks that say what the trace says, the clock of the page, and what it shows at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.file.document import load
+from experiments.recording import tracks
+from experiments.recording.playback import NotStarted
+from experiments.recording.reader import RecordingError
+from experiments.run import simulate
+from experiments.scene.stage import Condition
+from experiments.view.panel import History, Row, event_list, table
+from experiments.view.replay import Clock, Film, marks
+
+GUIDED = ("architecture=centralised",)
+
+
+@pytest.fixture(scope="module", params=[(), GUIDED], ids=["distributed", "centralised"])
+def flown(request, tmp_path_factory):
+    """A recorded run, as the trace in memory and as a replay."""
+    folder = tmp_path_factory.mktemp("run")
+    short = load("robotic-park", "duration_s=3.0", "timeline=[]", *request.param)
+    run = simulate(short, cases=["event"], folder=folder)
+    return run.traces["event"], folder / "event.mcap"
+
+
+def test_positions_are_those_of_the_recording(flown):
+    trace, file = flown
+    film = Film(tracks.read(file))
+    assert film.tracks.robots == trace.robots
+    for k in range(0, len(trace.time), 17):
+        moment = film.moment(float(trace.time[k]))
+        assert moment.position == pytest.approx(trace.true_position[k], abs=1e-6)
+        assert np.cos(moment.yaw - trace.yaw[k]) == pytest.approx(1.0, abs=1e-3)
+        assert moment.goal == pytest.approx(trace.goal[k], abs=1e-6)
+    between = float(trace.time[20] + trace.time[21]) / 2
+    middle = (trace.true_position[20] + trace.true_position[21]) / 2
+    assert film.moment(between).position == pytest.approx(middle, abs=1e-6)
+
+
+def test_transmissions_are_those_of_the_recording(flown):
+    trace, file = flown
+    read = tracks.read(file)
+    for row, track in enumerate(read.tracks):
+        sent = track.sent[(track.sent >= -1e-6) & (track.sent < 3.0 - 1e-6)]
+        assert sent == pytest.approx(np.sort(trace.sent_by(row).stamp), abs=1e-5)
+    assert [event.kind for event in read.events if event.kind in ("start", "phase")]
+
+
+def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(flown, tmp_path):
+    _, file = flown
+    whole = tracks.read(file)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[: int(0.7 * file.stat().st_size)])
+    assert 0.0 < tracks.read(cut).end < whole.end
+    (tmp_path / "none.mcap").write_bytes(b"nothing")
+    with pytest.raises(RecordingError, match="not an MCAP file"):
+        tracks.read(tmp_path / "none.mcap")
+    assert issubclass(NotStarted, RecordingError)
+
+
+def test_conditions_follow_the_phases(flown):
+    film = Film(tracks.read(flown[1]))
+    assert (film.moment(1.0).condition == Condition.ACTIVE).all()
+    assert (film.moment(film.tracks.begin - 1.0).condition == Condition.WAITING).all()
+    assert set(film.moment(film.tracks.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
+
+
+def test_history_has_errors_and_rates_of_the_whole_case(flown):
+    film = Film(tracks.read(flown[1]))
+    history = film.history()
+    k = int(np.searchsorted(history.time, 2.0))
+    moment = film.moment(history.time[k])
+    assert history.error[k] == pytest.approx(film._links.of_robots(moment.error), abs=1e-6)
+    assert sum(rate.sum() for rate in history.rate) > 0
+
+
+def test_the_clock_plays_pauses_and_ends():
+    clock = Clock(-2.0, 10.0)
+    clock.advance(1.0)
+    assert clock.t == 0.0
+    clock.toggle()
+    clock.speed = 5.0
+    clock.advance(1.0)
+    assert (clock.t, clock.playing) == (5.0, True)
+    clock.advance(3.0)
+    assert (clock.t, clock.playing) == (10.0, False)
+    clock.toggle()
+    assert (clock.t, clock.playing) == (-2.0, True)
+    clock.loop = True
+    clock.seek(99.0)
+    clock.advance(1.0)
+    assert (clock.t, clock.playing) == (-2.0, True)
+
+
+def test_phases_stand_on_the_slider(flown):
+    film = Film(tracks.read(flown[1]))
+    worded = [mark[1] for mark in marks([film]) if isinstance(mark, tuple)]
+    assert "landing" in worded
+
+
+def test_curves_of_many_robots_are_three():
+    history = History(40)
+    for t in range(60):
+        history.add(float(t), np.arange(40.0), np.zeros(40))
+    time, most, median, least = history.curves(history.error)
+    assert (time[0], time[-1], len(time)) == (-30.0, 0.0, 31)
+    assert (most[0], median[0], least[0]) == (39.0, 19.5, 0.0)
+
+
+def test_the_table_shows_the_worst_first_and_escapes_names(flown):
+    stage = Film(tracks.read(flown[1])).stage
+    rows = [Row(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
+    rows[3] = Row("<b>", Condition.DEAD, note="<script>")
+    text = table(rows, stage)
+    assert text.index("&lt;b&gt;") < text.index("R29") < text.index("R28")
+    assert "<script>" not in text
+    assert "and 10 more" in text
+    assert " R10<" not in text
+    assert "none yet" in event_list([], None)
