@@ -139,6 +139,25 @@ class Agent:
         """Order to go on after a hold."""
         self._ordered[row] = False
 
+    def go(self, row: int, goal: tuple[float, float], t: float) -> str:
+        """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
+
+        The robot moves as on a leg of its plan: avoidance, setpoint filter and hazards are the same.
+        """
+        assignment = self.assignment
+        phase = Phase(self.lifecycle.phase[row])
+        if phase != RUNNING:
+            return f"cannot go anywhere while {phase.word}"
+        if self._guided[row]:
+            return "its goals are the central controller's"
+        if not self.goal_computer.leads(row):
+            return "it follows its neighbours: only a leader can be sent somewhere"
+        low, high = assignment.limits.low, assignment.limits.high
+        if not all(low[k] <= goal[k] <= high[k] for k in range(2)):
+            return f"x = {goal[0]:g} m, y = {goal[1]:g} m is outside the arena"
+        self.goal_computer.redirect(row, goal, t, 0.5 * assignment.kinds[row].speed)
+        return ""
+
     def start(self, row: int, at: float, t: float = -np.inf, origin: Setpoint | None = None) -> str:
         """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
 

@@ -15,7 +15,7 @@ from agents.decision.control_updates import ControlUpdates, ControlView
 from agents.decision.neighbours import NeighbourStates
 from agents.formation.changes import Reshaping
 from agents.plugins import laws
-from agents.plugins.planners import Itinerary
+from agents.plugins.planners import Itinerary, Leg, Waypoints
 from agents.plugins.registry import FAILURES, PluginError
 
 
@@ -67,6 +67,7 @@ class GoalComputer:
         if len(rest):  # neither law nor plan: stay in place
             itineraries.append(Itinerary(rest, (), holds_before=True))
         self._itineraries = tuple(itineraries)
+        self._detours: dict[int, tuple[float, Itinerary]] = {}  # since when [s], by row
         self._gated = self._uses_law & ~planned  # a plan moves its target at every decision
 
     def update_links(self, t: float) -> None:
@@ -95,6 +96,15 @@ class GoalComputer:
         for itinerary in self._itineraries:
             mine = itinerary.rows
             itinerary.target(elapsed[mine], position[mine], heading[mine])
+
+    def leads(self, row: int) -> bool:
+        """Whether a row has neither links nor anchors: it follows a plan, or stays."""
+        return not self._uses_law[row]
+
+    def redirect(self, row: int, goal: tuple[float, float], t: float, speed: float) -> None:
+        """Sends a row that leads to x, y [m] instead of along its plan, from `t` [s] on, at `speed` [m/s]."""
+        way = Leg(0.0, Waypoints(points=[list(goal)], speed_=speed))
+        self._detours[row] = t, Itinerary(np.array([row]), (way,), holds_before=False)
 
     def origin(self, row: int) -> tuple[float, float, float, float] | None:
         """x, y, z [m] and yaw [rad] at which the plan of a row began; None without plan, or before."""
@@ -142,6 +152,8 @@ class GoalComputer:
                 goal[rows] = target
             else:
                 offset[rows] += laws.tracking_offset(position[rows], target, self.tracking_gain)
+        for row, (since, way) in self._detours.items():
+            goal[[row]], goal_yaw[[row]] = way.target(np.array([t - since]), place[[row]], yaw[[row]])
         goal = np.where(follows[:, None], laws.goal_position(position, offset, self.clamp), goal)
         goal[:, 2] = np.where(follows | ~self._flies, self.ground, goal[:, 2])
         return GoalDecision(due, goal, offset, goal_yaw)

@@ -18,7 +18,7 @@ import msgspec
 Vector = tuple[float, float, float]
 Setpoint = tuple[float, float, float, float]
 Encoding = Literal["json", "msgpack"]
-OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set", "inspect"]
+OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set", "inspect", "go"]
 ChangeKind = Literal["pause", "resume", "remove", "restart", "replace", "add"]
 
 JSON: Final = "application/json"  # plain, without a schema suffix: REST and command-line tools then print it
@@ -275,6 +275,7 @@ class Order(Message, frozen=True):
     at: float | None = None  # [s] UTC of a start
     name: str | None = None  # of the parameter to get or set
     value: float | None = None  # of the parameter to set
+    goal: tuple[float, float] | None = None  # x, y [m] of go: where a leader goes, in a straight line
     # of a start: `Status.origin` of the robot's former process; its plan goes on from there
     origin: Setpoint | None = None
 

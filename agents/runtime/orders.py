@@ -24,8 +24,10 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
     match order.order:
         case "takeoff":
             return agent.lifecycle.takeoff(row), None
-        case "start":
-            return _start(agent, row, order, t, utc), None
+        case "start" | "go":
+            return (
+                _start(agent, row, order, t, utc) if order.order == "start" else _go(agent, row, order.goal, t)
+            ), None
         case "hold":
             return _hold(agent, row), None
         case "resume":
@@ -55,6 +57,12 @@ def _resume(agent: Agent, row: int) -> str:
     if agent.lifecycle.reason[row] == PAUSED:
         agent.lifecycle.reason[row] = ""
     return ""
+
+
+def _go(agent: Agent, row: int, goal: tuple[float, float] | None, t: float) -> str:
+    if goal is None or not all(map(isfinite, goal)):
+        return "an order to go needs a `goal`, x and y in metres"
+    return agent.go(row, goal, t)
 
 
 def _start(agent: Agent, row: int, order: Order, t: float, utc: float) -> str:

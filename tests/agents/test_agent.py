@@ -7,6 +7,8 @@ from agents.agent import Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, IDLE, READY, RUNNING
 from agents.decision.neighbours import NeighbourPoses
+from agents.network.messages import Order
+from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, Leg, Robot, Start
 from experiments.definition.plan import Plan
 from tests.agents.few import pair, triangle
@@ -287,6 +289,30 @@ def test_a_leader_follows_its_plan(kind):
     swarm.run(6.0)
     np.testing.assert_allclose(swarm.row("L", "goal") - begin, [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(swarm.row("L", "truth"), begin + np.array([0.3, 0.0, 0.0]), atol=0.006)
+
+
+def test_a_leader_goes_where_it_is_sent_and_a_follower_does_not():
+    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.5})), [["L"], ["F"]])
+    order = Order("go", goal=(0.2, 0.1))
+    assert "cannot go anywhere while idle" in carry_out(swarm.agent("L"), 0, order, 0.0, 0.0)[0]
+    swarm.running()
+    for wrong, why in (
+        (Order("go", goal=(9.0, 0.0)), "outside the arena"),
+        (Order("go"), "needs a `goal`"),
+        (Order("go", goal=(float("nan"), 0.0)), "needs a `goal`"),
+    ):
+        assert why in carry_out(swarm.agent("L"), 0, wrong, swarm.t, 0.0)[0]
+    assert "only a leader" in carry_out(swarm.agent("F"), 0, order, swarm.t, 0.0)[0]
+    assert carry_out(swarm.agent("L"), 0, order, swarm.t, 0.0) == ("", None)
+    swarm.run(0.5)
+    gone = np.linalg.norm(swarm.row("L", "goal"))
+    assert 0.0 < gone < 0.5 * 0.5 * 0.28  # it goes at half its speed, not at once
+    swarm.run(8.0)
+    np.testing.assert_allclose(swarm.row("L", "truth")[:2], [0.2, 0.1], atol=0.006)
+    carry_out(swarm.agent("L"), 0, Order("go", goal=(0.0, 0.1)), swarm.t, 0.0)
+    swarm.run(8.0)
+    np.testing.assert_allclose(swarm.row("L", "truth")[:2], [0.0, 0.1], atol=0.006)
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def order(
     from agents.network.keys import Keys
     from experiments.real_time.conductor import orders
 
-    kinds = [kind for kind in get_args(messages.OrderKind) if kind not in ("get", "set", "inspect")]
+    kinds = [kind for kind in get_args(messages.OrderKind) if kind not in ("get", "set", "inspect", "go")]
     if what not in kinds:
         print(f"zenpark: no order '{what}'; there are: {', '.join(kinds)}", file=sys.stderr)
         return 2

@@ -19,7 +19,8 @@ ALIVE = {"alive": True, "age_s": 0.1}
 
 def status(phase: str = "running", **fields: object) -> messages.Status:
     zero = dict.fromkeys(
-        ("sent", "received", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"), 0
+        ("sent", "received", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"),
+        0,
     )
     return messages.Status(
         **{"robot": "CF01", "stamp": 0.0, "phase": phase, "reason": "", "body": "", "battery": None, "lost": {},
