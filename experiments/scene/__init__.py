@@ -1,4 +1,4 @@
-"""Scene in three dimensions: what is drawn of a case at one moment, as arrays; its meshes; and its drawing with viser.
+"""Scene in three dimensions: what is drawn of a case at one moment, its meshes, tracks of a recording, and the drawing.
 
-Imports experiments/definition and what lies below; only `drawing` needs viser. Live view, replay and report share it.
+Imports experiments/recording and what lies below; only `drawing` needs viser. Live view, replay and report share it.
 """

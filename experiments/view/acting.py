@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -29,6 +30,8 @@ REASON: Final = "button of zenpark view"
 SETTLED_S: Final = 0.4  # after the last move of a slider or target its value is sent
 SLIDERS: Final = 6
 NOTE_S: Final = 8.0
+LEADERS: Final = 5  # most that are dragged
+HELD_S: Final = 1.5  # until the goal that a leader reports is the one that it was sent to
 LAST: Final = "Repeat it with `zenpark estop`, or cut the power."
 
 
@@ -73,7 +76,9 @@ class Acting:
         self._alive: Sequence[str] = ()
         self._stage = Stage.of_robots(())
         self._parts: list[Any] = []  # of the present stage
-        self._target: Any = None
+        self._targets: dict[str, Any] = {}  # by leader
+        self._held_until = -inf  # [s, monotonic] targets stay where they were dragged
+        self._dragged = False
         self._due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
         self._lock = threading.Lock()
 
@@ -97,13 +102,16 @@ class Acting:
             ):  # fmt: skip
                 button = gui.add_button(text, icon=icon)
                 button.on_click(partial(self._give, messages.Order(what)))  # type: ignore[arg-type]
+            drag = gui.add_checkbox("Drag the leaders' targets", initial_value=False)
+            drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
     def set_stage(self, stage: Stage) -> None:
         """Another case: its parameters."""
         self._stage = stage
-        for part in self._parts:
+        for part in (*self._parts, *self._targets.values()):
             part.remove()
-        self._parts = []
+        self._parts, self._targets = [], {}
+        self._show_targets(shown=self._dragged)
         if stage.plan is None:
             return
         with self._folder:
@@ -116,6 +124,11 @@ class Acting:
         """Takes in the present state, and gives orders that waited for a control to rest."""
         self._alive = alive
         now = time.monotonic()
+        if now > self._held_until:
+            for name, target in list(self._targets.items()):
+                goal = moment.goal[self._stage.names.index(name)]
+                if np.isfinite(goal).all() and np.abs(target.position - goal).max() > 1e-3:
+                    target.position = goal
         with self._lock:
             due = [name for name, (at, _) in self._due.items() if now >= at]
             ready = [self._due.pop(name)[1] for name in due]
@@ -127,10 +140,12 @@ class Acting:
     def emergency_stop(self) -> None:
         """Cuts the motors of all robots of the run, and says which run it was and what answered."""
         stop = messages.encode(messages.Stop(self._watched.identity, REASON))
-        self._urgent.put(stop)
         sent = orders.EmergencyStop(self._watched.endpoints, self._watched.realm, self._watched.identity)
         sent.run = self._watched.run
-        sent.send(REASON)
+        sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)  # the session here may be blocked
+        sending.start()
+        self._urgent.put(stop)
+        sending.join()
         if sent.failure is not None:
             said, bad = f"NOT known to have stopped: {sent.failure}. {LAST}", True
         elif sent.moving:
@@ -141,6 +156,34 @@ class Acting:
             said, bad = f"no robot is seen. {LAST}", True
         self._record("emergency stop", said)
         self._note("Emergency stop", f"{sent.where}: {said}", bad=bad, stays=True)
+
+    def _show_targets(self, *, shown: bool) -> None:
+        """Handles at the goals of the leaders, by which they are dragged."""
+        self._dragged = shown
+        for target in self._targets.values():
+            target.remove()
+        self._targets = {}
+        for name in self._stage.leaders[:LEADERS] if shown else ():
+            target = self._server.scene.add_transform_controls(
+                f"/targets/{name}", scale=0.25, active_axes=(True, True, False), disable_rotations=True,
+                depth_test=False, position=(0.0, 0.0, -1000.0),
+            )  # fmt: skip
+            target.on_update(partial(self._drag, name))
+            self._targets[name] = target
+
+    def _drag(self, name: str, event: Any) -> None:  # noqa: ANN401 - viser's own type
+        if event.client is None:
+            return
+        x, y, _ = event.target.position
+        self._held_until = time.monotonic() + SETTLED_S + HELD_S
+        order = messages.Order("go", goal=(float(x), float(y)))
+        self._later(name, lambda: self._send(name, order))
+
+    def _send(self, name: str, order: messages.Order) -> None:
+        assert order.goal is not None
+        x, y = order.goal
+        replies = orders.send_order(self._session, self._keys, [name], order)
+        self._report(f"{name} to x = {x:.2f} m, y = {y:.2f} m", replies)
 
     def _give(self, order: messages.Order, _: object = None) -> None:
         """Gives an order to all robots that are there, and says what they answered."""

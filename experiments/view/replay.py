@@ -14,9 +14,9 @@ from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
 from agents.network.messages import EMERGENCY, Status
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
-from experiments.recording.tracks import LOST_S, Track, Tracks
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
+from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder, look_at
 from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row
 

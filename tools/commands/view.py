@@ -73,8 +73,8 @@ def _recorded(folder: Path) -> Path | None:
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
-    from experiments.recording import tracks
     from experiments.recording.reader import RecordingError
+    from experiments.scene import tracks
     from experiments.view import live, replay
 
     if folder.suffix == ".mcap":

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.file.document import load
-from experiments.recording import tracks
 from experiments.recording.playback import NotStarted
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate
+from experiments.scene import tracks
 from experiments.scene.stage import Condition
 from experiments.view.panel import History, Row, event_list, table
 from experiments.view.replay import Clock, Film, marks

@@ -1,0 +1,115 @@
+"""Chromium as a test drives it: a page of the view, the requests that it makes, and the scene that arrives in it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zstandard
+
+from tests.waiting import PATIENCE_S
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = (
+    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)  # fmt: skip
+
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
+
+
+class Page:
+    """A page that is open."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.hosts: set[str] = set()  # of all its requests, `host:port`
+        self.nodes: dict[str, dict[str, Any]] = {}  # properties of the scene's nodes, as they arrived last
+        self.texts: list[str] = []  # of messages that carry text: notifications
+        page.on("request", lambda request: self.hosts.add(request.url.split("/")[2] if "//" in request.url else ""))
+        page.on("websocket", self._listen)
+
+    def _listen(self, socket: Any) -> None:
+        self.hosts.add(socket.url.split("/")[2])
+        socket.on("framereceived", lambda data: self._receive(data) if isinstance(data, bytes) else None)
+
+    def _receive(self, data: bytes) -> None:
+        """Messages as viser packs them: sizes, compressed msgpack, then the arrays, each aligned to eight bytes."""
+        size, packed = (int.from_bytes(data[k : k + 8], "little") for k in (0, 8))
+        inner = msgspec.msgpack.decode(
+            zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], max_output_size=size)
+        )
+        at, arrays = -(-(16 + packed) // 8) * 8, []
+        for length in inner["binaryBufferLengths"]:
+            arrays.append(data[at : at + length])
+            at += -(-length // 8) * 8
+        for message in inner["messages"]:
+            self._take(message, arrays)
+
+    def _take(self, message: dict[str, Any], arrays: list[bytes]) -> None:
+        kind, name = message.get("type", ""), message.get("name", "")
+        if kind == "NotificationMessage":
+            self.texts.append(str(message))
+        if not name:
+            return
+        node = self.nodes.setdefault(name, {})
+        given = message.get("updates") or message.get("props") or {}
+        if kind == "SetPositionMessage":
+            given = {"position": message["position"]}
+        for key, value in given.items():
+            node[key] = _array(value, arrays)
+
+    def positions(self, name: str) -> np.ndarray:
+        """Positions (N, 3) of the copies of a batched mesh [m]."""
+        return np.frombuffer(self.nodes[name]["batched_positions"], dtype="<f4").reshape(-1, 3)
+
+    def until(self, true: Any, what: str, limit_s: float = PATIENCE_S) -> None:
+        """Waits, and lets the page's messages in meanwhile."""
+        left = limit_s
+        while not true():
+            assert left > 0.0, f"not in {limit_s:g} s: {what}"
+            self.page.wait_for_timeout(50)
+            left -= 0.05
+
+    def frames_per_second(self, seconds: float = 2.0) -> float:
+        """Frames that the page draws."""
+        script = """seconds => new Promise(resolve => {
+            let count = 0; const begun = performance.now();
+            const frame = now => {
+                count += 1;
+                now - begun > 1000 * seconds ? resolve(count / (now - begun) * 1000) : requestAnimationFrame(frame);
+            };
+            requestAnimationFrame(frame);
+        })"""
+        return float(self.page.evaluate(script, seconds))
+
+    def button(self, text: str) -> Any:
+        return self.page.get_by_role("button", name=text)
+
+
+def _array(value: Any, arrays: list[bytes]) -> Any:
+    """A property, an array as its bytes."""
+    if isinstance(value, dict) and any("inary" in key for key in value):
+        (index,) = (each for key, each in value.items() if isinstance(each, int))
+        return arrays[index]
+    return value
+
+
+@contextmanager
+def opened(address: str, width: int = 900, height: int = 600) -> Iterator[Page]:
+    """A page in a browser of its own."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
+        try:
+            page = Page(browser.new_page(viewport={"width": width, "height": height}))
+            page.page.goto(address, wait_until="commit")
+            yield page
+        finally:
+            browser.close()
