@@ -103,6 +103,7 @@ class Run:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
+Watch = Callable[[str, Experiment], Callable[[simulation.Instant], object]]  # of a case
 
 
 def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: Path | None = None) -> Run:
@@ -128,17 +129,21 @@ def simulate_seeds(
     cases: Sequence[str] = (),
     folder: Path | None = None,
     progress: Progress = lambda *_: None,
+    watch: Watch = lambda *_: lambda _: None,
 ) -> list[Run]:
     """As `simulate`, once for each seed, side by side; recordings are made of the first seed only.
 
-    `progress` is called repeatedly.
+    `progress` is called repeatedly. `watch` gives for each case what its simulation calls, see `simulation.simulate`.
     """
     _refuse_too_much(read.experiment, len(seeds))
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = standby.without_standby(experiment)  # noqa: PLW2901
         log = simulation.simulate(
-            experiment, seeds, progress=partial(_pass_progress, progress, name, experiment.duration_s)
+            experiment,
+            seeds,
+            progress=partial(_pass_progress, progress, name, experiment.duration_s),
+            watch=watch(name, experiment),
         )
         _pass_progress(progress, name, experiment.duration_s, math.inf)
         for copy in range(len(seeds)):

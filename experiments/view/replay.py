@@ -177,6 +177,25 @@ class Clock:
         self.t = min(max(t, self.begin), self.end)
 
 
+def add_transport(server: viser.ViserServer, clock: Clock, steps: tuple[str, ...]) -> None:
+    """Adds play and pause, also by the space bar, steps of a sample or so many seconds, and the speed."""
+    import viser  # noqa: PLC0415 - an extra
+
+    def step(event: viser.GuiEvent[Any]) -> None:
+        what = str(event.target.value)
+        clock.playing = False
+        clock.seek(clock.t + float(what.split(maxsplit=1)[0]) * (1.0 if what.endswith("s") else STEP_S))
+
+    play = server.gui.add_button("Play / pause (Space)", icon=viser.Icon.PLAYER_PLAY)
+    play.on_click(lambda _: clock.toggle())
+    server.gui.add_button_group("step", steps).on_click(step)
+    given = f"{clock.speed:g}"
+    speed = server.gui.add_dropdown("speed", tuple(dict.fromkeys((*SPEEDS, given))), initial_value=given)
+    speed.on_update(lambda event: setattr(clock, "speed", float(event.target.value)))
+    key = server.gui.add_command("Play or pause", hotkey="space", icon=viser.Icon.PLAYER_PLAY)
+    key.on_trigger(lambda _: clock.toggle())
+
+
 class ReplayView:
     """The page of the recordings of a run."""
 
@@ -244,36 +263,22 @@ class ReplayView:
     # ------------------------------------------------------------------ controls
 
     def _build_controls(self) -> None:
-        import viser  # noqa: PLC0415 - an extra
-
         gui, clock = self._server.gui, self.clock
         with gui.add_folder("Replay", order=5.0):
             self._slider: Any = gui.add_slider(
                 "time [s]", min=round(clock.begin, 2), max=max(round(clock.end, 2), round(clock.begin, 2) + STEP_S),
                 step=STEP_S, initial_value=0.0, marks=marks(self._films),
             )  # fmt: skip
-            self._play = gui.add_button("Play (Space)", icon=viser.Icon.PLAYER_PLAY)
-            steps = gui.add_button_group("step", ("-1 s", "-1", "+1", "+1 s"))
-            speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+            add_transport(self._server, clock, ("-1 s", "-1", "+1", "+1 s"))
             if len(self._films) > 1:
                 case = gui.add_dropdown("table of", tuple(film.tracks.case for film in self._films))
                 case.on_update(self._choose_case)
         self._slider.on_update(self._seek)
-        self._play.on_click(lambda _: self.clock.toggle())
-        steps.on_click(lambda event: self._step(event.target.value))
-        speed.on_update(lambda event: setattr(self.clock, "speed", float(event.target.value)))
-        key = gui.add_command("Play or pause", hotkey="space", icon=viser.Icon.PLAYER_PLAY)
-        key.on_trigger(lambda _: self.clock.toggle())
 
     def _seek(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:  # moved by a hand, not by the clock
             self.clock.playing = False
             self.clock.seek(float(event.target.value))
-
-    def _step(self, what: str) -> None:
-        self.clock.playing = False
-        by = float(what.split(maxsplit=1)[0]) * (1.0 if what.endswith("s") else STEP_S)
-        self.clock.seek(self.clock.t + by)
 
     def _choose_case(self, event: viser.GuiEvent[Any]) -> None:
         self._choose([film.tracks.case for film in self._films].index(event.target.value))

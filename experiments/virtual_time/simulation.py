@@ -16,6 +16,7 @@ import numpy as np
 
 from agents.agent import Agent
 from agents.arrays import Array, Index, Mask, PoseTable, some
+from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.safety.hazards import Incident
 from experiments.definition import bodies
@@ -24,7 +25,7 @@ from experiments.definition.plan import Plan
 from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from twins.body import TwinBody
-from twins.engines.engine import Touch
+from twins.engines.engine import Engine, Touch
 
 STATE: Final = ("position", "velocity", "yaw", "true_position", "true_yaw")  # columns from the state of the bodies
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that exist in all samples or in none
@@ -68,6 +69,17 @@ class Log:
     incidents: tuple[Incident, ...] = ()  # hazards of robots
 
 
+@dataclass(frozen=True)
+class Instant:
+    """Present state of a run in virtual time, for those who watch it; nothing in it may be changed."""
+
+    time: float  # [s] since the common start; NaN before it is known
+    now: float  # [s] of the clock of the decision
+    agent: Agent
+    state: BodyState
+    engine: Engine  # of the bodies
+
+
 def simulate(
     experiment: Experiment,
     seeds: Sequence[int],
@@ -75,6 +87,7 @@ def simulate(
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
+    watch: Callable[[Instant], object] = lambda _: None,
 ) -> Log:
     """Flies one case of an experiment once for each seed.
 
@@ -85,6 +98,7 @@ def simulate(
             other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
         progress: Called at state_hz with the time of the experiment [s]; NaN before its start is known.
+        watch: Called at state_hz, and as slow as it likes.
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
@@ -124,6 +138,7 @@ def simulate(
         touches += twin.touches()
         if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
             progress(t - conductor.start_at)
+            watch(Instant(t - conductor.start_at, t, agent, state, twin.engine))
             sample = {
                 **{what: getattr(state, what) for what in (*STATE, *OPTIONAL)},
                 "phase": agent.lifecycle.phase.copy(),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from tools.commands import view as viewing
 from tools.commands.options import (
     Anyway,
     As,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from experiments.file.document import Document
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording.run_folder import RunOrigin
-    from experiments.run import Run
+    from experiments.run import Run, Watch
 
 app: Final = typer.Typer()
 
@@ -64,6 +65,10 @@ def run(
     ] = None,
     lab: Lab = None,
     identity: As = "operator",
+    view: Annotated[bool, typer.Option("--view", help="Shows it in the browser, in three dimensions.")] = False,
+    pace: Annotated[
+        float | None, typer.Option(min=0.01, max=100.0, help="Of --virtual --view: so many times as fast. [1]")
+    ] = None,
 ) -> int:
     """Run an experiment: one process per robot, or in virtual time; a bundle repeats its run."""
     from experiments.file.problems import DocumentError, Problem
@@ -85,7 +90,7 @@ def run(
         anyway=anyway,
         tags=tag or [],
     )
-    show = _Shown(out, as_json, report, open_report)
+    show = _Shown(out, as_json, report, open_report, view, pace)
     if not bundle.is_bundle(file):
         return _run(origin, options, show)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
@@ -102,6 +107,8 @@ class _Shown:
     as_json: bool
     report: bool
     open_report: bool
+    view: bool
+    pace: float | None  # simulated seconds in one second, in a view
 
 
 def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
@@ -111,6 +118,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
 
     read = load(origin.file, *origin.changes)
     _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
+    _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
     chosen(read, options.cases)
     if not sound(read, seeds=origin.seeds) and not origin.anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
@@ -120,9 +128,11 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         read.keep(folder / SOURCE)
         with _kept_origin(folder, origin, read, options):
             if origin.virtual:
-                runs, stopped, code = _simulate(read, folder, options, origin.seeds), "", 0
+                with viewing.paced(show.pace or 1.0) if show.view else nullcontext(lambda *_: lambda _: None) as watch:
+                    runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch), "", 0
             else:
-                runs, stopped, code = _conduct(read, folder, options, quiet=show.as_json)
+                with viewing.following(folder, options.identity) if show.view else nullcontext():
+                    runs, stopped, code = _conduct(read, folder, options, quiet=show.as_json)
         if not runs:
             return code
         if not runs[0].traces:
@@ -217,7 +227,19 @@ def _report_failures(runs: Sequence[Run]) -> int:
     return FAILED if found else 0
 
 
-def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> list[Run]:
+def _refuse_view(show: _Shown, *, virtual: bool, seeds: int) -> None:
+    """Raise DocumentError for a view that there cannot be, before anything is started."""
+    from experiments.file.problems import DocumentError, Problem
+
+    if show.pace is not None and not (virtual and show.view):
+        raise DocumentError([Problem("--pace", 0, 0, "is for --virtual --view", "add both, or leave it out")])
+    if show.view:
+        viewing.require_viser()
+        if seeds > 1:
+            raise DocumentError([Problem("--seeds", 0, 0, "one run is viewed", "leave out --view or --seeds")])
+
+
+def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch) -> list[Run]:
     """Run in virtual time, one run for each seed from the file's on."""
     from experiments.run import simulate_seeds
     from tools.progress import Bar
@@ -230,6 +252,7 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int) -> 
             cases=options.cases,
             folder=folder,
             progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+            watch=watch,
         )
 
 

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
 from tools.commands.options import Connect, Lab, Realm, routers
 
 if TYPE_CHECKING:
+    from agents.runtime.run_registry import Run
+    from experiments.run import Watch
     from experiments.view.acting import Watched
 
 app: Final = typer.Typer()
 
 PORT: Final = 8080
+START_S: Final = 30.0  # until a run that was started just now is registered
+POLL_S: Final = 0.1
 
 
 class ViewError(RuntimeError):
@@ -42,34 +47,85 @@ def view(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of the page; the next free one if it is taken.")] = PORT,
     dark: Annotated[bool, typer.Option("--dark", help="Dark colours.")] = False,
     open_page: Annotated[bool, typer.Option("--open", help="Opens it in the browser.")] = False,
+    with_run: Annotated[
+        bool, typer.Option("--with-run", hidden=True, help="Waits for the run, and ends with it.")
+    ] = False,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")] = None,
 ) -> int:
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
-    try:
-        import viser  # noqa: F401
-    except ImportError:
-        raise ViewError(
-            "the view needs viser: ./zenpark view installs it; elsewhere `pip install zenpark[view]`"
-        ) from None
+    require_viser()
     from agents.runtime.command_line import on_termination
 
     ended = threading.Event()
     with on_termination(ended.set):
         if seconds is not None:
             threading.Timer(seconds, ended.set).start()
-        replayed = None if run is None else _recorded(Path(run))
-        if replayed is not None:
-            return _replay(replayed, ended, port=port, dark=dark, open_page=open_page)
-        _live(_watched(connect, realm, lab, identity), ended, port=port, dark=dark, open_page=open_page)
+        up = None if run is None else _up(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
+        if run is not None and up is None:
+            return _replay(Path(run), ended, port=port, dark=dark, open_page=open_page)
+        watched = _watched(connect, realm, lab, identity) if up is None else _of_run(up, identity)
+        _live(watched, ended, port=port, dark=dark, open_page=open_page, with_run=with_run)
     return 0
 
 
-def _recorded(folder: Path) -> Path | None:
-    """The folder of a run, if it is over; None if the run is still up."""
+def require_viser() -> None:
+    """Check that the library of the view is installed.
+
+    Raises:
+        ViewError: If it is not.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("viser") is None:
+        raise ViewError("the view needs viser: `./zenpark view` installs it; elsewhere `pip install zenpark[view]`")
+
+
+@contextmanager
+def following(folder: Path, identity: str) -> Iterator[None]:
+    """Inside, a run that begins is shown by a process of its own, which ends with it."""
+    import subprocess
+
+    command = [sys.executable, "-m", "tools.guard", "view", str(folder), "--with-run", "--open", "--as", identity]
+    # its address is for people: standard output may be JSON
+    viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sys.stderr, start_new_session=True)
+    try:
+        yield
+    finally:
+        viewer.terminate()
+        viewer.wait()
+
+
+@contextmanager
+def paced(pace: float) -> Iterator[Watch]:
+    """Inside, runs in virtual time are shown in this process, `pace` times as fast as they would be in real time."""
+    from experiments.view import live
+    from experiments.view.paced import PacedView
+
+    server = live.open_server(PORT, "zenpark", dark=False)
+    try:
+        _tell(server.get_port(), "virtual time: begins when the page is open", open_page=True, to=sys.stderr)
+        yield PacedView(server, pace=pace, dark=False).begin
+    finally:
+        live.close_server(server)
+
+
+def _up(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
+    """The run of a folder, if it is up, or is within `wait_s` [s]."""
+    import time
+
     from agents.runtime import run_registry
 
-    here = str(folder.absolute())
-    return None if any(run.folder == here and run.alive for run in run_registry.runs()) else folder
+    here, deadline = str(folder.absolute()), time.monotonic() + wait_s
+    while True:
+        found = next((run for run in run_registry.runs() if run.folder == here and run.alive), None)
+        if found is not None or time.monotonic() >= deadline or ended.wait(POLL_S):
+            return found
+
+
+def _of_run(run: Run, identity: str | None) -> Watched:
+    from experiments.view.acting import Watched
+
+    return Watched(run.endpoints, run.realm, identity or _usual(run.endpoints), run)
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
@@ -113,8 +169,7 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
         )
     if len(up) > 1:
         print(f"zenpark: {len(up)} runs are up; this is the newest one", file=sys.stderr)
-    newest = up[-1]
-    return Watched(newest.endpoints, newest.realm, identity or _usual(newest.endpoints), newest)
+    return _of_run(up[-1], identity)
 
 
 def _usual(endpoints: Sequence[str]) -> str:
@@ -124,7 +179,7 @@ def _usual(endpoints: Sequence[str]) -> str:
     return "operator" if lab_of(endpoints) is None else "observer"
 
 
-def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> None:
+def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, open_page: bool, with_run: bool) -> None:
     from agents.network.session import open_session
     from agents.network.shutdown import held
     from experiments.view import live
@@ -138,15 +193,15 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
         declared.append(page)
         _tell(server.get_port(), watched.words, open_page=open_page)
         try:
-            page.run(ended.is_set)
+            page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
         finally:
             live.close_server(server)
 
 
-def _tell(port: int, what: str, *, open_page: bool) -> None:
+def _tell(port: int, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
     import webbrowser
 
     address = f"http://127.0.0.1:{port}"
-    print(f"{address}  {what}", flush=True)
+    print(f"{address}  {what}", flush=True, file=to)
     if open_page:
         webbrowser.open(address)
