@@ -13,10 +13,9 @@ from experiments.report.page import Row as Line
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import front, pareto
 from experiments.sweep.sweep import SweepResult
-from experiments.sweep.table import CellRow, figure, short, with_interval, words_of
+from experiments.sweep.table import NONE, NUMBERS, CellRow, numbers, short, with_interval, words_of
 
 PAGE: Final = "sweep.html"
-NONE: Final = "–"
 MOST_LINES: Final = 40  # of a table that stands open
 LEVELS: Final = (1.01, 1.02, 1.05)  # of IAE: the fewest messages within each are named
 TERMS: Final = (
@@ -105,15 +104,11 @@ def verdict(tuned: TuningResult) -> list[Finding]:
 def table(rows: Sequence[CellRow]) -> Table:
     """The cells for people."""
     paths = list(dict.fromkeys(path for row in rows for path in row.parameters))
-    head = ("Case", *map(short, paths), "f [Hz]", "Messages", "IAE", "ITAE", "Acquired", "Gap", "Lost")
+    head = ("Case", *map(short, paths), *NUMBERS)
     lines = []
     for row in rows:
         values = [words_of(row.parameters[path]) if path in row.parameters else NONE for path in paths]
-        ratios = [with_interval(row.ratio[index]) for index in ("messages", "iae", "itae")]
-        acquired = NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %"
-        gap = NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f} ms"
-        f, dropped = figure(row.mean["f_hz"].mean), figure(row.mean["dropped"].mean)
-        lines.append(Line((row.case, *values, f, *ratios, acquired, gap, dropped), sum=row.reference))
+        lines.append(Line((row.case, *values, *numbers(row)), sum=row.reference))
     reference = next((row.case for row in rows if row.reference), "the reference")
     return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
 

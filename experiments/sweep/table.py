@@ -15,7 +15,7 @@ from experiments.sweep.runs import Figures
 
 MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
 RATIOS: Final = ("messages", "iae", "itae", "rmse")
-NONE: Final = "-"
+NONE: Final = "–"
 
 
 class CellRow(msgspec.Struct, frozen=True):
@@ -98,22 +98,27 @@ def write_json(path: Path, table: Mapping[str, Any]) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
 
 
+NUMBERS: Final = ("f [Hz]", "messages ratio", "IAE ratio", "ITAE ratio", "acquired", "gap [ms]", "dropped")  # heads
+
+
+def numbers(row: CellRow) -> tuple[str, ...]:
+    """The main numbers of a cell for people: those of `NUMBERS`; messages, IAE and ITAE are ratios."""
+    return (
+        figure(row.mean["f_hz"].mean),
+        *(with_interval(row.ratio[index]) for index in ("messages", "iae", "itae")),
+        NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %",
+        NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}",
+        figure(row.mean["dropped"].mean),
+    )
+
+
 def text(rows: Sequence[CellRow]) -> list[str]:
     """The main columns, for the terminal."""
-    head = (
-        "case",
-        "parameters",
-        "seeds",
-        "f [Hz]",
-        "messages ratio",
-        "IAE ratio",
-        "ITAE ratio",
-        "acquired",
-        "gap [ms]",
-        "dropped",
-    )
-    lines = [head, *(_cells(each) for each in rows)]
-    width = [max(len(line[k]) for line in lines) for k in range(len(head))]
+    lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *NUMBERS)]
+    for row in rows:
+        seeds = str(row.seeds) + (f" ({row.failed} failed)" if row.failed else "")
+        lines.append((row.case, row.words, seeds, *numbers(row)))
+    width = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [
         "  ".join(cell.ljust(width[k]) if k < 2 else cell.rjust(width[k]) for k, cell in enumerate(line)).rstrip()
         for line in lines
@@ -135,23 +140,6 @@ def with_interval(value: Spread) -> str:
     if value.mean is None:
         return NONE
     return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ±{value.ci95:.3f}")
-
-
-def _cells(each: CellRow) -> tuple[str, ...]:
-    acquired = NONE if each.acquired is None else f"{100.0 * each.acquired:.0f} %"
-    seeds = str(each.seeds) + (f" ({each.failed} failed)" if each.failed else "")
-    return (
-        each.case,
-        each.words,
-        seeds,
-        figure(each.mean["f_hz"].mean),
-        with_interval(each.ratio["messages"]),
-        with_interval(each.ratio["iae"]),
-        with_interval(each.ratio["itae"]),
-        acquired,
-        NONE if each.gap_min_s is None else f"{1e3 * each.gap_min_s:.0f}",
-        figure(each.mean["dropped"].mean),
-    )
 
 
 def words_of(value: object) -> str:

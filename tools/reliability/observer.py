@@ -11,12 +11,12 @@ import zenoh
 
 from agents.arrays import Array, norm
 from agents.body.kinds import KINDS
-from agents.formation.graph import BY_DISTANCE, BY_RELATIVE
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.messages import Command
 from experiments.definition.experiment import Experiment
+from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
 
 TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of poses
@@ -44,15 +44,11 @@ class Invariants:
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
         self.position: Array = np.full((len(row), 3), np.nan)
-        links = [link for link in Plan(experiment).one_way_links if np.isinf(link.reach)]
-        self._links = links
-        self._receiver = np.array([row[link.receiver] for link in links], dtype=np.intp)
-        self._sender = np.array([row[link.sender] for link in links], dtype=np.intp)
-        self._distance = np.array([link.wanted.distance for link in links])
-        self._relative = np.array([link.wanted.relative for link in links]).reshape(-1, 3)
-        self._bearing = np.array([link.wanted.bearing for link in links]).reshape(-1, 3)
-        self._wants = np.array([link.wanted.wants for link in links])
-        self._span = np.array([(link.since, link.until) for link in links]).reshape(-1, 2)
+        plan = Plan(experiment)
+        self._law, formation = plan.law, plan.formation
+        if formation.presence is not None:  # links by range may end at any time
+            formation = formation.select(np.flatnonzero(np.isinf(formation.presence.reach)))
+        self._formation = formation
         self.nearest = np.inf  # [m] between surfaces of any two robots, so far
         self._wrong: set[str] = set()
 
@@ -94,29 +90,20 @@ class Invariants:
         return [f"{self.names[first[k]]} and {self.names[second[k]]} overlap" for k in np.flatnonzero(both).tolist()]
 
     def formation_error(self, live: Collection[str], t: float) -> float:
-        """The largest error of the links between robots that live [m, or rad of a direction]; 0 without any.
+        """The largest error [m] of links between robots that live, as their law measures it; 0 without any.
 
         Args:
             live: Robots that are under way.
             t: Since the common start [s].
         """
         here = np.array([name in live for name in self.names])
-        there = here[self._receiver] & here[self._sender] & (self._span[:, 0] <= t) & (t < self._span[:, 1])
-        if not there.any():
-            return 0.0
-        apart = self.position[self._receiver] - self.position[self._sender]
-        by_distance = np.abs(norm(apart) - self._distance)
-        planar = np.where(np.isfinite(self._relative), apart - self._relative, 0.0)
-        known = np.isfinite(self._bearing)
-        direction = np.where(known, apart, 0.0)
-        length = norm(direction)
-        cosine = np.where(known, direction * self._bearing, 0.0).sum(axis=1) / np.where(length > 0.0, length, 1.0)
-        by_bearing = np.arccos(np.clip(cosine, -1.0, 1.0))
-        error = np.where(
-            self._wants == BY_DISTANCE, by_distance, np.where(self._wants == BY_RELATIVE, norm(planar), by_bearing)
-        )
-        error = np.where(np.isnan(error), np.inf, error)
-        return float(error[there].max())
+        links = self._formation.links
+        counted = here[links.receiver] & here[links.sender]
+        position = self.position[np.union1d(links.receiver[counted], links.sender[counted])]
+        if not np.isfinite(position).all():
+            return np.inf
+        error = errors_over_time(self._law, self._formation, np.array([t]), self.position[None])[0]
+        return float(np.where(counted & np.isfinite(error), error, 0.0).max(initial=0.0))
 
     def invalid_command(self, command: Command) -> str:
         """The fault of a command to a body; empty if it has none."""
