@@ -17,7 +17,7 @@ from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, rea
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
 from experiments.report import figures, scenery
-from experiments.report.page import Finding, PageFigure, Section, date_of, numbered, render, seeds_in_words
+from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
     architecture_table,
@@ -63,6 +63,8 @@ NETWORK: Final = (
     "The effects that the file asks of the network, on top of the real network's own: dropped poses did arrive, and "
     "were discarded. Delays are from the stamp of a pose to its arrival, whatever caused them."
 )
+GAPS: Final = "Between two transmissions within the run; silence before the first and after the last is not counted."
+BELIEF: Final = "Distance of the last pose received on each link, carried on by the prediction, from the true one."
 MOST_LINKS: Final = 60  # longer tables are folded
 
 
@@ -122,30 +124,15 @@ def write(
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        *_of_architecture(cases),
+        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)]),
         Section("Figures", pictures=drawn),
         Section("Each robot", tables=robot_tables(cases)),
-        Section(
-            "Was anything lost?",
-            (PROOF,),
-            proof_tables(cases),
-        ),
-        *_modelled(cases),
-        Section(
-            "Time between transmissions",
-            prose=(
-                "Between two transmissions within the run; silence before the first and after the last is not counted.",
-            ),
-            tables=(gaps_table(cases),),
-        ),
-        Section(
-            "Belief of neighbours",
-            ("Distance of the last pose received on each link, carried on by the prediction, from the true one.",),
-            (links_table(cases),),
-            folded="Show all links" if len(cases[0].belief) > MOST_LINKS else "",
-        ),
+        Section("Was anything lost?", (PROOF,), proof_tables(cases)),
+        *_tables("What the modelled network did", NETWORK, network_tables(cases)),
+        *_tables("Time between transmissions", GAPS, [gaps_table(cases)]),
+        *_tables("Belief of neighbours", BELIEF, [links_table(cases)]),
         *_of_worlds(cases, first, len(drawn)),
-        *_of_clocks(first),
+        *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("What happened", tables=(events_table(first),)),
         Section("The experiment", listing=listing, folded="Show the file"),
         Section("Definitions", terms=DEFINITIONS),
@@ -202,11 +189,11 @@ def compare(
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        *_of_architecture(cases),
+        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)]),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
         Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
-        *_modelled(cases),
+        *_tables("What the modelled network did", NETWORK, network_tables(cases)),
         Section("Definitions", terms=DEFINITIONS),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -222,12 +209,11 @@ def compare(
     )
 
 
-def _modelled(cases: Sequence[CaseMetrics]) -> list[Section]:
-    """Effects of the modelled network, where there is one."""
-    tables = network_tables(cases)
-    many = any(len(table.rows) > MOST_LINKS for table in tables)
-    title, folded = "What the modelled network did", "Show all links" if many else ""
-    return [Section(title, (NETWORK,), tables, folded=folded)] if tables else []
+def _tables(title: str, prose: str, tables: Iterable[Table | None]) -> list[Section]:
+    """A section of tables with rows, folded if they are long; none without any."""
+    shown = tuple(table for table in tables if table is not None and table.rows)
+    folded = "Show all links" if any(len(table.rows) > MOST_LINKS for table in shown) else ""
+    return [Section(title, (prose,), shown, folded=folded)] if shown else []
 
 
 def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
@@ -255,19 +241,6 @@ def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[Pa
     }
     drawn = figures.every(cases, traces)
     return numbered((figure, captions[name]) for name, figure in drawn.items())
-
-
-def _of_architecture(cases: Sequence[CaseMetrics]) -> list[Section]:
-    """Architecture, if not each robot decides for itself."""
-    table = architecture_table(cases)
-    return [] if table is None else [Section("Architecture", (ARCHITECTURE,), (table,))]
-
-
-def _of_clocks(traces: Sequence[Trace]) -> list[Section]:
-    """Clock offsets of other machines, where robots ran on any."""
-    if not any(trace.clocks for trace in traces):
-        return []
-    return [Section("Clocks of other machines", (CLOCKS,), (clocks_table(traces),))]
 
 
 def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
