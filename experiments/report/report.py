@@ -221,7 +221,7 @@ def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
     kept = read_origin(folder)
     if kept is None and now.command and not (folder / ORIGIN).exists():
         keep_origin(folder, now)
-    return kept or now
+    return kept if kept is not None and kept.date else now  # another file of that name has no date
 
 
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[PageFigure, ...]:
