@@ -72,6 +72,36 @@ class Row:
 
 
 @app.command()
+def watchdog(
+    robot: Annotated[
+        str | None, typer.Argument(metavar="[USER@ROBOT]", help="TurtleBot3 that ssh reaches; none: print the file.")
+    ] = None,
+    *,
+    namespace: Annotated[str, typer.Option(help="Namespace of the robot's nodes, such as tb3_0.")] = "",
+    domain: Annotated[int, typer.Option(min=0, max=232, help="ROS_DOMAIN_ID of the robot.")] = 30,
+    silence: Annotated[
+        float, typer.Option(min=0.1, max=5.0, help="Stop it after so long without a command [s].")
+    ] = 0.5,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove it.")] = False,
+) -> None:
+    """Install a watchdog on a TurtleBot3, which stops it when no command arrives."""
+    from agents.protocols import turtlebot3
+    from experiments.real_time.hosts import robot_watchdog
+
+    if robot is None:
+        sys.stdout.write(robot_watchdog.FILE.read_text("utf-8"))
+        return
+    at = turtlebot3.address(robot, f"ros2dds://{namespace}", turtlebot3.TurtleBot3Settings())
+    said = (
+        robot_watchdog.remove(robot)
+        if remove
+        else robot_watchdog.install(robot, namespace=at.namespace, domain=domain, silence_s=silence)
+    )
+    for line in said:
+        print(f"{robot}: {line}")
+
+
+@app.command()
 def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
     """Say whether each host can take part: version, clock, devices, certificates, router."""
     from experiments.definition import endpoints

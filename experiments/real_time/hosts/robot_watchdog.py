@@ -1,0 +1,106 @@
+"""Install the watchdog of `bridges.turtlebot3.watchdog` on a robot, or remove it; over ssh, without zenpark there."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Final
+
+from bridges.turtlebot3 import watchdog
+from experiments.real_time.hosts import ssh
+from experiments.real_time.hosts.hosts import HostError
+
+INSTALL_S: Final = 120.0
+FOLDER: Final = "zenpark-watchdog"  # in the home folder on the robot
+FILE: Final = Path(watchdog.__file__)
+
+# $0 is the folder, $1 the namespace, $2 the domain, $3 the silence [s]; the file comes on standard input
+PUT: Final = """set -eu
+folder=$HOME/$0
+setup=$(ls -d /opt/ros/*/setup.sh 2>/dev/null | tail -n 1 || true)
+[ -n "${ROS_SETUP:-$setup}" ] || { echo "there is no ROS 2 under /opt/ros" >&2; exit 3; }
+mkdir -p "$folder"
+cat > "$folder/watchdog.py.new"
+mv "$folder/watchdog.py.new" "$folder/watchdog.py"
+cat > "$folder/run" <<END
+#!/bin/sh
+# Keeps the watchdog running; started at boot by cron, ended by: touch $folder/stop
+exec 9> "$folder/lock"
+flock -n 9 || exit 0
+rm -f "$folder/stop"
+. "${ROS_SETUP:-$setup}"
+export ROS_DOMAIN_ID=$2 PYTHONUNBUFFERED=1
+while [ ! -e "$folder/stop" ]; do
+    python3 "$folder/watchdog.py" --silence $3 --ros-args -r __ns:=/$1 > "$folder/log" 2>&1 9>&- &
+    echo \\$! > "$folder/pid"
+    wait \\$! || true
+    sleep 1
+done
+END
+chmod +x "$folder/run"
+touch "$folder/stop"
+[ ! -e "$folder/pid" ] || kill "$(cat "$folder/pid")" 2>/dev/null || true
+flock -w 10 "$folder/lock" true || { echo "the former watchdog does not end: see $folder" >&2; exit 4; }
+rm -f "$folder/pid" "$folder/log"
+nohup "$folder/run" > /dev/null 2>&1 < /dev/null &
+if command -v crontab > /dev/null; then
+    { crontab -l 2>/dev/null | grep -v "$folder/run" || true; echo "@reboot $folder/run"; } | crontab -
+    echo "it is started at each boot (crontab -l)"
+else
+    echo "there is no cron: start $folder/run at each boot yourself"
+fi
+for _ in $(seq 150); do
+    if grep -q "watches" "$folder/log" 2>/dev/null; then grep "watches" "$folder/log" | tail -n 1; exit 0; fi
+    sleep 0.1
+done
+echo "it does not come up:" >&2; tail -n 5 "$folder/log" >&2; exit 5
+"""
+
+REMOVE: Final = """set -eu
+folder=$HOME/$0
+[ -d "$folder" ] || { echo "there is none"; exit 0; }
+touch "$folder/stop"
+[ ! -e "$folder/pid" ] || kill "$(cat "$folder/pid")" 2>/dev/null || true
+if command -v crontab > /dev/null; then { crontab -l 2>/dev/null | grep -v "$folder/run" || true; } | crontab -; fi
+flock -w 10 "$folder/lock" true
+rm -rf "$folder"
+echo "removed"
+"""
+
+
+def install(robot: str, *, namespace: str, domain: int, silence_s: float) -> list[str]:
+    """Install the watchdog and start it; returns what there is to say.
+
+    Args:
+        robot: Address as ssh takes it.
+        namespace: Of the robot's ROS nodes, without slashes around it; may be empty.
+        domain: ROS_DOMAIN_ID.
+        silence_s: Without a command for so long the robot is stopped [s].
+
+    Raises:
+        HostError: If the robot cannot be reached, has no ROS 2, or the watchdog does not come up.
+    """
+    return _run(robot, PUT, [FOLDER, namespace, str(domain), f"{silence_s:g}"])
+
+
+def remove(robot: str) -> list[str]:
+    """Stop the watchdog and remove it; returns what there is to say.
+
+    Raises:
+        HostError: As `install`.
+    """
+    return _run(robot, REMOVE, [FOLDER])
+
+
+def _run(robot: str, text: str, words: list[str]) -> list[str]:
+    command = ssh.script(robot, text, words)
+    try:
+        done = subprocess.run(command, input=FILE.read_bytes(), capture_output=True, timeout=INSTALL_S, check=False)
+    except subprocess.TimeoutExpired:
+        raise HostError(f"{robot}: did not answer within {INSTALL_S:g} s; try it by hand: ssh {robot}") from None
+    errors = done.stderr.decode(errors="replace").strip()
+    if done.returncode == ssh.BROKEN:
+        raise HostError(f"{robot}: {ssh.explained(robot, '', errors)}")
+    if done.returncode:
+        raise HostError(f"{robot}: {errors}")
+    return done.stdout.decode(errors="replace").splitlines()
