@@ -63,3 +63,28 @@ def test_ctrl_c_lands_the_robot_that_hops(tmp_path: Path) -> None:
     hop = next(check for check in json.loads(out)["robots"][0]["checks"] if check["check"] == "hop")
     assert (hop["verdict"], hop["found"]) == ("unknown", "interrupted; it is down")
     assert log.read_text().rstrip().splitlines()[-1].startswith("CF01: done")
+
+
+DRONES = """
+title = "A Crazyflie by radio and a Tello, under motion capture"
+duration_s = 30.0
+[robots]
+CF01 = { kind = "crazyflie", start = [0.0, -0.6, 0.0], hover = 0.5 }
+T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }
+"""
+
+
+@pytest.mark.timeout(150)
+def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path: Path) -> None:
+    (tmp_path / "drones.toml").write_text(DRONES)
+    command = [sys.executable, "-m", "tools.guard", "preflight", str(tmp_path / "drones.toml"), "--json", "--hop"]
+    done = subprocess.run(
+        [*command, "--bodies", "protocol", "--out", str(tmp_path / "out")],
+        cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=140,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    drone, tello = ({check["check"]: check for check in robot["checks"]} for robot in json.loads(done.stdout)["robots"])
+    assert {drone[name]["verdict"] for name in ("address", "firmware", "battery", "position", "radio", "hop")} == {"ok"}
+    assert " V under load" in drone["hop"]["found"]
+    assert tello["hop"]["verdict"] == "ok"
+    assert "of 0.8 m high" in tello["hop"]["found"]

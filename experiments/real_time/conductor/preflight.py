@@ -18,6 +18,7 @@ from typing import Final
 import msgspec
 
 from agents.body.interface import UNANSWERED
+from agents.body.kinds import TELLO
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
@@ -53,7 +54,7 @@ STANDS_M_S: Final = 0.02  # slower: a robot on wheels stands
 class Trials:
     """What is tried beyond observing; both touch the motors."""
 
-    hop: bool = False  # drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`
+    hop: bool = False  # drones hop to `HOP_M` (see `alone`), robots on wheels drive `DRIVE_M`
     stop: bool = False  # emergency stop of a drone that begins to climb, of a robot on wheels that drives
 
 
@@ -97,10 +98,16 @@ def check_robots(
 
 
 def alone(experiment: Experiment) -> Experiment:
-    """The robots of a case without formation and plans: drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`."""
+    """The robots of a case without formation and plans: drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`.
+
+    A Tello climbs to a height of its own before it obeys, and is not sent down to `HOP_M` from there.
+    """
     robots = {
         name: msgspec.structs.replace(
-            robot, hover=None if robot.hover is None else min(HOP_M, robot.hover), shadow=None, standby=False
+            robot,
+            hover=robot.hover if robot.hover is None or robot.kind == TELLO.name else min(HOP_M, robot.hover),
+            shadow=None,
+            standby=False,
         )
         for name, robot in experiment.robots.items()
     }

@@ -23,6 +23,7 @@ Verdict = Literal["ok", "warn", "bad", "unknown"]
 
 HOP_M: Final = 0.2  # height of the hop
 HOP_OFF_M: Final = 0.08  # farther from this height on average: bad
+HELD: Final = 25  # last states of a hop, by which its height is measured
 HOP_DRIFT_M: Final = 0.2  # a hop that ends farther to the side is bad
 DRIVE_M: Final = 0.1  # way of the drive of a robot on wheels
 DRIVE_OFF_M: Final = 0.03  # farther from this way: bad
@@ -276,7 +277,7 @@ def _stop(what: str, observed: Observed, tried: Tried) -> Check:
 
 
 def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
-    """Hop of a drone to `HOP_M`, or drive of a robot on wheels by `DRIVE_M`; the battery under load."""
+    """Hop of a drone to its `hover`, or drive of a robot on wheels by `DRIVE_M`; the battery under load."""
     what = hop_of(observed.robot)
     load = _charged(tried.charge, tried.volts)
     loaded = f"; battery {load} under load" if load else ""
@@ -289,9 +290,10 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
     if what == "drive":
         said, remedy = f"{side:.3f} m of {DRIVE_M:g} m{loaded}", _drive_remedy(side)
     else:
-        height = float(positions[:, 2].max() - positions[0, 2])
-        said = f"{height:.2f} m of {HOP_M:g} m high, {side:.2f} m to the side{loaded}"
-        remedy = _hop_remedy(height, side)
+        wanted = observed.robot.hover or HOP_M
+        height = float(np.median(positions[-HELD:, 2]) - positions[0, 2])
+        said = f"{height:.2f} m of {wanted:g} m high, {side:.2f} m to the side{loaded}"
+        remedy = _hop_remedy(height - wanted, side)
     if not remedy and tried.charge < safety.battery_low:
         remedy = BATTERY.get(observed.robot.kind, "charge it")
     return Check(check=what, verdict="bad" if remedy else "ok", found=said, remedy=remedy)
@@ -310,9 +312,9 @@ def _drive_remedy(way: float) -> str:
     return "its speed is not what it is told: units and wheel sizes of its server, slipping wheels" if wrong else ""
 
 
-def _hop_remedy(height: float, side: float) -> str:
-    """What to do about a hop of `height` [m] that went `side` [m] to the side; nothing if that is right."""
-    if abs(height - HOP_M) > HOP_OFF_M:
+def _hop_remedy(above: float, side: float) -> str:
+    """What to do about a hop `above` its height [m] and `side` [m] to the side; nothing if that is right."""
+    if abs(above) > HOP_OFF_M:
         return "does not keep its height: propellers, battery, trim, height of its positioning system"
     drifts = side > HOP_DRIFT_M
     return (

@@ -10,7 +10,7 @@ import pytest
 
 from agents.body.limits import Safety
 from agents.network.messages import Inspection, State, Status
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import preflight_checks as checks
@@ -18,18 +18,15 @@ from experiments.real_time.conductor.preflight import alone
 from experiments.real_time.conductor.preflight_checks import Observed, Tried
 
 TODAY = date(2026, 3, 1)
-DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.8, body="radio://0/80/2M/E7E7E7E701")
+DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body="radio://0/80/2M/E7E7E7E701")
 OTHER = Robot(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body="radio://0/80/2M/E7E7E7E702")
 WHEELS = Robot(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
 
 
 def status(**values) -> Status:
-    zeros = dict.fromkeys(
-        ("sent", "heard", "malformed", "refused", "ticks", "missed", "decisions", "interventions", "avoided", "pid"), 0
-    )
-    numbers = {"stamp": 0.0, "late_s": 0.0, "started": 0.0, "cpu_s": 0.0, "rss_mb": 0.0}
-    given = {"robot": "CF01", "phase": "ready", "reason": "", "body": "", "battery": 0.9}
-    return Status(**{**zeros, **numbers, **given, "lost": {}, "dropped": {}, "missing": [], **values})
+    nothing = {str: "", int: 0, float: 0.0, dict[str, int]: {}, list[str]: []}
+    empty = {each.name: nothing.get(each.type) for each in msgspec.structs.fields(Status) if each.required}
+    return Status(**{**empty, "robot": "CF01", "phase": "ready", "battery": 0.9, **values})
 
 
 def states(*places, yaw: float | None = 0.0) -> list[State]:
@@ -166,7 +163,7 @@ def test_a_robot_on_wheels_that_rolls_on_after_the_stop():
     ],
 )
 def test_hops_and_drives(robot, end, verdict, remedy):
-    tried = Tried(states=states((0.0, 0.5, 0.0), end), volts=3.7, charge=0.6)
+    tried = Tried(states=states((0.0, 0.5, 0.0), end, end), volts=3.7, charge=0.6)
     made = checks.hop(standing(robot), tried, Safety())
     assert made.verdict == verdict
     assert made.remedy.startswith(remedy)
@@ -174,7 +171,7 @@ def test_hops_and_drives(robot, end, verdict, remedy):
 
 
 def test_a_battery_that_sags_under_load():
-    tried = Tried(states=states((0.0, 0.5, 0.0), (0.0, 0.5, 0.2)), charge=0.05)
+    tried = Tried(states=states((0.0, 0.5, 0.0), (0.0, 0.5, 0.2), (0.0, 0.5, 0.2)), charge=0.05)
     assert checks.hop(standing(), tried, Safety()).verdict == "bad"
 
 
@@ -185,3 +182,9 @@ def test_robots_are_checked_without_formation_and_low():
     assert len(plan.links) == 0
     assert {case.robots[leg.robot].kind for leg in case.timeline} == {"khepera4", "turtlebot3"}
     assert {robot.hover for robot in case.robots.values()} == {None, checks.HOP_M}
+
+
+def test_a_tello_takes_off_to_its_own_height():
+    robots = {"T1": Robot(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
+    case = alone(Experiment(title="", duration_s=1.0, robots=robots))
+    assert {name: robot.hover for name, robot in case.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
