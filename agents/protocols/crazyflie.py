@@ -79,7 +79,7 @@ class CrazyflieSettings(Part, frozen=True):
     link: Literal["udp", "radio"] = "udp"  # for the twin only: `radio` puts a software Crazyradio between
     # for the twin only: files of cflib's cache with the parameters and the log variables that it lists; empty: built in
     tables: list[str] = []
-    connect_s: Wait = 20.0  # [s] limit for connecting, from its turn on its radio
+    connect_s: Wait = 60.0  # [s] limit for connecting, from its turn on its radio
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 
     @property

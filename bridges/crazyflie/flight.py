@@ -40,6 +40,7 @@ TURNED: Final = math.radians(2.0)
 STUTTER_S: Final = 0.2  # a gap of the radio that is longer hands over to the planner on board,
 STEADY_S: Final = 2.0  # which holds the place until no gap was so long for this time
 LANDING_GAP_S: Final = 0.8  # after a longer gap the drone is landed: it has flown without control
+STUTTERING_S, MOST_GAPS = 10.0, 4  # with more gaps in this time the drone is landed: it would hover out of reach next
 HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignored
 AGAIN_S: Final = 3.0  # a landing that takes longer than planned by this is ordered again
 PEAK: Final = 35.0 / 16.0  # maximum / mean speed of the planner's polynomial from rest to rest
@@ -80,6 +81,7 @@ class Flight:
         self._sent = -math.inf
         self._goal: Target | None = None
         self._held_since = -math.inf  # last gap after which the planner on board was given the drone
+        self._gaps: list[float] = []  # end of each gap of the last seconds [s]
         self._span = 0.0  # duration of the landing [s]
 
     @property
@@ -197,8 +199,11 @@ class Flight:
         """Give the drone to the planner on board after a gap of the radio of `gap` [s], or land it after a long one."""
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
-        if gap > LANDING_GAP_S:
-            self.trouble = f"landed: no radio for {gap:.1f} s"
+        now = time.monotonic()
+        self._gaps = [at for at in self._gaps if now - at < STUTTERING_S] + [now]
+        if gap > LANDING_GAP_S or len(self._gaps) > MOST_GAPS:
+            many = f"{len(self._gaps)} gaps of the radio in {STUTTERING_S:g} s"
+            self.trouble = f"landed: no radio for {gap:.1f} s" if gap > LANDING_GAP_S else f"landed: {many}"
             self._land(GENTLE)
             return
         target = self._target
@@ -206,15 +211,15 @@ class Flight:
             span = max(PEAK * math.dist(self._telemetry.position.tolist(), target[:3]) / CRAZYFLIE.speed, SHORTEST_S)
             self._planner.go_to(*target, span if math.isfinite(span) else SHORTEST_S)
             self._end_streaming()  # after the command: an idle planner without setpoints stops the motors
-        self._held_since = time.monotonic()
+        self._held_since = now
 
     def update_phase(self, now: float) -> None:
         """Update the phase from the drone's status at `now` on the monotonic clock [s]."""
         telemetry = self._telemetry
-        if now - telemetry.status_time > FRESH_S:
+        if now - telemetry.arrival > FRESH_S:
             return
         info, flying = telemetry.info, self._flying
-        since = now - self._since
+        since = telemetry.status_time - self._since  # a status that waited behind others tells of an earlier phase
         if self.phase is Phase.GROUND and flying and since > STOPPING_S:
             self.trouble = "landed: it flew without an order"
             self.land()
@@ -242,7 +247,7 @@ class Flight:
         """Link lost for so long that the firmware has cut the motors, provided that setpoints were streamed."""
         if self.airborne:
             stopping = self.phase is Phase.STOPPING
-            held = self._held_since > -math.inf or self._settings.control == "high-level"
+            held = self._held_since > self._sent or self._settings.control == "high-level"
             alone = self.phase is Phase.CLIMBING or ((stopping or self.phase is Phase.FLYING) and held)
             self.trouble = "out of reach: may still hover by itself" if alone else "out of reach: its motors are off"
             if not (alone and stopping):  # else: the stop is sent as soon as the drone is in reach again
@@ -276,8 +281,9 @@ class Flight:
     def _takeoff_refusal(self) -> str:
         """Reason against a take-off; empty if none."""
         telemetry = self._telemetry
-        if time.monotonic() - telemetry.status_time > FRESH_S:
-            return "no take-off: no status received"
+        age = time.monotonic() - telemetry.status_time
+        if age > FRESH_S:
+            return f"no take-off: its last status is {age:.1f} s old; is its radio too full, or gone?"
         if telemetry.battery_low:
             return "no take-off: battery low"
         if Info.LOCKED in telemetry.info:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents.protocols.crtp import Port
+from bridges.crazyflie import body
 from bridges.crazyflie.body import open_crazyflie
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import request
@@ -177,6 +178,38 @@ def test_a_session_that_begins_while_safelink_is_on():
             again.cut()
         finally:
             again.close()
+
+
+def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
+    """More logs than polls: the drone says so by its stamps, long before a packet is lost; then the radio recovers."""
+    monkeypatch.setattr(body, "overload", lambda *_: "")
+    with flown(device=RADIO | {"log_hz": 100.0}, exchanges_hz=90.0) as (twin, process):
+        process.until(lambda: len(twin.device.lines[0].queue) > 150, "queue")
+        waits = len(twin.device.lines[0].queue) / 105.0  # [s] of logs
+        assert process.t - process.state.time[0] == pytest.approx(waits, rel=0.3)
+        process.body.takeoff(np.array([0]), np.array([HEIGHT]))
+        process.until(lambda: "s old; is its radio too full" in process.state.notes[0], "refusal")
+        process.until(lambda: not process.state.flying[0], "on the ground")
+        assert truth(twin)[2] == 0.0
+        assert twin.device.lines[0].dropped == 0
+
+
+def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
+    """Twenty times as many logs as asked for, more than there are polls: answers and the status wait behind them."""
+    with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
+        process.takeoff(HEIGHT)
+        descent = Descent(twin, process)
+        drone, queue = twin.device.drones[0], twin.device.lines[0].queue
+        send = drone.send
+        drone.send = lambda port, channel, data: [
+            send(port, channel, data) for _ in range(20 if (port, channel) == (Port.LOG, 2) and len(queue) < 160 else 1)
+        ]
+        hovering(process)
+        process.until(lambda: process.t - process.state.time[0] > 0.5, "old poses")
+        assert process.state.flying[0]
+        process.land()  # as the robot's loop does then
+        process.until(lambda: supervised(twin) in {State.LANDED, State.READY}, "landed")
+        assert descent.fastest.max() < LANDS
 
 
 def test_a_radio_that_carries_too_little_is_refused():

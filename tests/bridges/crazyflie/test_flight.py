@@ -52,7 +52,7 @@ class Air:
         end = self.now + seconds
         while self.now < end:
             self.now += 0.02
-            self.board.status_time[0] = self.board.pose_time[0] = self.now
+            self.board.status_time[0] = self.board.pose_time[0] = self.telemetry.arrival = self.now
             self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
             self.flight.set_target(self.now, PLACE)
             self.flight.update_phase(self.now)
@@ -170,6 +170,27 @@ def test_after_a_gap(air, gap, phase):
         assert air.times("send_position_setpoint") == []
         air.pass_(1.0)
         assert air.times("send_position_setpoint")
+
+
+def test_a_radio_that_stutters_on_ends_in_a_landing(air):
+    for _ in range(4):
+        air.flight.hold_after_gap(0.3)
+        air.pass_(1.0)
+        assert air.flight.phase is Phase.FLYING
+    air.flight.hold_after_gap(0.3)
+    assert air.flight.phase is Phase.LANDING
+    assert "5 gaps of the radio" in air.flight.trouble
+
+
+def test_an_old_status_tells_of_an_earlier_phase(air):
+    """Behind a full queue: `flying` of before the take-off's end, `not flying` of before the take-off."""
+    air.flying = False
+    for _ in range(200):
+        air.now += 0.02
+        air.telemetry.arrival, air.board.status_time[0] = air.now, 100.0
+        air.flight.set_target(air.now, PLACE)
+        air.flight.update_phase(air.now)
+    assert air.flight.phase is Phase.FLYING
 
 
 def test_setpoints_of_old_poses_are_ignored(air):
