@@ -327,7 +327,7 @@ def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], 
     reports = sorted(content[CentreState], key=lambda each: each.stamp)
     counts = (
         counter_growth(((each.pid, each.stamp, getattr(each, what)) for each in reports), start, start + duration)
-        for what in ("heard", "lost", "dropped")
+        for what in ("received", "lost", "dropped")
     )
     received, lost_poses, dropped_poses = (np.array([each[name] for name in row], dtype=np.intp) for each in counts)
     return Goals.of_run(

@@ -149,7 +149,7 @@ def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
     folder, run = flown
     with pytest.raises(ExportError, match=r"run\.txt: is no name"):
         commands.export(str(folder), str(tmp_path / "run.txt"), as_csv=False)
-    with pytest.raises(ExportError, match=r"end with \.mat or \.csv"):
+    with pytest.raises(ExportError, match=r"end with \.mat, \.csv"):
         commands.export(str(folder), str(tmp_path / "run.mat"), as_csv=True)
     for name in ("run.mat", "run.csv"):
         with pytest.raises(ExportError, match="cannot be written: No such file or directory"):
