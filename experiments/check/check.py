@@ -13,7 +13,6 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.network.messages import MAX_PAYLOAD
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
@@ -25,7 +24,6 @@ from experiments.file.document import Document, Source
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
 NOT_RANDOM: Final = "not-random"
-RECEIVED_BYTES: Final = 200  # of one received pose in telemetry
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
 ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
@@ -56,22 +54,6 @@ def chance(analysis: Analysis) -> Iterator[Claim]:
         yield Claim("warning", NOT_RANDOM, message, remedy, ("disturbance",))
 
 
-def telemetry(analysis: Analysis) -> Iterator[Claim]:
-    """Warn if the poses received between two samples of telemetry do not fit into one message."""
-    experiment, links = analysis.experiment, analysis.plan.pose_links
-    if not len(links):
-        return
-    received = np.bincount(links.receiver)
-    size = float(received.max()) * experiment.rates.pose_hz / experiment.rates.state_hz * RECEIVED_BYTES
-    if size > MAX_PAYLOAD:
-        name = analysis.names[int(received.argmax())]
-        message = (
-            f"{name} may receive {size / RECEIVED_BYTES:.0f} poses between two samples of telemetry, "
-            f"{size / 1024.0:.0f} kB: each sample is sent in {int(np.ceil(size / MAX_PAYLOAD))} messages or more"
-        )
-        yield Claim("warning", "telemetry-split", message, "raise rates.state_hz", ("rates", "state_hz"))
-
-
 SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
@@ -80,7 +62,6 @@ SUBJECTS: Final = (
     safety.architecture,
     safety.safety,
     chance,
-    telemetry,
 )
 
 

@@ -28,7 +28,6 @@ TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
 REPETITIONS: Final = 5  # flights with noise, each with another seed
 QUESTIONS: Final = 6000  # to the trigger, from which the rate of transmissions is estimated
-PAIRS: Final = 1_000_000  # distances that are held in memory at once
 
 
 @dataclass(frozen=True)
@@ -124,24 +123,20 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         kinds: Of the rows.
         clearance: Free height from which on two robots pass above each other [m].
     """
-    i, j = np.triu_indices(len(kinds), 1)
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
     low, high = prediction.position[..., :2].min(axis=0), prediction.position[..., :2].max(axis=0)
-    gap = np.maximum(low[i] - high[j], low[j] - high[i]).max(axis=1)
-    meet = gap < radius[i] + radius[j]  # the areas in which they move: of many robots most never come near each other
-    i, j = i[meet], j[meet]
-    apart, layer = radius[i] + radius[j], (height[i] + height[j]) / 2.0 + clearance
-    nearest, when = np.full(len(i), np.inf), np.zeros(len(i))
-    block = max(1, PAIRS // max(1, len(i)))
-    for begin in range(0, len(prediction.time), block):
-        position = prediction.position[begin : begin + block]
-        offset = position[:, i] - position[:, j]
-        planar = np.where(np.abs(offset[..., 2]) < layer, norm(offset[..., :2]), np.inf)
-        at = planar.argmin(axis=0)
-        least = planar[at, np.arange(len(i))]
-        nearer = least < nearest
-        nearest[nearer], when[nearer] = least[nearer], prediction.time[begin + at[nearer]]
-    return [Approach(int(i[k]), int(j[k]), float(nearest[k]), float(when[k])) for k in np.flatnonzero(nearest < apart)]
+    found: list[Approach] = []
+    for i in range(len(kinds) - 1):
+        # the areas in which they move: of many robots most never come near each other
+        apart = np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i]).max(axis=1)
+        j = i + 1 + np.flatnonzero(apart < radius[i] + radius[i + 1 :])
+        offset = prediction.position[:, i, None] - prediction.position[:, j]
+        level = np.abs(offset[..., 2]) < (height[i] + height[j]) / 2.0 + clearance
+        gap = np.where(level, norm(offset[..., :2]), np.inf)
+        at = gap.argmin(axis=0)
+        near = np.flatnonzero(gap.min(axis=0) < radius[i] + radius[j])
+        found += [Approach(i, int(j[k]), float(gap[at[k], k]), float(prediction.time[at[k]])) for k in near]
+    return found
 
 
 def message_rate(experiment: Experiment) -> float:

@@ -109,7 +109,7 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
     height = np.nan_to_num(analysis.assignment.hover)
     low, high = _heights(analysis, height)
     for row, name in enumerate(analysis.names):
-        if _eyes(experiment.robots[name]) or not experiment.robots[name].avoids:
+        if _sensors(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
         in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
         there = [f"'{scene.names[k]}'" for k in in_height]
@@ -130,17 +130,16 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
     peopled = any(robot.body == WORLD for robot in robots.values())
     bare = not (peopled or experiment.arena.obstacles or experiment.arena.walls)
     for name, robot in robots.items():
-        if robot.ranges == "world" and robot.body == WORLD:
+        served, path = robot.ranges == "world", ("robots", name, "ranges")
+        if served and robot.body == WORLD:
             message = f'{name} lives in the world, whose range sensors are its own: ranges = "world" adds nothing'
-            yield Claim("warning", "ranges-twice", message, "leave ranges out", ("robots", name, "ranges"))
-        elif robot.ranges == "world" and not _eyes(robot):
+            yield Claim("warning", "ranges-twice", message, "leave ranges out", path)
+        elif served and not _sensors(robot):
             message = f"{name} has no range sensors that the world could serve"
-            remedy = 'say which: sensors = ["multiranger"], or leave ranges out'
-            yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
-        elif robot.ranges == "world" and bare:
+            yield Claim("warning", "ranges-of-nothing", message, 'say which: sensors = ["multiranger"]', path)
+        elif served and bare:
             message = f"{name} takes its ranges from a world without obstacles and robots"
-            remedy = 'add [arena.obstacles], a robot with body = "world", or leave ranges out'
-            yield Claim("warning", "ranges-of-nothing", message, remedy, ("robots", name, "ranges"))
+            yield Claim("warning", "ranges-of-nothing", message, "add [arena.obstacles], or leave ranges out", path)
         if robot.shadow is not None and robot.body in TWINS:
             message = f"{name} is a twin, so its shadow only compares one twin with another"
             yield Claim("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
@@ -157,7 +156,7 @@ def _avoids(analysis: Analysis) -> Mask:
     return np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
 
 
-def _eyes(robot: Robot) -> tuple[str, ...]:
+def _sensors(robot: Robot) -> tuple[str, ...]:
     """Its range sensors."""
     return OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
 

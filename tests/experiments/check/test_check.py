@@ -249,7 +249,6 @@ def test_gains(gain, code):
         (PARK, "timeline.0.plan.speed=0.3", ("error", "leader-too-fast"), "0.3 m/s; it has 0.22", "0.2 m/s"),
         (PARK, "safety.speed=0.1", ("error", "leader-too-fast"), "it has 0.1 m/s", "0.09 m/s"),
         (PARK, "disturbance={}", ("warning", "not-random"), "runs of other seeds are the same", "position_sigma"),
-        (PARK, "rates.state_hz=0.25", ("warning", "telemetry-split"), "is sent in 3 messages or more", "state_hz"),
         (PARK, "timeline.0.plan.speed=0.21", ("warning", "leader-near-limit"), "of the 0.22 m/s", "0.2 m/s"),
         (
             PARK,

@@ -61,7 +61,7 @@ def updating(park, update):
         (
             {"update": {"kind": "mixed", "smoothing_s": 0.1}},
             ("formation", "update", "smoothing_s"),
-            "for what is said",
+            "for transmissions",
             "leave it out",
         ),
     ],
