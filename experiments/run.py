@@ -65,7 +65,7 @@ def show(figure: Figure, file: str | Path | None = None) -> Picture:
 
 
 def folder(default: str) -> Path:
-    """Where a script keeps its figures: its first argument; `default` if there is none, and in a notebook.
+    """Folder for the figures of a script: its first argument; `default` if there is none, and in a notebook.
 
     Args:
         default: From the checkout, wherever the script or the notebook was started.

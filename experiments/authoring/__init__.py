@@ -1,1 +1,1 @@
-"""Where experiment files come from: generated formations, and the files of Robotic Park."""
+"""Sources of experiment files: generated formations, and the files of Robotic Park."""

@@ -84,7 +84,7 @@ class Analysis:
 
     @property
     def edges(self) -> int:
-        """How many pairs are linked, directions ignored."""
+        """Number of linked pairs, directions ignored."""
         return len(edges(self.assignment.links))
 
     @property
@@ -107,7 +107,7 @@ class Analysis:
 
     @property
     def departure(self) -> float:
-        """When the first robot leaves by plan or the shape changes, after the start; infinity if neither [s]."""
+        """Time of the first moving leg or the first change of shape after the start [s]; infinity without either."""
         timeline = self.experiment.timeline
         leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
         return min((at for at in (*leaves, *(each.at for each in self.pattern.changes)) if at > 0), default=math.inf)
@@ -136,7 +136,7 @@ class Analysis:
         return np.asarray((total[end] - total[before]) / (end - before)[:, None])
 
     def acquired(self, until: float) -> float | None:
-        """From when on the mean of every link over `WINDOW_S` keeps within the tolerance, up to `until` [s]."""
+        """Time from which on the mean of every link over `WINDOW_S` is within the tolerance, up to `until` [s]."""
         time = self.prediction.time
         mean = self.mean_error[time <= until + 1e-9]
         bad = np.flatnonzero(mean.max(axis=1, initial=0.0) > self.experiment.tolerance + FORGIVEN)
@@ -171,7 +171,7 @@ class Analysis:
         return f"{self.names[first]} - {self.names[second]}"
 
     def link_path(self, number: int) -> Path:
-        """Where a link stands in the file."""
+        """Path of a link in the file."""
         wanted = self.assignment.links.receiver[number], self.assignment.links.sender[number]
         ends = tuple(self.names[row] for row in wanted)
         return next(
@@ -275,7 +275,7 @@ def _shapes(  # noqa: PLR0917 - one caller
     aloft: Array,
     silent: Index,
 ) -> list[Shape]:
-    """Where the robots end, where they start, what the distances suggest, and random places, until one is exact."""
+    """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
     end, rows, links = prediction.position[-1], len(aloft), wanted.select(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False

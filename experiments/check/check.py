@@ -1,7 +1,7 @@
-"""`zenpark check`: says whether an experiment can work before anything moves.
+"""`zenpark check`: findings on an experiment before anything moves.
 
-That a file can be read at all is for `experiments.file.document` to say; here the experiment is held against theory
-(`theory`) and against an ideal run of it (`motion`), each case for itself.
+`experiments.file.document` reads the file; here each case is compared with theory (`theory`) and with an ideal run
+(`motion`).
 """
 
 from __future__ import annotations

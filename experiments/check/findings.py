@@ -32,7 +32,7 @@ def join_names(words: Sequence[str], most: int = 4) -> str:
 
 
 def first_of_each_code(claims: Iterable[Claim]) -> list[Claim]:
-    """The first claims of each code; the last that is kept tells how many more there are."""
+    """First claims of each code; the last of them ends with the number of the others."""
     by_code: dict[str, list[Claim]] = {}
     for claim in claims:
         by_code.setdefault(claim.code, []).append(claim)

@@ -142,7 +142,7 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
 def message_rate(experiment: Experiment) -> float:
     """Transmissions of all robots together in a flight with the noise of the experiment [1/s].
 
-    The flight lasts as many questions to the trigger as `QUESTIONS`, for noise makes robots transmit.
+    Noise makes robots transmit; the flight takes `QUESTIONS` questions to the trigger at most.
     """
     duration = min(experiment.duration_s, QUESTIONS / experiment.rates.pose_hz)
     bare = isolated(msgspec.structs.replace(experiment, duration_s=duration))

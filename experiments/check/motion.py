@@ -329,7 +329,7 @@ def ends(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _lasts(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
-    """How long a plan moves its robot [s], to within 1 %; None if for ever."""
+    """Duration for which a plan moves its robot [s], to within 1 %; None: for ever."""
     elapsed = np.geomspace(0.01, 1e6, 2000)
     heading = np.full(len(elapsed), start[2] if len(start) > 2 else 0.0)
     target, _ = plan.target(elapsed, np.tile(anchor, (len(elapsed), 1)), heading)

@@ -102,7 +102,7 @@ def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residual
 
 
 def _beside(apart: Array, bearing: Array) -> tuple[Array, Array]:
-    """From the ray along each bearing to x, as the law `bearing` sees it, and its derivative."""
+    """Vector from the ray along each bearing to x, as in the law `bearing`, and its derivative."""
     flat = np.isnan(bearing[:, 2])
     bearing, apart = bearing.copy(), apart.copy()
     bearing[flat, 2] = apart[flat, 2] = 0.0
@@ -299,7 +299,7 @@ def contradictions(links: Links) -> list[Contradiction]:
 
 
 def _ring(one: int, other: int, above: dict[int, int]) -> tuple[int, ...]:
-    """The way from one row to another through a tree of which `above` tells the parents."""
+    """The way from one row to another through a tree with the parents `above`."""
 
     def up(row: int) -> list[int]:
         way = [row]

@@ -143,7 +143,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
 
 
 def _measured(analysis: Analysis) -> Mask:
-    """Which links (E,) stand at the start and ask for a distance."""
+    """Mask (E,) of the links that stand at the start and ask for a distance."""
     wants = analysis.asked.wants
     return analysis.standing if wants is None else analysis.standing & (wants == BY_DISTANCE)
 
@@ -228,7 +228,7 @@ def presence(analysis: Analysis) -> Iterator[Claim]:
 
 
 def _runs(there: Mask) -> Mask:
-    """Of masks over time (T, E), the first of every run of equal ones."""
+    """First mask of every run of equal masks (T, E) over time."""
     return np.asarray(there[np.concatenate([[True], (there[1:] != there[:-1]).any(axis=1)])])
 
 

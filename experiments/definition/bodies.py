@@ -46,7 +46,7 @@ def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Ar
 
 
 def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
-    """As `start_poses`, scattered by the seed as the file asks, clear of other robots and of obstacles.
+    """Start poses as `start_poses`, scattered by the seed, clear of other robots and of obstacles.
 
     Places are drawn for all robots of the experiment in the order of the file, so that all processes agree.
     """

@@ -91,7 +91,7 @@ class _Ends:
 
 
 def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
-    """Without keys."""
+    """Conditions of these links without random keys."""
     effects = [link_effects(channel), *(link_effects(channel, own) for own in channel.links.values())]
     count = len(ends.receiver)
     which = np.zeros(count, dtype=np.intp)

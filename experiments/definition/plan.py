@@ -106,7 +106,7 @@ class Plan:
 
     @cached_property
     def avoidance_links(self) -> Links:
-        """Links that only avoidance needs: between all robots that no law links, if it hears all; else to neighbours.
+        """Links that only avoidance needs: between all robots that no law links, if it needs all; else from neighbours.
 
         Robots that the centre guides have no law of their own.
         """
@@ -193,7 +193,7 @@ class Plan:
         )
 
     def _patience(self, name: str) -> float:
-        """How long a robot holds without a position [s]: in a world that is gone it cannot move, and may wait."""
+        """Time for which a robot holds without a position [s]; without its world it cannot move, and may wait."""
         experiment = self.experiment
         return experiment.world.patience_s if experiment.robots[name].body == WORLD else experiment.safety.blind_s
 

@@ -155,7 +155,7 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
 
 
 def _pairs(text: str) -> tuple[tuple[str, str], ...]:
-    """As `links.link_pairs`; nothing where that is reported elsewhere."""
+    """Pairs of a link as `links.link_pairs`; none where the error is reported elsewhere."""
     try:
         return link_pairs(text)
     except ValueError:

@@ -188,7 +188,7 @@ class _Reading:
     content: _Table
 
     def document(self) -> Document:
-        """See `read`."""
+        """Document of this text, see `read`."""
         source = self.source
         source.refuse(structure.number_faults(self.content))
         base, tables, cases = self._changed(source.overrides)

@@ -37,7 +37,7 @@ class Override:
 
     @property
     def whole(self) -> Path:
-        """From the top of the file."""
+        """Path from the top of the file."""
         return self.path if self.case is None else ("cases", self.case, *self.path)
 
     def refused(self, message: str, hint: str) -> DocumentError:

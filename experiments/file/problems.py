@@ -152,7 +152,7 @@ def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
 
 
 def _blank(text: str, at: int) -> int:
-    """Behind white space, line ends and comments."""
+    """Offset behind white space, line ends and comments."""
     return _end(_BLANK, text, at)
 
 

@@ -171,7 +171,7 @@ def _table(
 
 @cache
 def _fields_of(struct: type[msgspec.Struct]) -> Mapping[str, msgspec.structs.FieldInfo]:
-    """By their names in a file. Cached: working out what annotations mean takes longer than judging a table by them."""
+    """Fields by their names in a file. Cached: resolving annotations takes longer than checking a table."""
     return {field.encode_name: field for field in msgspec.structs.fields(struct)}
 
 

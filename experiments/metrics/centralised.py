@@ -23,7 +23,7 @@ class Delays:
 
     @classmethod
     def of_series(cls, delay: Array) -> Delays:
-        """Of all (A,)."""
+        """Statistics of delays (A,) [s]."""
         if not len(delay):
             return cls(None, None, None)
         return cls(float(delay.mean()), float(np.quantile(delay, 0.95)), float(delay.max()))
@@ -44,7 +44,7 @@ def received_by_centre(trace: Trace) -> Mask:
 
 
 def delays(trace: Trace) -> list[Delays]:
-    """Of each robot."""
+    """Delays of the goals to each robot."""
     goals = trace.goals
     none = Delays.of_series(np.zeros(0))
     if goals is None:
@@ -53,7 +53,7 @@ def delays(trace: Trace) -> list[Delays]:
 
 
 def goals_to(trace: Trace) -> tuple[Index, Index]:
-    """How many goals were sent to each robot (N,), and their payload (N,) [bytes]."""
+    """Number of goals sent to each robot (N,), and their payload (N,) [bytes]."""
     rows, goals = len(trace.robots), trace.goals
     if goals is None:
         return np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)

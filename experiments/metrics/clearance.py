@@ -34,7 +34,7 @@ class Clearance:
 
     @classmethod
     def of_trace(cls, trace: Trace) -> Clearance:
-        """Of a whole trace; obstacles that can be pushed count only where no world watched for contacts."""
+        """Clearance in a whole trace; obstacles that can be pushed count only where no world watched for contacts."""
         names, solid = trace.robots, _Cylinders.of_trace(trace)
         robots: list[Approach | None] = [None] * len(names)
         arena: list[Approach | None] = [None] * len(names)

@@ -260,7 +260,7 @@ def _robots(
 
 
 def _short(trace: Trace, net: Links, row: int) -> float | None:
-    """How far a robot that had a plan was from where that wanted it, at the end [m]; None: no plan, or not known."""
+    """Distance of a robot with a plan from its goal at the end [m]; None: no plan, or not known."""
     began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
     if not began or row in net.receiver:
         return None

@@ -1,4 +1,4 @@
-"""How far the twin beside a robot agrees with it: bias, error and correlation, from the poses of both."""
+"""Agreement of a shadow twin with its robot: bias, error and correlation, from the poses of both."""
 
 from __future__ import annotations
 

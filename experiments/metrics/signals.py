@@ -24,7 +24,7 @@ RETURN_S: Final = 3.0  # robots come back one after the other when the network d
 
 
 def phase_starts(trace: Trace) -> tuple[float, ...]:
-    """When phases begin: the common start, each leg of the timeline and each change of shape within the run [s]."""
+    """Beginnings of the phases [s]: common start, each leg of the timeline and each change of shape in the run."""
     first, last = float(trace.time[0]), float(trace.time[-1])
     experiment = trace.experiment
     begins = {leg.at_s for leg in experiment.timeline} | {change.at_s for change in experiment.formation.changes}

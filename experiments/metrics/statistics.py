@@ -83,7 +83,7 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(values: Sequence[float | None]) -> Spread:
-    """Of the known values."""
+    """Statistics of the known values."""
     known = [value for value in values if value is not None]
     n = len(known)
     deviation = statistics.stdev(known) if n > 1 else None

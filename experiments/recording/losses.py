@@ -77,7 +77,7 @@ def _by_sender(statuses: list[Status], run: tuple[float, float], what: Literal["
 
 
 def counter_growth(counts: Iterable[tuple[int, float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
-    """How much counters grew in a run, by their names.
+    """Growth of counters in a run, by their names.
 
     Args:
         counts: Reports in order of time: process, stamp [s], and what the process has counted since it began.

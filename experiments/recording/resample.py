@@ -58,7 +58,7 @@ def step(t: Array, values: Array, time: Array, hold: float) -> Array:
 
 
 def _known(t: Array, time: Array, hold: float) -> Mask:
-    """Where on the grid the samples say something: close to one, or between two that are not far apart."""
+    """Mask of the grid where samples are valid: close to one, or between two that are not far apart."""
     after = np.searchsorted(t, time)
     padded = np.concatenate([[-np.inf], t, [np.inf]])
     since, until = time - padded[after], padded[after + 1] - time

@@ -107,7 +107,7 @@ class Goals:
 
 
 def _first(time: Array, row: Index, pose: Array) -> Mask:
-    """Which of goals (K,), acted on at `time`, are the first of their robot that rest on that pose."""
+    """Mask of the goals (K,), acted on at `time`, that are the first of their robot to rest on that pose."""
     order = np.lexsort((time, row))
     changed = np.ones(len(order), dtype=bool)
     changed[1:] = (np.diff(row[order]) != 0) | (np.diff(pose[order]) > ROUNDING_S)

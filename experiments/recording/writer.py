@@ -68,7 +68,7 @@ class ChunkIndices:
             yield Block(block)
 
     def close(self) -> None:
-        """Lets the file go."""
+        """Close the file, which is then deleted."""
         self._kept.close()
 
 
@@ -201,7 +201,7 @@ class Recording:
         self._writer.add_metadata(METADATA, about)
 
     def _record(self, topic: _Written, message: Message, entry: msgspec.Struct, logged: float) -> bool:
-        """Whether the message was whole, and is written."""
+        """Write a message; False if it could not be encoded."""
         try:
             data = topic.encode(entry)
         except Unencodable:
@@ -252,7 +252,7 @@ class _Written:
 
 
 def _drawing() -> Callable[[State], bytes]:
-    """From a state to the pose that a viewer draws."""
+    """Encoder from a state to the pose that a viewer draws."""
     encode = pose_stamped(FRAME)
 
     def drawn(state: State) -> bytes:

@@ -355,7 +355,7 @@ class Logbook:
             )
 
     def _counts(self, row: Index, time: Array) -> tuple[Index, Index]:
-        """How often each row occurs until the end of the run, and until the end of everything."""
+        """Number of times each row occurs until the end of the run, and until the end of the log."""
         rows = len(self._log.names)
         messages_in_run = time <= self._experiment.duration_s + ROUNDING_S
         return np.bincount(row[messages_in_run], minlength=rows), np.bincount(row, minlength=rows)
@@ -380,7 +380,7 @@ class Logbook:
 
 
 def _known(value: Any) -> Any:  # noqa: ANN401 - a number or a list of them
-    """As messages have it: a tuple; None if it is NaN."""
+    """A value in the form of messages: a tuple or a number; None if it is NaN."""
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
     return None if math.isnan(value) else value

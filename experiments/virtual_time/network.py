@@ -189,7 +189,7 @@ class VirtualNetwork:
     """Carries poses between robots, and poses and goals between them and their centre, if they have one."""
 
     def __init__(self, experiment: Experiment, agent: Agent, seeds: Sequence[int], *, lean: bool) -> None:
-        """For all repetitions; `lean` as for `experiments.virtual_time.simulation.simulate`."""
+        """Network of all repetitions; `lean` as for `experiments.virtual_time.simulation.simulate`."""
         assignment, rows = agent.assignment, len(agent.assignment.names)
         self._agent, self._lean = agent, lean
         self._channel = VirtualChannel(experiment, assignment.links, seeds)

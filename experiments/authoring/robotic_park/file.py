@@ -385,7 +385,7 @@ def _robot(entry: Entry, listed: _Robot, own: Entry, given: _Robot, task: Task |
 
 
 def kind_of(name: str) -> str:
-    """The kind of a robot as zenpark calls it, which theirs tell by their names; empty if a name tells none."""
+    """Kind of a robot in zenpark by its name; empty for a name without a known kind."""
     return next((kind for part, kind in KINDS if part in name.lower()), "")
 
 

@@ -155,7 +155,7 @@ def _mirrored(one: Relation, other: Relation, kind: str) -> bool:
 
 
 def _line(name: str, other: str, relation: Relation, task: Task, gain: float | None, *, both: bool) -> str:
-    """`name` asks `relation` of `other`: p_name − p_other, as a link tells where its second robot is from the first."""
+    """Line of a link: `relation` is p_name − p_other, and a link has its second robot relative to the first."""
     link = f'"{other} {"-" if both else ">"} {name}"'
     if task.kind == "distance" and gain is None:
         return f"{link} = {relation.values[0]:g}"
