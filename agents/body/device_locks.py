@@ -84,9 +84,9 @@ def _lock(path: Path, name: str, address: str) -> int:
         except BlockingIOError:
             holder, _, other = os.read(file, LONGEST).decode(errors="replace").partition(" ")
             os.close(file)
-            who = "this process" if holder == str(os.getpid()) else f"process {holder or '(not known yet)'}"
+            driver = "this process" if holder == str(os.getpid()) else f"process {holder or '(not known yet)'}"
             of = f" for {other}" if other else ""
-            raise BodyError(f"{name}: {address} is in use: {who} drives it{of}; end that first") from None
+            raise BodyError(f"{name}: {address} is in use: {driver} drives it{of}; end that first") from None
         except BaseException:
             os.close(file)
             raise

@@ -91,16 +91,16 @@ class Rays(Columns, frozen=True):
     @classmethod
     def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
         """The scans of all rows; None if no row has one."""
-        seen = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
-        if not seen:
+        there = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
+        if not there:
             return None
-        counts = [len(scan.distance) for _, scan in seen]
+        counts = [len(scan.distance) for _, scan in there]
         return cls(
-            np.repeat(np.array([row for row, _ in seen], dtype=np.intp), counts),
-            np.repeat(np.array([scan.time for _, scan in seen]), counts),
-            np.concatenate([scan.bearing for _, scan in seen]),
-            np.concatenate([scan.elevation for _, scan in seen]),
-            np.concatenate([scan.distance for _, scan in seen]),
+            np.repeat(np.array([row for row, _ in there], dtype=np.intp), counts),
+            np.repeat(np.array([scan.time for _, scan in there]), counts),
+            np.concatenate([scan.bearing for _, scan in there]),
+            np.concatenate([scan.elevation for _, scan in there]),
+            np.concatenate([scan.distance for _, scan in there]),
         )
 
     @classmethod

@@ -24,12 +24,6 @@ class Anchors:
     def __len__(self) -> int:
         return len(self.row)
 
-    def of_rows(self, rows: Index) -> Anchors:
-        """Anchors of these rows, renumbered from 0."""
-        mine = np.flatnonzero(np.isin(self.row, rows))
-        order = np.argsort(rows)
-        return self._take(mine, order[np.searchsorted(rows, self.row[mine], sorter=order)])
-
     def repeated(self, times: int, rows: int) -> Anchors:
         """Anchors of `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))

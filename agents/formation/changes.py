@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, norm
+from agents.arrays import Array, Columns, Index, Mask, norm
 from agents.formation.graph import Links
 
 ROUNDING_S = 1e-6  # decisions are multiples of a period that binary fractions miss by less than this
@@ -111,8 +111,7 @@ def _scaled(distance: Array, grown: Array, rise: Array) -> Array:
     return np.where(grown == 1.0, distance, np.sqrt(np.maximum(grown**2 * (distance**2 - rise**2), 0.0) + rise**2))
 
 
-@dataclass(frozen=True)
-class Presence:
+class Presence(Columns, frozen=True):
     """Times and distances at which links (E) exist."""
 
     since: Array  # (E,) begin since the common start [s]
@@ -120,14 +119,10 @@ class Presence:
     reach: Array  # (E,) distance below which a link begins [m]; infinity: any
     release: Array  # (E,) distance above which it ends [m]; the gap to `reach` prevents flicker
 
-    def select(self, which: Index) -> Presence:
-        return Presence(self.since[which], self.until[which], self.reach[which], self.release[which])
-
     def padded(self, more: int) -> Presence:
         """Presence with `more` links behind these, which always exist."""
         ever = np.full(more, np.inf)
-        columns = ((self.since, -ever), (self.until, ever), (self.reach, ever), (self.release, ever))
-        return Presence(*(np.concatenate(both) for both in columns))
+        return Presence.joined([self, Presence(-ever, ever, ever, ever)])
 
     def present_at_start(self) -> Mask:
         """Links (E,) that exist before any distance is known."""

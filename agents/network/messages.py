@@ -449,12 +449,14 @@ def read_stop(payload: bytes, mime: str) -> Stop:
     decoded: object = None
     with suppress(Exception):  # unreadable is a stop as well
         decoded = (msgspec.msgpack if mime.startswith(MSGPACK) else msgspec.json).decode(payload[:MAX_PAYLOAD])
-    who, reason = "", payload[:MAX_PAYLOAD].decode(errors="replace")
+    sender, reason = "", payload[:MAX_PAYLOAD].decode(errors="replace")
     if isinstance(decoded, str):
         reason = decoded
     elif isinstance(decoded, dict) and not decoded.keys().isdisjoint(Stop.__struct_fields__):
-        who, reason = (text if isinstance(text := decoded.get(field), str) else "" for field in Stop.__struct_fields__)
-    return Stop(_shown(who) or UNKNOWN, _shown(reason))
+        sender, reason = (
+            text if isinstance(text := decoded.get(field), str) else "" for field in Stop.__struct_fields__
+        )
+    return Stop(_shown(sender) or UNKNOWN, _shown(reason))
 
 
 def _shown(text: str) -> str:

@@ -196,6 +196,6 @@ def light_distance(reflected: Array) -> Array:
 
     Reflected light falls with the square of the distance from the emitter behind the rim; a choice, not a calibration.
     """
-    seen = np.maximum(reflected, LIGHT_NOTHING)
-    near = LIGHT_SCALE * (np.sqrt(LIGHT_TOUCHING / seen) - 1.0)
+    light = np.maximum(reflected, LIGHT_NOTHING)
+    near = LIGHT_SCALE * (np.sqrt(LIGHT_TOUCHING / light) - 1.0)
     return np.where(reflected <= LIGHT_NOTHING, np.nan, RIM + np.maximum(near, 0.0))

@@ -103,16 +103,16 @@ def serve_router(
     """
     register = _register(endpoints)
     patience_s = 0.0
-    seen = _stamp(register)  # before reading: a change in between is detected
+    read = _stamp(register)  # before reading: a change in between is detected
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
         with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
             ready(session)
             patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
-                if (now := _stamp(register)) == seen:
+                if (now := _stamp(register)) == read:
                     continue
-                seen = now
+                read = now
                 try:
                     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
                 except EndpointError as error:  # the former rules still hold

@@ -92,14 +92,14 @@ class Watchdog:
     def _watch(self) -> None:
         period = self._silence_s / LOOKS
         looked = since = time.monotonic()
-        seen, hung, again = self._beats, 0.0, 0.0
+        counted, hung, again = self._beats, 0.0, 0.0
         while not self._over.wait(period):
             last, looked = looked, time.monotonic()
             if looked - last > self._silence_s:
                 since += looked - last  # the whole process stood still
                 continue
-            if self._beats != seen:
-                seen, since, hung = self._beats, looked, 0.0
+            if self._beats != counted:
+                counted, since, hung = self._beats, looked, 0.0
                 continue
             if looked - since < self._silence_s:
                 continue

@@ -202,19 +202,19 @@ class Hazards:
         self._no_row = self.held
         self.incidents = []
 
-    def update(self, t: float, seen: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
+    def update(self, t: float, found: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
         """Update for one tick; returns incidents of the rows that must land or be cut now, for the first time.
 
         Args:
             t: Now [s].
-            seen: Causes present; a cause that is left out is present on no row.
+            found: Causes present; a cause that is left out is present on no row.
             active: (N,) rows that climb, wait in the air, or run: the others have no hazards.
             landing: (N,) rows that land: they have the hazards with `Rule.landing`.
         """
-        if self._quiet and not seen:
+        if self._quiet and not found:
             return []
         now = np.zeros(self._level.shape, dtype=bool)
-        for cause, rows, _ in seen:
+        for cause, rows, _ in found:
             now[cause] = rows
         now &= active | (self._landing & landing)
         before = self._level
@@ -237,9 +237,9 @@ class Hazards:
         self._quiet = not (some(on) or some(now))
         if not some(level != before):
             return []
-        return self._record(t, before, lasted, {sighting.cause: sighting for sighting in seen})
+        return self._record(t, before, lasted, {sighting.cause: sighting for sighting in found})
 
-    def _record(self, t: float, before: Index, lasted: Array, seen: Mapping[int, Observation]) -> list[Incident]:
+    def _record(self, t: float, before: Index, lasted: Array, found: Mapping[int, Observation]) -> list[Incident]:
         """Record changes in words; returns landings and cuts, the hardest of each row last."""
         news = []
         for cause, row in np.argwhere(self._level != before).tolist():
@@ -249,7 +249,7 @@ class Hazards:
                 text = f"over: {words}, after {lasted[cause, row]:.2f} s"
                 self._texts[row].pop(cause, None)
             else:
-                text = f"{outcome.name.lower()}: {words}: {seen[cause].detail(row)}"
+                text = f"{outcome.name.lower()}: {words}: {found[cause].detail(row)}"
                 self._texts[row][cause] = text
             news.append(Incident(t, row, Cause(cause), outcome, text))
         news.sort(key=lambda incident: incident.outcome)

@@ -50,7 +50,7 @@ class FormationArrays:
         """Some of the links, or the same in another order."""
         changes = tuple(change.select(which) for change in self.changes)
         return FormationArrays(
-            self.links.select(which), changes, None if self.presence is None else self.presence.select(which)
+            self.links.select(which), changes, None if self.presence is None else self.presence.take(which)
         )
 
     def to_receivers(self, rows: Index) -> FormationArrays:

@@ -229,19 +229,11 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
             continue
         taken = sorted(name for name, body in me.robots.items() if body and _has(other, name, body))
         if taken:
-            stop = (
-                lab_options(other.endpoints[0])
-                if len(other.endpoints) == 1
-                else f"--connect @{other.folder}/{mesh.ENDPOINTS}"
-            )
-            raise DocumentError(
-                [
-                    Problem(
-                        file, 0, 0, f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}",
-                        f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `zenpark estop {stop}`",
-                    )
-                ]
-            )  # fmt: skip
+            mesh_file = f"--connect @{other.folder}/{mesh.ENDPOINTS}"
+            stop = lab_options(other.endpoints[0]) if len(other.endpoints) == 1 else mesh_file
+            what = f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}"
+            hint = f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `zenpark estop {stop}`"
+            raise DocumentError([Problem(file, 0, 0, what, hint)])
         if same := sorted(me.robots.keys() & other.robots.keys()):
             notes.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
     return notes

@@ -192,8 +192,8 @@ def serve(launch: Launch) -> int:
         Unreachable: If no router answers.
     """
     experiment, endpoints = launch.read()
-    steered = Plan(experiment).guided
-    if not steered:
+    guided = Plan(experiment).guided
+    if not guided:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise DocumentError([Problem(launch.file, 0, 0, "every robot of this experiment decides for itself", hint)])
     over = threading.Event()
@@ -209,10 +209,10 @@ def serve(launch: Launch) -> int:
     ) as joint:
         process = CentreProcess(experiment, joint.session, joint.keys, endpoints)
         joint.declared.append(process)
-        heard = [name for name in experiment.robots if name not in steered]
+        others = [name for name in experiment.robots if name not in guided]
         print(
-            f"centre ready: guides {', '.join(steered)} at {experiment.rates.coordination_hz:g} Hz"
-            + (f"; {', '.join(heard)} decide for themselves" if heard else "")
+            f"centre ready: guides {', '.join(guided)} at {experiment.rates.coordination_hz:g} Hz"
+            + (f"; {', '.join(others)} decide for themselves" if others else "")
             + f"; realm {experiment.network.realm} at {', '.join(endpoints)}",
             flush=True,
         )

@@ -140,12 +140,12 @@ class ConductorWatch:
         self._thread.join()
 
     def _watch_token(self) -> None:
-        there, gone_s = True, 0.0
+        there, missing_s = True, 0.0
         while not self._over.wait(LOOK_S):
             for _, alive in self._watch.changes():
                 there = alive
-            gone_s = 0.0 if there or not network.connected(self._session) else gone_s + LOOK_S
-            if gone_s > self._silence_s:
+            missing_s = 0.0 if there or not network.connected(self._session) else missing_s + LOOK_S
+            if missing_s > self._silence_s:
                 print("the conductor is gone", flush=True)
                 os.kill(os.getpid(), signal.SIGTERM)
                 return
