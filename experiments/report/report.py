@@ -37,8 +37,8 @@ from experiments.report.tables import (
 from experiments.report.verdict import failures, findings, interruptions, left_out
 
 PROOF: Final = (
-    "Every pose carries a running number, so a gap proves a loss. Heard is counted over all listeners together; a pose "
-    "sent in the last instant of the run may still be under way."
+    "Every pose carries a running number, so a gap proves a loss. Received poses are counted over all receivers "
+    "together; a pose sent in the last instant of the run may still be under way."
 )
 CLOCKS: Final = (
     "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "

@@ -287,11 +287,11 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case: poses sent, recorded, received, lost, and dropped by a modelled network; seeds are added up."""
     columns: list[Column[RobotMetrics]] = [
-        ("Listeners", lambda robots: str(robots[0].listeners) if len({r.robot for r in robots}) == 1 else ""),
+        ("Receivers", lambda robots: str(robots[0].listeners) if len({r.robot for r in robots}) == 1 else ""),
         ("Sent", _cell(sum, "messages")),
         ("Recorded", _cell(sum, "recorded")),
-        ("To be heard", lambda robots: number(sum(robot.messages * robot.listeners for robot in robots))),
-        ("Heard", _cell(sum, "heard")),
+        ("To be received", lambda robots: number(sum(robot.messages * robot.listeners for robot in robots))),
+        ("Received", _cell(sum, "heard")),
         ("Lost", _cell(sum, "lost")),
         ("Dropped", _cell(sum, "dropped")),
     ]
@@ -323,7 +323,7 @@ def links_table(cases: Sequence[CaseMetrics]) -> Table:
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """For each case with a modelled network the fate of the poses on each link; several seeds are added up."""
     columns: list[Column[Passage]] = [
-        ("Heard", _cell(sum, "heard")),
+        ("Received", _cell(sum, "heard")),
         ("Dropped", _cell(sum, "dropped")),
         ("Share [%]", lambda links: number(dropped_share(links))),
         ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
