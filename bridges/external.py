@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import replace
 from math import isfinite
 from typing import Final, Literal
 
@@ -138,7 +137,7 @@ class ExternalBody:
             battery=nothing[:, 0],
             flying=self._flying.copy(),
             notes=self._notes(),
-            rays=None if rays is None else replace(rays, time=rays.time - self._clock_offset),
+            rays=None if rays is None else msgspec.structs.replace(rays, time=rays.time - self._clock_offset),
             ahead=self._positions.ahead,
         )
 
