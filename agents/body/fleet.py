@@ -51,7 +51,7 @@ class Fleet:
         """A field of the state of all rows, from bodies of which some may lack it."""
         if name == "rays":
             return Rays.of_bodies(parts)
-        if name == "notes":
+        if name in {"notes", "refusals"}:
             notes = [""] * self._rows
             for group, own in parts:
                 for row, note in zip(group, own, strict=False):

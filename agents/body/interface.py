@@ -141,6 +141,8 @@ class BodyState:
     shadow_yaw: Array | None = None  # (n,) of that twin [rad]
     # (n,) [s] stamp of the last external position less the time of its arrival; None without external positions
     ahead: Array | None = None
+    # why the device of each row would refuse to take off now; empty if it would not, or does not tell
+    refusals: tuple[str, ...] = ()
     # (n,) when the device was heard last, on the clock of `read` [s]; NaN, or None, for bodies without a device
     heard: Array | None = None
 

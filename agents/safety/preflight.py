@@ -68,6 +68,8 @@ class Preflight:
             return "no position of its own" + (f": {clock_text(self._assignment.names, ahead, row)}" if off else "")
 
         yield where.invalid, nowhere
+        if any(refusals := state.refusals):
+            yield np.array([bool(refusal) for refusal in refusals]), lambda row: refusals[row]
         waits, missing = lacking
         yield waits, lambda row: "never heard " + ", ".join(missing(row))
         if now.health.offline_since < np.inf:

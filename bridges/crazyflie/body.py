@@ -137,6 +137,7 @@ class CrazyflieBody:
             battery=board.battery.copy(),
             flying=board.airborne.copy(),
             notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
+            refusals=tuple(pilot.refusal for pilot in self._pilots),
             rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
         )
         if len(self._external_rows):

@@ -106,7 +106,7 @@ class Flight:
         if self.airborne:
             return
         self._held_since = -math.inf
-        self.trouble = self._takeoff_refusal() or self._arm()
+        self.trouble = self.takeoff_refusal() or self._arm()
         if self.trouble:
             return
         self._end_streaming()
@@ -278,7 +278,7 @@ class Flight:
         self.phase, self._since = phase, time.monotonic()
         self.publish_airborne()
 
-    def _takeoff_refusal(self) -> str:
+    def takeoff_refusal(self) -> str:
         """Reason against a take-off; empty if none."""
         telemetry = self._telemetry
         age = time.monotonic() - telemetry.status_time

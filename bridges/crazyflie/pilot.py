@@ -102,6 +102,11 @@ class CrazyfliePilot:
         )
 
     @property
+    def refusal(self) -> str:
+        """Why the drone on the ground would refuse to take off; empty if it would not."""
+        return "" if self._flight.airborne else self._flight.takeoff_refusal()
+
+    @property
     def exchanges(self) -> int:
         """Packets received over the current link."""
         return 0 if self._link is None else self._link.exchanges

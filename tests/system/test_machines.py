@@ -196,6 +196,18 @@ def test_a_robot_that_dies_on_a_machine_is_started_again_there(lab: Machines, tm
     until(lambda: not busy(lab), "nothing is left")
 
 
+def test_a_preflight_starts_robots_on_their_machines(lab: Machines, tmp_path: Path) -> None:
+    file = triangle(lab, tmp_path, 5.0)
+    out, _ = zenpark(lab, "preflight", str(file), "--hop", "--out", str(tmp_path / "out"), "--json").communicate(
+        timeout=120
+    )
+    said = json.loads(out[out.index("\n{") :])
+    assert said["ok"], out
+    made = {robot["robot"]: {check["check"]: check["verdict"] for check in robot["checks"]} for robot in said["robots"]}
+    assert [made["KH01"]["drive"], made["KH02"]["clock"], made["CF01"]["hop"]] == ["ok"] * 3
+    assert busy(lab) == []
+
+
 def test_hosts_check_tells_of_each_machine(lab: Machines, tmp_path: Path) -> None:
     file = experiment(lab, tmp_path, 4.0)
     checked = zenpark(lab, "hosts", "check", str(file))

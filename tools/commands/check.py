@@ -114,6 +114,8 @@ def preflight(
     """Check the robots of an experiment before the first flight; motors turn with --hop and --stop only."""
     import sys
 
+    import msgspec
+
     from agents.runtime.command_line import Interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions
@@ -143,19 +145,17 @@ def preflight(
     finally:
         remove_unused(folder)
     red = [each.robot for each in found if each.red]
+    ok = not (red or ended or emergency)
+    said = msgspec.to_builtins({"file": str(read.path), "ok": ok, "robots": found, "folder": str(folder)})
+    text = msgspec.json.format(msgspec.json.encode(said), indent=2)
+    if folder.exists():
+        (folder / "preflight.json").write_bytes(text + b"\n")
     if as_json:
-        import json
-
-        import msgspec
-
-        said = msgspec.to_builtins(
-            {"file": str(read.path), "ok": not (red or ended or emergency), "robots": found, "folder": str(folder)}
-        )
-        print(json.dumps(said, indent=2))
+        print(text.decode())
     else:
         _print_checks(found)
         verdict = f"red: {', '.join(red)}" if red else "interrupted" if ended else "nothing is red"
-        print(f"\n{verdict}; logs: {folder / 'logs'}")
+        print(f"\n{verdict}; {folder / 'preflight.json'}, logs: {folder / 'logs'}")
     if emergency:
         print(f"zenpark: {emergency.words}", file=sys.stderr)
     return 130 if ended else int(bool(red or emergency))

@@ -139,7 +139,9 @@ def _address(each: Observed) -> Check:
         return _bad("address", each.status.body, remedy)
     if silent:
         return Check(check="address", verdict="unknown", found="it does not say whether it answers")
-    return Check(check="address", verdict="ok", found="answers" + (f"; {each.status.body}" if each.status.body else ""))
+    if each.status.body:
+        return Check(check="address", verdict="warn", found=f"answers; {each.status.body}", remedy="its bridge says so")
+    return Check(check="address", verdict="ok", found="answers")
 
 
 def _firmware(name: str, observed: Mapping[str, Observed], today: date) -> Check:

@@ -77,8 +77,9 @@ def test_what_some_bodies_say_of_their_rows_stands_at_their_rows():
     both, _, b = interleaved()
     assert both.read(0.0).notes == ()
     plain = b.read
-    b.read = lambda t: replace(plain(t), notes=("locked", "", "tumbled"))
+    b.read = lambda t: replace(plain(t), notes=("locked", "", "tumbled"), refusals=("", "", "upside down"))
     assert both.read(0.0).notes == ("locked", "", "", "", "tumbled")
+    assert both.read(0.0).refusals == ("", "", "", "", "upside down")
 
 
 def test_each_body_is_told_what_concerns_its_rows():

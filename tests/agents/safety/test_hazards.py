@@ -213,7 +213,9 @@ def spoiled(swarm, **values):
     def spoil(t, state):
         for name, value in values.items():
             was = getattr(state, name)
-            if was is None:
+            if isinstance(value, tuple):
+                setattr(state, name, value)
+            elif was is None:
                 setattr(state, name, np.tile(np.asarray(value, dtype=float), (len(state.yaw), 1)))
             else:
                 was = was.copy()

@@ -16,6 +16,7 @@ FAILURES = {
     "no position": ({"position": np.nan}, "no position of its own"),
     "no heading": ({"yaw": np.nan}, "it does not know which way it looks"),
     "outside": ({"position": [2.3, 0.0, 0.0]}, "it is 0.30 m outside the arena"),
+    "locked": ({"refusals": ("locked: switch it off and on",)}, "locked: switch it off and on"),
     "elsewhere": ({"position": [0.5, 0.2, 0.0]}, "it is 0.40 m from its start (0.1, 0.2), more than 0.3 m"),
     "on a table": ({"position": [0.1, 0.2, 0.7]}, "it does not stand on the floor, but at z = 0.70 m"),
     "carried": ({"velocity": [0.0, 0.4, 0.3]}, "it is not at rest: 0.50 m/s"),

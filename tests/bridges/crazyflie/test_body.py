@@ -91,6 +91,7 @@ def test_emergency_stop():
         process.until(lambda: supervised(twin) == State.LOCKED, "locked")
         process.until(lambda: truth(twin)[2] == 0.0, "down")
         process.until(lambda: not process.state.flying[0] and "locked" in process.state.notes[0], "said so")
+        process.until(lambda: process.state.refusals == ("locked: switch it off and on",), "refuses to take off")
         process.body.takeoff(np.array([0]), np.array([0.5]))
         process.until(lambda: "switch it off and on" in process.state.notes[0] and not process.state.flying[0], "no")
         assert truth(twin)[2] == 0.0

@@ -115,6 +115,7 @@ def test_one_of_several_drones_of_a_process_that_never_answered():
     [
         ({"battery": 0.1}, "battery", "10%, 4.10 V, less than 20%"),
         ({"phase": "idle", "reason": "it is not level: it leans 40°"}, "ready", "it is not level: it leans 40°"),
+        ({"phase": "idle", "reason": "locked: switch it off and on"}, "ready", "locked: switch it off and on"),
     ],
 )
 def test_what_its_own_process_says(said, check, text):
@@ -188,3 +189,10 @@ def test_a_tello_takes_off_to_its_own_height():
     robots = {"T1": Robot(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
     case = alone(Experiment(title="", duration_s=1.0, robots=robots))
     assert {name: robot.hover for name, robot in case.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
+
+
+def test_what_a_bridge_says_of_a_robot_that_answers_is_a_warning():
+    each = standing()
+    each.status = status(body="3 positions refused")
+    made = found(each, "address")
+    assert (made.verdict, made.found) == ("warn", "answers; 3 positions refused")
