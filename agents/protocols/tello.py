@@ -20,7 +20,9 @@ STATE_HZ: Final = 10.0
 AUTO_LAND_S: Final = 15.0  # without a command for this long the drone lands by itself
 TAKEOFF_HEIGHT: Final = 0.8  # [m] to which `takeoff` climbs
 STICK: Final = 100  # full deflection
-STICK_SPEED: Final = 1.0  # [m/s] at full deflection; measured on the wire only, the maker gives no figure
+STICK_SPEED: Final = 1.0  # [m/s] at full deflection, unless measured: a guess, the maker gives no figure
+TEST_SPEED: Final = 0.2  # [m/s] of the stick test, as far as known: 2 s forward, at rest 1 s before and after, 2 s back
+TEST_ENDS_S: Final = (1.0, 3.0, 4.0, 6.0, 7.0)  # [s] ends of its parts, from the end of the take-off
 STICK_TURN: Final = math.radians(100.0)  # [rad/s] at full deflection, likewise
 
 
@@ -30,8 +32,13 @@ class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     silence_s: float = 1.0  # [s] without a state line after which the drone counts as lost; it comes at 10 Hz
     rc_hz: float = 20.0  # [1/s] stick positions sent
     low_battery: float = 0.10  # below this charge it does not take off, and lands
+    stick_speed: float = STICK_SPEED  # [m/s] at full deflection of the sticks; `zenpark preflight --sticks` measures it
+    stick_test: bool = False  # after the take-off it flies the stick test instead of setpoints
+    twin_stick_speed: float = STICK_SPEED  # for the twin only: [m/s] that its sticks really give
 
     def __post_init__(self) -> None:
+        if not (0.1 <= self.stick_speed <= 10.0 and 0.1 <= self.twin_stick_speed <= 10.0):
+            raise ValueError("stick_speed must be 0.1 to 10 m/s")
         if not 0.3 <= self.silence_s <= 10.0:
             raise ValueError("silence_s must be 0.3 to 10 s, for the state comes every 0.1 s")
         if not 2.0 <= self.rc_hz <= 50.0:
@@ -58,27 +65,46 @@ def endpoint(robot: str, address: str) -> tuple[str, int]:
     return host, port
 
 
-def sticks(velocity: tuple[float, float, float], yaw_rate: float, yaw: float) -> tuple[int, int, int, int]:
-    """Arguments of `rc` (right, forward, up, clockwise) for a velocity in the world [m/s] and a yaw rate [rad/s]."""
+def sticks(
+    velocity: tuple[float, float, float], yaw_rate: float, yaw: float, stick_speed: float = STICK_SPEED
+) -> tuple[int, int, int, int]:
+    """Arguments of `rc` (right, forward, up, clockwise) for a velocity in the world [m/s] and a yaw rate [rad/s].
+
+    `stick_speed` is the speed at full deflection [m/s].
+    """
     x, y, z = velocity
     cos, sin = math.cos(yaw), math.sin(yaw)
     forward, left = cos * x + sin * y, cos * y - sin * x
     return (
-        _stick(-left / STICK_SPEED),
-        _stick(forward / STICK_SPEED),
-        _stick(z / STICK_SPEED),
+        _stick(-left / stick_speed),
+        _stick(forward / stick_speed),
+        _stick(z / stick_speed),
         _stick(-yaw_rate / STICK_TURN),
     )
 
 
-def motion(rc: tuple[int, int, int, int], yaw: float) -> tuple[float, float, float, float]:
+def test_deflection(stick_speed: float) -> int:
+    """Deflection of the sticks in the stick test: 20 unless another `stick_speed` is known."""
+    return _stick(TEST_SPEED / stick_speed)
+
+
+def stick_test(elapsed: float, stick_speed: float) -> tuple[int, int, int, int] | None:
+    """Sticks of the stick test `elapsed` [s] after the take-off; None when it is over."""
+    deflection = test_deflection(stick_speed)
+    forward = (0, deflection, 0, -deflection, 0)
+    return next(((0, stick, 0, 0) for stick, end in zip(forward, TEST_ENDS_S, strict=True) if elapsed < end), None)
+
+
+def motion(
+    rc: tuple[int, int, int, int], yaw: float, stick_speed: float = STICK_SPEED
+) -> tuple[float, float, float, float]:
     """Velocity in the world [m/s] and yaw rate [rad/s] of sticks at `yaw`: the inverse of `sticks`."""
     right, forward, up, clockwise = (value / STICK for value in rc)
     cos, sin = math.cos(yaw), math.sin(yaw)
     return (
-        STICK_SPEED * (cos * forward + sin * right),
-        STICK_SPEED * (sin * forward - cos * right),
-        STICK_SPEED * up,
+        stick_speed * (cos * forward + sin * right),
+        stick_speed * (sin * forward - cos * right),
+        stick_speed * up,
         -STICK_TURN * clockwise,
     )
 

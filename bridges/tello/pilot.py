@@ -71,7 +71,7 @@ class TelloPilot:
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
         self._running = self._aloft = -math.inf  # when the motors' clock last moved, when it was last not low
-        self._began_at = self._sent_at = self._cut_at = -math.inf
+        self._began_at = self._sent_at = self._cut_at = self._up_at = -math.inf
         self._send_error = ""
 
     @property
@@ -195,23 +195,26 @@ class TelloPilot:
             self._send_and_await("takeoff", now)
 
     def _airborne(self, now: float) -> None:
-        self.duty = Duty.HOLD
+        self.duty, self._up_at = Duty.HOLD, now
         self._running = self._aloft = now
 
     def _sticks(self, now: float, last_read: float) -> tuple[int, int, int, int]:
         """Stick values for the setpoint or toward the position to hold; zeros if neither is fresh."""
         if now - last_read > FRESH_S:
             return ZERO_STICKS
+        scale = self._settings.stick_speed
+        if self._settings.stick_test and (test := protocol.stick_test(now - self._up_at, scale)) is not None:
+            return test if math.isfinite(self.position[0]) else ZERO_STICKS
         if self.duty is Duty.FLY and now - self.setpoint_time <= FRESH_S:
             x, y, z, turn = self.setpoint
-            return protocol.sticks((x, y, z), turn, self.yaw)
+            return protocol.sticks((x, y, z), turn, self.yaw, scale)
         if self.duty is Duty.HOLD and math.isfinite(self.position[0]):
             limit, response = self._kind.speed, self._kind.response
             x, y, z = (
                 max(-limit, min(limit, response * (there - here)))
                 for there, here in zip(self.hold_position, self.position, strict=True)
             )
-            return protocol.sticks((x, y, z), 0.0, self.yaw)
+            return protocol.sticks((x, y, z), 0.0, self.yaw, scale)
         return ZERO_STICKS
 
     def _receive(self, now: float) -> None:

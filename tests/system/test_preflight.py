@@ -88,3 +88,39 @@ def test_drones_hop_through_their_bridges_under_motion_capture(tmp_path: Path) -
     assert " V under load" in drone["hop"]["found"]
     assert tello["hop"]["verdict"] == "ok"
     assert "of 0.8 m high" in tello["hop"]["found"]
+
+
+TELLO = """
+title = "a Tello whose sticks give less than it is told"
+duration_s = 20.0
+[robots.T1]
+kind = "tello"
+start = [0.0, 0.0, 0.0]
+hover = 0.8
+body = "tello-twin"
+position = "external"
+device = { twin_stick_speed = 0.6, stick_speed = SPEED }
+"""
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize(("believed", "verdict"), [(1.0, "bad"), (0.6, "ok")])
+def test_sticks_of_a_tello_are_measured(tmp_path: Path, believed: float, verdict: str) -> None:
+    """Under simulated motion capture, at a fifth of its sticks, before any loop is closed."""
+    file = tmp_path / "tello.toml"
+    file.write_text(TELLO.replace("SPEED", str(believed)))
+    command = [sys.executable, "-m", "tools.guard", "preflight", str(file), "--json", "--sticks"]
+    done = subprocess.run(
+        [*command, "--bodies", "protocol", "--out", str(tmp_path / "out")],
+        cwd=ROOT,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    (robot,) = json.loads(done.stdout)["robots"]
+    sticks = next(check for check in robot["checks"] if check["check"] == "sticks")
+    assert sticks["verdict"] == verdict, done.stdout
+    assert float(sticks["found"].split()[0]) == pytest.approx(0.6, rel=0.05)
+    assert ("stick_speed = 0." in sticks["remedy"]) == (verdict == "bad")

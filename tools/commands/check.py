@@ -105,13 +105,16 @@ def preflight(
     stop: Annotated[
         bool, typer.Option("--stop", help="Robot by robot: an emergency stop while it begins to climb, or drives.")
     ] = False,
+    sticks: Annotated[
+        bool, typer.Option("--sticks", help="Tello by Tello: measures how fast it flies at a fifth of its sticks.")
+    ] = False,
     here: Here = False,
     lab: Lab = None,
     identity: As = "operator",
     out: Out = None,
     as_json: AsJson = False,
 ) -> int:
-    """Check the robots of an experiment before the first flight; motors turn with --hop and --stop only."""
+    """Check the robots of an experiment before the first flight; motors turn with --hop, --stop and --sticks only."""
     import sys
 
     import msgspec
@@ -135,7 +138,7 @@ def preflight(
                 read,
                 folder,
                 options,
-                Trials(hop=hop, stop=stop),
+                Trials(hop=hop, stop=stop, sticks=sticks),
                 show=shown(quiet=as_json),
                 interrupted=interrupted,
                 emergency=emergency,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import re
 import socket
 import zlib
 from collections import deque
@@ -39,6 +40,21 @@ MOVES: Final = {
 }
 
 
+LOWEST_FLIP_CHARGE: Final = 0.50
+FLIPS: Final = {"l": "left", "r": "right", "f": "forward", "b": "back"}
+FLIP_M: Final = 0.2  # by which a flip displaces it
+PASSED: Final = 0.15  # [m] distance from a point of an arc at which the next one is flown to
+ARC_M: Final = 0.2
+LINE: Final = 1e-6  # [m⁴] three points with a smaller squared area are on a line
+PAD: Final = re.compile(r"m-?[1-8]")
+MANOEUVRES: Final = (*MOVES, "go", "curve", "jump", "flip", "cw", "ccw")
+OTHERS: Final = (
+    *("command", "takeoff", "land", "emergency", "stop", "rc", "speed"),
+    *("streamon", "streamoff", "mon", "moff", "mdirection"),
+)
+TEXT_ANSWERS: Final = {"wifi": "ok", "ap": "ok,drone will reboot in 3s"}  # commands with arguments of text
+
+
 class Mode(Enum):
     """State of a drone."""
 
@@ -54,8 +70,13 @@ class Mode(Enum):
 class _Drone:
     """Socket, client and commands of one drone."""
 
-    def __init__(self, wire: socket.socket, faults: Faults, chance: np.random.Generator) -> None:
+    def __init__(
+        self, wire: socket.socket, faults: Faults, chance: np.random.Generator, chosen: protocol.TelloSettings
+    ) -> None:
         self.wire, self.faults, self._chance = wire, faults, chance
+        self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
+        self.silent_until = -math.inf  # end of a gap of the Wi-Fi [s]
+        self.seeks_pads = False  # mission pads are switched on
         self.mode = Mode.GROUND
         self.sdk = False
         self.peer: tuple[str, int] | None = None  # sender of the last command
@@ -63,6 +84,7 @@ class _Drone:
         self.last_command = 0.0
         self.sticks = (0, 0, 0, 0)
         self.goal = np.zeros(3)
+        self.further: list[Array] = []  # points after the goal
         self.heading = 0.0
         self.pace = protocol.STICK_SPEED  # [m/s] of moves
         self.motors_s = 0.0
@@ -80,13 +102,17 @@ class _Drone:
         if self.aloft:
             self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
 
+    def silent(self, t: float) -> bool:
+        """Whether the Wi-Fi is gone at time `t` [s]."""
+        return t < self.silent_until or self.faults.silent(t)
+
     def lost(self) -> bool:
         """Whether this packet is lost."""
         return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
 
     def send(self, text: str, to: tuple[str, int], t: float) -> None:
         """Queue a packet; sent at once, or after the injected delay."""
-        if not self.lost():
+        if not (self.silent(t) or self.lost()):
             self._outbox.append((t + self.faults.delay_s, text.encode("ascii", "replace"), to))
             self.flush(t)
 
@@ -112,8 +138,9 @@ class TelloDevice:
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
         count = len(body.names)
-        for name, table in zip(body.names, body.device, strict=True):
-            settings(protocol.TelloSettings, name, table)
+        chosen = [
+            settings(protocol.TelloSettings, name, table) for name, table in zip(body.names, body.device, strict=True)
+        ]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
         self._model = Quadrotor(body.kinds, body.start, body.yaw, self._dt)
@@ -126,12 +153,16 @@ class TelloDevice:
         try:
             for row, name in enumerate(body.names):
                 chance = np.random.default_rng([body.seeds[row], zlib.crc32(name.encode()), zlib.crc32(b"loss")])
-                self._drones.append(_Drone(_listen(name, body.addresses[row]), request.faults, chance))
+                self._drones.append(_Drone(_listen(name, body.addresses[row]), request.faults, chance, chosen[row]))
         except BodyError:
             self.close()
             raise
         places = (drone.wire.getsockname() for drone in self._drones)
         self.addresses = tuple(f"tello://{host}:{port}" for host, port in places)
+
+    def silence(self, row: int, seconds: float) -> None:
+        """Begin a gap of a drone's Wi-Fi: nothing is received in either direction, the sticks stay as they are."""
+        self._drones[row].silent_until = self._t + seconds
 
     def sockets(self) -> Sequence[socket.socket]:
         """See `Device.sockets`."""
@@ -145,7 +176,7 @@ class TelloDevice:
                     packet, sender = drone.wire.recvfrom(1024)
                 except OSError:
                     return
-                if not (drone.faults.silent(t) or drone.lost()):
+                if not (drone.silent(t) or drone.lost()):
                     self._receive(row, packet, sender, t)
 
     def advance(self, t: float) -> None:
@@ -161,8 +192,7 @@ class TelloDevice:
                 late = t - drone.state_due
                 period = 1.0 / protocol.STATE_HZ
                 drone.state_due += period if late < period else late + period  # missed packets are not repeated
-                if not drone.faults.silent(t):
-                    drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
+                drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
             drone.flush(t)
 
     def truth(self) -> tuple[Array, Array]:
@@ -212,12 +242,14 @@ class TelloDevice:
     def _execute(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
         """Execute a command; returns the answer, empty if there is none, or none yet."""
         drone = self._drones[row]
+        if word in MANOEUVRES:
+            return self._manoeuvre(row, word, arguments, sender) if drone.aloft else "error Motor stop"
+        if word not in OTHERS:
+            return TEXT_ANSWERS.get(word, f"unknown command: {word}")
         try:
             values = [int(argument) for argument in arguments]
         except ValueError:
             return "error"
-        if word in (*MOVES, "go", "cw", "ccw"):
-            return self._manoeuvre(row, word, values, sender) if drone.aloft else "error Motor stop"
         if word in ("takeoff", "land", "emergency"):
             return self._start_automatic(row, word, sender)
         if word == "rc" and len(values) == 4:
@@ -231,8 +263,8 @@ class TelloDevice:
             answer = "ok" if len(values) == 1 and 10 <= values[0] <= 100 else "out of range"
             drone.pace = 0.01 * values[0] if answer == "ok" else drone.pace
         else:
-            known = ("command", "streamon", "streamoff", "mon", "moff", "mdirection")
-            answer = "ok" if word in known else "error" if word == "rc" else f"unknown command: {word}"
+            drone.seeks_pads = word == "mon" or (word != "moff" and drone.seeks_pads)
+            answer = "error" if word == "rc" else "ok"
         return answer
 
     def _start_automatic(self, row: int, word: str, sender: tuple[str, int]) -> str:
@@ -255,29 +287,47 @@ class TelloDevice:
         drone.mode, drone.answer_to = Mode.LAND, sender
         return ""
 
-    def _manoeuvre(self, row: int, word: str, values: list[int], sender: tuple[str, int]) -> str:
+    def _manoeuvre(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
+        """Begin a move or turn; returns the answer of a refusal, else nothing yet."""
         drone, yaw = self._drones[row], float(self._model.yaw[row])
-        if word in ("cw", "ccw"):
-            if len(values) != 1 or not 1 <= values[0] <= 360:
-                return "out of range"
-            drone.heading = yaw + math.radians(values[0]) * (-1.0 if word == "cw" else 1.0)
-            drone.mode, drone.answer_to = Mode.TURN, sender
-            return ""
-        if word == "go":
-            if len(values) != 4 or max(map(abs, values[:3])) > 500 or not 10 <= values[3] <= 100:
-                return "out of range"
-            if max(map(abs, values[:3])) < 20:
-                return "error"
-            way, drone.pace = 0.01 * np.array(values[:3]), 0.01 * values[3]
-        else:
-            if len(values) != 1 or not 20 <= values[0] <= 500:
-                return "out of range"
-            way = 0.01 * values[0] * np.array(MOVES[word])
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        turned = np.array([cos * way[0] - sin * way[1], sin * way[0] + cos * way[1], way[2]])
-        drone.goal = self._model.position[row] + turned
-        drone.mode, drone.answer_to = Mode.MOVE, sender
+        try:
+            if word in ("cw", "ccw"):
+                (angle,) = _whole(arguments, 1)
+                _require("out of range", met=1 <= angle <= 360)
+                drone.mode = Mode.TURN
+                drone.heading = yaw + math.radians(angle) * (-1.0 if word == "cw" else 1.0)
+            else:
+                ways, drone.pace = self._ways(drone, word, arguments)
+                cos, sin = math.cos(yaw), math.sin(yaw)
+                turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+                drone.goal, *drone.further = [self._model.position[row] + turn @ way for way in ways]
+                drone.mode = Mode.MOVE
+        except _Refusal as refusal:
+            return str(refusal)
+        drone.answer_to = sender
         return ""
+
+    @staticmethod
+    def _ways(drone: _Drone, word: str, arguments: list[str]) -> tuple[list[Array], float]:
+        """Points (3,) of a move one after the other [m], forward, left and up of the drone, and its pace [m/s]."""
+        if word == "flip":  # attitude is not simulated: a short way in its direction
+            direction = FLIPS.get(" ".join(arguments))
+            if direction is None or drone.charge < LOWEST_FLIP_CHARGE:
+                raise _Refusal("error")
+            return [FLIP_M * np.array(MOVES[direction])], drone.pace
+        if arguments and PAD.fullmatch(arguments[-1]):
+            raise _Refusal("error No valid marker")  # there are no mission pads
+        if word in MOVES:
+            (distance,) = _whole(arguments, 1)
+            _require("out of range", met=20 <= distance <= 500)
+            return [0.01 * distance * np.array(MOVES[word])], drone.pace
+        count, fastest = {"go": (1, 100), "curve": (2, 60)}.get(word, (0, 0))
+        _require("error", met=count > 0)
+        *way, speed = _whole(arguments, 3 * count + 1)
+        _require("out of range", met=max(map(abs, way)) <= 500 and 10 <= speed <= fastest)
+        points = 0.01 * np.array(way).reshape(count, 3)
+        _require("error", met=bool((np.abs(points) >= 0.2).any(axis=1).all()))
+        return ([points[0]] if word == "go" else _arc(*points)), 0.01 * speed
 
     def _yaw(self, row: int) -> int:
         """Yaw as reported: degrees clockwise from the yaw at power-on, -180 to 179."""
@@ -285,9 +335,10 @@ class TelloDevice:
 
     def _state(self, row: int) -> str:
         drone, yaw, height = self._drones[row], float(self._model.yaw[row]), float(self._truth[row, 2])
+        pad, at = (-1, -100) if drone.seeks_pads else (-2, -200)  # none seen; not searched for
         right, forward, up, _ = protocol.sticks(tuple(self._model.velocity[row].tolist()), 0.0, yaw)
         return (
-            f"mid:-1;x:-100;y:-100;z:-100;mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw(row)};"
+            f"mid:{pad};x:{at};y:{at};z:{at};mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw(row)};"
             f"vgx:{int(forward / 10)};vgy:{int(right / 10)};vgz:{int(-up / 10)};templ:63;temph:66;"
             f"tof:{max(10, round(100.0 * height))};h:{10 * int(10.0 * height + 1e-6)};"
             f"bat:{round(100.0 * drone.charge)};baro:{170.0 + height:.2f};time:{int(drone.motors_s)};"
@@ -314,7 +365,7 @@ class TelloDevice:
     def _model_setpoint(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
         yaw = float(self._model.yaw[row])
         if drone.mode is Mode.STICKS:
-            return protocol.motion(drone.sticks, yaw)
+            return protocol.motion(drone.sticks, yaw, drone.stick_speed)
         if drone.mode is Mode.TURN:
             rate = max(-protocol.STICK_TURN, min(protocol.STICK_TURN, 4.0 * (drone.heading - yaw)))
             return 0.0, 0.0, 0.0, rate
@@ -339,8 +390,11 @@ class TelloDevice:
         elif drone.mode is Mode.FALL and z <= 0.0:
             drone.mode = Mode.GROUND
         elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(row, drone):
-            drone.hover()
-            drone.finish("ok", t)
+            if drone.mode is Mode.MOVE and drone.further:
+                drone.goal = drone.further.pop(0)
+            else:
+                drone.hover()
+                drone.finish("ok", t)
         if not flying:
             return
         drone.motors_s += self._dt
@@ -354,7 +408,42 @@ class TelloDevice:
     def _arrived(self, row: int, drone: _Drone) -> bool:
         if drone.mode is Mode.TURN:
             return abs(drone.heading - float(self._model.yaw[row])) < NEAR_YAW
-        return float(np.abs(drone.goal - self._model.position[row]).max()) < NEAR
+        near = PASSED if drone.further else NEAR
+        return float(np.abs(drone.goal - self._model.position[row]).max()) < near
+
+
+class _Refusal(Exception):
+    """Answer to a command that is not executed."""
+
+
+def _require(answer: str, *, met: bool) -> None:
+    if not met:
+        raise _Refusal(answer)
+
+
+def _whole(arguments: list[str], count: int) -> list[int]:
+    """Arguments as whole numbers."""
+    try:
+        values = [int(argument) for argument in arguments]
+    except ValueError:
+        raise _Refusal("error") from None
+    _require("out of range", met=len(values) == count)
+    return values
+
+
+def _arc(first: Array, second: Array) -> list[Array]:
+    """Points (3,) on the arc from the origin through `first` to `second` [m], `ARC_M` apart at most."""
+    normal = np.cross(first, second)
+    area = float(normal @ normal)
+    _require("error", met=area > LINE)
+    centre = np.cross((first @ first) * second - (second @ second) * first, normal) / (2.0 * area)
+    radius = float(np.linalg.norm(centre))
+    _require("error", met=0.5 <= radius <= 10.0)
+    out = -centre
+    side = np.cross(normal / math.sqrt(area), out)
+    end = math.atan2(float((second - centre) @ side), float((second - centre) @ out)) % (2.0 * math.pi)
+    angles = np.linspace(0.0, end, max(2, math.ceil(end * radius / ARC_M)) + 1)[1:]
+    return [centre + out * math.cos(angle) + side * math.sin(angle) for angle in angles]
 
 
 def _listen(name: str, address: str) -> socket.socket:

@@ -78,13 +78,20 @@ class CaseProcesses:
         self.adopted = {*there, *self.away}
         return sorted(self.adopted)
 
-    def start(self, only: Collection[str] | None = None) -> None:
-        """Start all robots that are neither adopted nor on standby, or `only` some of them, on their machines."""
-        robots = self._context.experiment.robots
+    def start(self, only: Collection[str] | None = None, changed: Mapping[str, Robot] | None = None) -> None:
+        """Start all robots that are neither adopted nor on standby, or `only` some of them, on their machines.
+
+        `changed` are robots with other settings, this time only.
+        """
+        robots, file, experiment = self._context.experiment.robots, self._addressed, self._reached
+        if changed:
+            experiment = msgspec.structs.replace(experiment, robots={**experiment.robots, **changed})
+            file = self._context.folder / f"{self._context.case}-changed.json"
+            file.write_bytes(write_json(experiment))
         for names in self._groups.values():
             wanted = names if only is None else [name for name in names if name in only]
             if missing := [name for name in wanted if not (name in self.adopted or robots[name].standby)]:
-                self._start(missing, self._addressed, self._reached)
+                self._start(missing, file, experiment)
 
     def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
         """Start the process of the robots `names` while the run is under way.

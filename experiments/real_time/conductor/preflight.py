@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +22,7 @@ from agents.body.kinds import TELLO
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
+from agents.protocols import tello
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
 from experiments.file.document import Document, write_json
 from experiments.real_time.conductor import preflight_checks as checks
@@ -56,6 +57,7 @@ class Trials:
 
     hop: bool = False  # drones hop to `HOP_M` (see `alone`), robots on wheels drive `DRIVE_M`
     stop: bool = False  # emergency stop of a drone that begins to climb, of a robot on wheels that drives
+    sticks: bool = False  # Tellos fly the stick test, in which no loop is closed
 
 
 def check_robots(
@@ -233,9 +235,10 @@ class Inspector:
     def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
         what = checks.hop_of(each.robot)
-        wanted = [(what, self._trials.hop), ("stop, motors on", self._trials.stop)]
-        for check, asked in wanted:
-            option = "--stop" if check.startswith("stop") else "--hop"
+        wanted = [(what, "--hop", self._trials.hop), ("stop, motors on", "--stop", self._trials.stop)]
+        if each.robot.kind == TELLO.name:  # first: the other flights are steered by what it measures
+            wanted.insert(0, ("sticks", "--sticks", self._trials.sticks))
+        for check, option, asked in wanted:
             if not asked:
                 yield checks.not_tried(check, f"{option} tries it")
             elif red or self._context.ended():
@@ -244,23 +247,43 @@ class Inspector:
                 )
             else:
                 self._phase(f"{name}: {check}")
-                tried = self._move(name, each.robot, stop=option == "--stop")
+                tried = (
+                    self._test_sticks(name)
+                    if check == "sticks"
+                    else self._move(name, each.robot, stop=option == "--stop")
+                )
                 if self._context.ended():
                     yield checks.not_tried(check, "interrupted; it is down")
                     continue
-                made = (
-                    checks.stop_in_motion(each, tried)
-                    if option == "--stop"
-                    else checks.hop(each, tried, self._experiment.safety)
-                )
+                if check == "sticks":
+                    made = checks.sticks(each, tried)
+                elif option == "--stop":
+                    made = checks.stop_in_motion(each, tried)
+                else:
+                    made = checks.hop(each, tried, self._experiment.safety)
                 red = made.verdict == "bad"
                 yield made
 
-    def _move(self, name: str, robot: Robot, *, stop: bool) -> Tried:
+    def _test_sticks(self, name: str) -> Tried:
+        """One Tello flies the stick test at the height of its take-off."""
+        robot = self._processes.robot(name)
+        device = robot.device | {"stick_test": True}
+        robot = msgspec.structs.replace(robot, hover=tello.TAKEOFF_HEIGHT, device=device)
+        return self._move(name, robot, stop=False, changed={name: robot}, hold_s=tello.TEST_ENDS_S[-1])
+
+    def _move(
+        self,
+        name: str,
+        robot: Robot,
+        *,
+        stop: bool,
+        changed: Mapping[str, Robot] | None = None,
+        hold_s: float = HOLD_S,
+    ) -> Tried:
         """One robot in a process of its own hops or drives, and lands or is stopped."""
         tried = Tried()
         self._robots[name].forget_process()
-        self._processes.start([name])
+        self._processes.start([name], changed)
         try:
             self._wait_ready([name])
             if not self._robots[name].reached("ready"):
@@ -273,7 +296,7 @@ class Inspector:
                     self._wait(TRY_S, lambda: _moved(tried.states, robot))
                     self._stop(name, tried)
                 else:
-                    self._fly(name, robot, tried)
+                    self._fly(name, robot, tried, hold_s)
         finally:
             self._processes.end_robots()  # lands it, whatever has happened
         return tried
@@ -286,8 +309,8 @@ class Inspector:
             reply = self._order(name, messages.Order("start", at=self._clock.utc() + start_lead_s(1)))
         return "" if reply.ok else f"refused: {reply.reason}"
 
-    def _fly(self, name: str, robot: Robot, tried: Tried) -> None:
-        """Follow a hop or a drive to its end."""
+    def _fly(self, name: str, robot: Robot, tried: Tried, hold_s: float) -> None:
+        """Follow a hop or a drive to its end; a drone lands after `hold_s` [s] at its height."""
         seen = self._robots[name]
         measured = -math.inf
 
@@ -310,7 +333,7 @@ class Inspector:
             self._wait(CLIMB_S, lambda: over() or seen.reached("airborne"))
             if not seen.reached("airborne"):
                 tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._why(name)}"
-            elif not self._wait(HOLD_S, over):
+            elif not self._wait(hold_s, over):
                 tried.states = list(tried.states)  # the landing is no part of it
                 self._order(name, messages.Order("land"))
                 if not self._wait(LAND_S, lambda: seen.reached("done") or name in self._ended):

@@ -132,6 +132,45 @@ def test_it_climbs_to_its_height_and_holds_its_place_until_setpoints_come():
     assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)  # a setpoint of half a second ago is none
 
 
+def test_sticks_of_another_scale():
+    """A drone that flies 0.5 m/s at full deflection gets twice the sticks of one that flies 1 m/s."""
+    cockpit = Cockpit(stick_speed=0.5).fly()
+    cockpit.pilot.position, cockpit.pilot.yaw = (0.9, 2.0, 0.6), 0.0
+    cockpit.pass_(0.05)
+    assert cockpit.drone.sticks[-1] == (0, 20, 0, 0)
+    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
+        Duty.FLY,
+        (0.0, 0.2, 0.0, 0.0),
+        cockpit.now,
+    )
+    cockpit.pass_(0.05)
+    assert cockpit.drone.sticks[-1] == (-40, 0, 0, 0)
+
+
+def test_the_stick_test_closes_no_loop():
+    """Forward for 2 s, back for 2 s, whatever setpoints say; with the position lost the sticks rest."""
+    cockpit = Cockpit(stick_test=True).fly()
+    cockpit.drone.sticks.clear()
+    flown = []
+    for _ in range(70):
+        cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
+            Duty.FLY,
+            (0.5, 0.5, 0.5, 0.5),
+            cockpit.now,
+        )
+        cockpit.pass_(0.1)
+        flown.append(cockpit.drone.sticks[-1])
+    forward = [sticks[1] for sticks in flown]
+    assert {sticks[:1] + sticks[2:] for sticks in flown[:68]} == {(0, 0, 0)}
+    assert (forward.count(20), forward.count(-20)) == (20, 20)
+    assert forward.index(20) == pytest.approx(9, abs=1)
+    assert flown[-1] == (-50, 50, 50, -29)  # it is over
+    lost = Cockpit(stick_test=True).fly()
+    lost.pilot.position = (np.nan,) * 3
+    lost.pass_(2.0)
+    assert lost.drone.sticks[-1] == (0, 0, 0, 0)
+
+
 def test_the_sticks_keep_it_alive():
     cockpit = Cockpit().fly()
     before = len(cockpit.drone.sticks)

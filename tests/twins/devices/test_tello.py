@@ -164,6 +164,18 @@ def test_moves_end_where_they_should(talk):
         ("takeoff", "error"),
         ("rc 0 0", "error"),
         ("rc a b c d", "error"),
+        ("go a 0 0 50", "error"),
+        ("go 50 0 0 50 m1", "error No valid marker"),
+        ("jump 50 0 0 50 0 m1 m2", "error No valid marker"),
+        ("flip x", "error"),
+        ("curve 100 0 0 200 0 0 30", "error"),
+        ("curve 20 10 0 40 0 0 30", "error"),
+        ("curve 100 100 0 200 0 0 90", "out of range"),
+        ("motoron", "unknown command: motoron"),
+        ("keepalive", "unknown command: keepalive"),
+        ("EXT led 1 2 3", "unknown command: EXT"),
+        ("wifi name word", "ok"),
+        ("ap name word", "ok,drone will reboot in 3s"),
         ("dance", "unknown command: dance"),
         ("why?", "unknown command: why?"),
         ("speed 50", "ok"),
@@ -174,6 +186,71 @@ def test_what_it_refuses_in_the_air(talk, command, answer):
     drone = talk()
     drone.up()
     assert drone.ask(command) == answer
+
+
+def test_a_curve_goes_through_its_points(talk):
+    """A quarter of a circle of 1 m ahead and to the left: never farther than 5 cm from it."""
+    drone = talk()
+    drone.up()
+    begin, centre = drone.place(), drone.place() + np.array([0.0, 1.0, 0.0])
+    drone.say("curve 71 29 0 100 100 0 30")
+    answers = []
+    for _ in range(80):
+        answers += [answer for answer, _ in drone.wait(0.1)]
+        assert np.linalg.norm((drone.place() - centre)[:2]) == pytest.approx(1.0, abs=0.05)
+    assert answers == ["ok"]
+    assert drone.place() - begin == pytest.approx([1.0, 1.0, 0.0], abs=0.05)
+
+
+def test_a_flip_needs_half_a_battery(talk):
+    full, half = talk(), talk(faults={"battery": 0.4})
+    for drone, answer in ((full, "ok"), (half, "error")):
+        drone.up()
+        drone.say("flip f")
+        assert [said for said, _ in drone.wait(3.0)] == [answer]
+
+
+def test_mission_pads_are_searched_for_when_switched_on(talk):
+    drone = talk()
+    drone.ask("command")
+    for command, said in (("battery?", ("-2", "-200")), ("mon", ("-1", "-100")), ("moff", ("-2", "-200"))):
+        drone.ask(command)
+        drone.wait(0.2)
+        state, _ = drone.state()
+        assert (state["mid"], state["x"]) == said
+
+
+def test_a_gap_of_the_wifi_leaves_the_sticks_as_they_are(talk):
+    """As a real one: it flies on, hears nothing, and lands 15 s after the last command if nobody comes back."""
+    drone = talk()
+    drone.up()
+    drone.say("rc 0 30 0 0")
+    drone.wait(1.0)
+    drone.state()
+    before = drone.place()
+    drone.device.silence(0, 1.0)
+    drone.say("rc 0 0 0 0")
+    drone.wait(0.95)
+    assert drone.state()[1] == 0
+    assert drone.place()[0] - before[0] == pytest.approx(0.285, abs=0.02)
+    drone.say("rc 0 0 0 0")
+    drone.wait(0.1)
+    drone.say("rc 0 0 0 0")
+    drone.wait(1.0)
+    assert drone.state()[1] > 0
+    at = drone.place()
+    drone.wait(0.5)
+    assert drone.place() == pytest.approx(at, abs=0.01)
+
+
+def test_sticks_of_another_scale(talk):
+    drone = talk(device={"twin_stick_speed": 0.6})
+    drone.up()
+    drone.say("rc 0 50 0 0")
+    drone.wait(2.0)
+    before = drone.place()
+    drone.wait(1.0)
+    assert drone.place()[0] - before[0] == pytest.approx(0.3, abs=0.01)
 
 
 def test_what_it_refuses_on_the_ground(talk):

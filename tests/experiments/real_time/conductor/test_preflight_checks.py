@@ -196,3 +196,46 @@ def test_what_a_bridge_says_of_a_robot_that_answers_is_a_warning():
     each.status = status(body="3 positions refused")
     made = found(each, "address")
     assert (made.verdict, made.found) == ("warn", "answers; 3 positions refused")
+
+
+# ---------------------------------------------------------------------- sticks of a Tello
+
+
+def pushed(forward: float, back: float, *, yaw: float = 0.5) -> list[State]:
+    """States of a drone that flies forward from 1 to 3 s and back from 4 to 6 s [m/s], with a lag."""
+    along = speed = 0.0
+    flown = []
+    for k in range(350):
+        t = 0.02 * k
+        wanted = forward if 1.0 <= t < 3.0 else -back if 4.0 <= t < 6.0 else 0.0
+        speed += 0.02 / 0.3 * (wanted - speed)
+        along += 0.02 * speed
+        flown.append(State("T1", k, t, "airborne", (along * math.cos(yaw), along * math.sin(yaw), 0.8), yaw=yaw))
+    return flown
+
+
+@pytest.mark.parametrize(
+    ("forward", "back", "believed", "verdict", "text"),
+    [
+        (0.2, 0.2, 1.0, "ok", "0.99 m/s at full deflection (0.99 forward, 0.99 back)"),
+        (0.2, 0.22, 0.5, "ok", "0.52 m/s"),  # twice the deflection
+        (0.3, 0.3, 1.0, "bad", "1.49 m/s"),
+        (0.2, 0.08, 1.0, "bad", "0.40 back"),
+        (0.0, 0.0, 1.0, "bad", "0.00 m/s"),
+    ],
+)
+def test_the_speed_of_sticks(forward, back, believed, verdict, text):
+    each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8, device={"stick_speed": believed}))
+    made = checks.sticks(each, Tried(states=pushed(forward, back)))
+    assert made.verdict == verdict, made
+    assert text in made.found
+    if forward == back == 0.3:
+        assert "stick_speed = 1.49" in made.remedy
+
+
+def test_sticks_that_could_not_be_measured():
+    each = Observed(Robot(kind="tello", start=[0.0, 0.0], hover=0.8))
+    assert checks.sticks(each, Tried(failure="not ready: no position")).verdict == "bad"
+    fast = checks.sticks(each, Tried(failure="came down by itself: it moves", states=pushed(0.5, 0.0)[:200]))
+    assert "double stick_speed" in fast.remedy
+    assert checks.sticks(each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
