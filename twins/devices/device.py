@@ -82,6 +82,7 @@ class DeviceRequest:
 
     body: BodyRequest
     faults: Faults
+    by_hand: bool = False  # without an experiment: addresses at which vendor libraries scan, where they are free
 
 
 DeviceFactory = Callable[[DeviceRequest], Device]  # entry-point group `zenpark.devices`, by the word in `body`

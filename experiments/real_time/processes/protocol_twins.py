@@ -163,7 +163,7 @@ def by_hand(
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
     request = DeviceRequest(
-        bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), _faults(faults)
+        bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), _faults(faults), by_hand=True
     )
     return _serve(word, request, experiment, connect, identity=identity)
 

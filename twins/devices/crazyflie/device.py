@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 from collections import deque
@@ -20,6 +21,7 @@ from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink
 from twins.devices.device import DeviceRequest
 
+SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
 LARGEST: Final = 64  # [bytes]
 AT_ONCE: Final = 64  # packets read from one socket before the others are served
 RECEIVE_BYTES: Final = 1 << 20
@@ -33,7 +35,7 @@ class LossyLink:
     def __init__(self, random: np.random.Generator, request: DeviceRequest) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
-        self.socket.bind((HOST, 0))
+        _bind(self.socket, (*SCANNED_PORTS, 0) if request.by_hand else (0,))
         self.socket.setblocking(False)
         self.peer: Peer | None = None  # client; None before the first packet
         self.t = 0.0  # current time [s]
@@ -88,6 +90,18 @@ class LossyLink:
             self.socket.sendto(packet, self.peer)
         except (BlockingIOError, ConnectionError):
             return  # lost, as on a radio
+
+
+def _bind(wire: socket.socket, ports: Sequence[int]) -> None:
+    """Bind to the first port that is free; 0 always is."""
+    for port in ports:
+        try:
+            wire.bind((HOST, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+        else:
+            return
 
 
 class CrazyflieTwin:

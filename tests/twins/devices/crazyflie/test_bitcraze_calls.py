@@ -1,0 +1,325 @@
+"""What Bitcraze's examples and acceptance tests ask of a Crazyflie, by the same calls of the unmodified cflib over UDP.
+
+One connection serves all: each test is a row of the list in docs/crazyflie.md.
+"""
+
+import math
+import subprocess
+import sys
+import threading
+
+import pytest
+from cflib import crtp
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.log import LogConfig
+from cflib.crazyflie.mem import CompressedSegment, CompressedStart, MemoryElement, Poly4D
+from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+from cflib.crazyflie.syncLogger import SyncLogger
+from cflib.utils.power_switch import PowerSwitch
+
+from tests.twins.loopback import Served, request
+from tests.waiting import until
+from twins.devices.crazyflie.device import open_device
+from twins.devices.device import DeviceRequest, Faults
+
+pytestmark = pytest.mark.system
+
+ANSWER_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def connected(tmp_path_factory):
+    """A twin, and cflib connected to it with all parameters read."""
+
+    if not crtp.CLASSES:
+        crtp.init_drivers()
+    with Served(open_device, request("crazyflie", ["crazyflie-twin"])) as twin:
+        cf = Crazyflie(rw_cache=str(tmp_path_factory.mktemp("cache")))
+        cf.link_statistics.start = lambda: None  # its thread of pings may join itself at the end
+        with SyncCrazyflie(twin.addresses[0], cf=cf) as scf:
+            scf.wait_for_params()
+            yield scf, twin
+
+
+@pytest.fixture
+def cf(connected):
+    return connected[0].cf
+
+
+@pytest.fixture
+def scf(connected):
+    return connected[0]
+
+
+def memory(cf, kind):
+    (found,) = cf.mem.get_mems(kind)
+    return found
+
+
+def answered(call, *arguments):
+    """Arguments of the callback that `call` gets as its last argument."""
+    said, came = [], threading.Event()
+
+    def callback(*values):
+        said.extend(values)
+        came.set()
+
+    call(*arguments, callback)
+    assert came.wait(ANSWER_S)
+    return said
+
+
+def logged(scf, period_ms=10, rows=1, **variables):
+    """Values of `rows` rows of a log block."""
+
+    block = LogConfig("test", period_ms)
+    for name, kind in variables.items():
+        block.add_variable(name.replace("__", "."), kind)
+    with SyncLogger(scf, block) as logger:
+        return [values for _, (_, values, _) in zip(range(rows), logger, strict=False)]
+
+
+# ---------------------------------------------------------------------- parameters
+
+
+def test_self_test_passed(cf):
+    """All acceptance tests begin with it."""
+    assert int(cf.param.get_value("system.selftestPassed")) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("led.bitmask", 255),  # sbs_swarm, lights of a swarm
+        ("ring.effect", 7),  # circling_square, LED examples, persistent_params
+        ("ring.fadeTime", 0.5),  # synchronized_sequence
+        ("ring.solidRed", 100),
+        ("ring.headlightEnable", 1),
+        ("led_deck_ctrl.rgb888", 0x20FF10),
+        ("colorLedBot.wrgb8888", 0x10203040),  # color_led_set
+        ("pid_attitude.pitch_kd", 0.1234),  # basicparam
+        ("pid_rate.roll_kp", 240.0),
+        ("ctrlMel.kp_xy", 0.5),
+        ("commander.enHighLevel", 1),
+        ("hlCommander.vtoff", 0.6),
+        ("stabilizer.controller", 2),
+        ("kalman.robustTwr", 1),
+        ("locSrv.extQuatStdDev", 0.06),
+        ("motion.disable", 0),
+        ("powerDist.idleThrust", 1200),
+        ("health.startPropTest", 1),
+        ("system.highlight", 1),
+    ],
+)
+def test_parameters_of_examples(cf, name, value):
+    group, own = name.split(".")
+    said = []
+    cf.param.add_update_callback(group=group, name=own, cb=lambda _, text: said.append(text))
+    cf.param.set_value(name, value)
+    until(lambda: said and float(said[-1]) == pytest.approx(value), f"{name} confirmed")
+    assert float(cf.param.get_value(name)) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("deck", ["bcFlow2", "bcZRanger2"])
+def test_deck_that_examples_wait_for(cf, deck):
+    """sbs_motion_commander and its like: 'No flow deck detected' otherwise."""
+    said = []
+    cf.param.add_update_callback(group="deck", name=deck, cb=lambda _, text: said.append(text))
+    cf.param.request_param_update(f"deck.{deck}")
+    until(lambda: said == ["1"], "the deck is there")
+
+
+def test_read_only_and_persistent_parameters(cf):
+    element = cf.param.toc.get_element_by_complete_name
+    assert element("deck.bcLighthouse4").get_readable_access() == "RO"
+    with pytest.raises(AttributeError):
+        cf.param.set_value("deck.bcLighthouse4", 1)
+    assert (element("ring.effect").is_extended(), element("ring.effect").is_persistent()) == (True, True)
+    assert (element("stabilizer.stop").is_extended(), element("stabilizer.stop").is_persistent()) == (False, False)
+    with pytest.raises(AttributeError):
+        cf.param.persistent_get_state("stabilizer.stop", lambda *_: None)
+
+
+def test_stored_parameters(cf):
+    name = "sound.effect"
+    _, state = answered(cf.param.persistent_get_state, name)
+    assert (state.is_stored, state.default_value, state.stored_value) == (False, 0, None)
+    cf.param.set_value(name, 11)
+    assert answered(cf.param.persistent_store, name) == [name, True]
+    _, state = answered(cf.param.persistent_get_state, name)
+    assert (state.is_stored, state.stored_value) == (True, 11)
+    assert answered(cf.param.persistent_clear, name) == [name, True]
+    _, state = answered(cf.param.persistent_get_state, name)
+    assert not state.is_stored
+
+
+def test_raw_parameter(cf):
+    said = []
+    cf.param.add_update_callback(group="ring", name="effect", cb=lambda _, text: said.append(int(text)))
+    cf.param.set_value_raw("ring.effect", 0x08, 13)
+    cf.param.request_param_update("ring.effect")
+    until(lambda: 13 in said, "set by its name")
+
+
+# ---------------------------------------------------------------------- logs
+
+
+def test_largest_log_block(scf):
+    """The block of the acceptance tests: 26 bytes at 100 Hz, nothing exactly level."""
+    variances = {f"gyro__{axis}Variance": "float" for axis in "xyz"}
+    angles = dict.fromkeys(("stabilizer__roll", "stabilizer__pitch", "stabilizer__yaw"), "float")
+    (values,) = logged(scf, **angles, stabilizer__thrust="uint16_t", **variances)
+    assert len(values) == 7
+    assert abs(values["stabilizer.roll"]) > 1e-4
+    assert all(values[f"gyro.{axis}Variance"] > 0.0 for axis in "xyz")
+
+
+def test_variables_of_examples(scf):
+    """autonomous_sequence, Crazyswarm2's odometry, health checks."""
+    state = {f"kalman__state{axis}": "float" for axis in ("X", "Y", "Z", "PX", "PY", "PZ")}
+    assert set(logged(scf, **state)[0]) == {name.replace("__", ".") for name in state}
+    sensors = {f"{group}__{axis}": "float" for group in ("gyro", "acc") for axis in "xyz"}
+    assert 0.9 < logged(scf, **sensors)[0]["acc.z"] < 1.1
+    power = logged(scf, pm__vbat="FP16", pm__batteryLevel="uint8_t", health__batteryPass="uint8_t")[0]
+    assert (3.0 < power["pm.vbat"] < 4.3, power["pm.batteryLevel"]) == (True, 90)
+    supervisor = logged(scf, supervisor__info="uint16_t", sys__canfly="uint8_t", radio__isConnected="uint8_t")[0]
+    assert (supervisor["supervisor.info"] & 8, supervisor["sys.canfly"], supervisor["radio.isConnected"]) == (8, 1, 1)
+
+
+# ---------------------------------------------------------------------- memories
+
+
+def test_memory_tester(scf, cf):
+    """As the swarm test rig: 1,000 bytes read, 1,000 written, no error counted."""
+
+    tester = memory(cf, MemoryElement.TYPE_MEMORY_TESTER)
+    assert answered(tester.read_data, 5, 1000) == [tester]
+    cf.param.set_value("memTst.resetW", "1")
+    assert answered(tester.write_data, 5, 1000)[0] is tester
+    assert logged(scf, memTst__errCntW="uint32_t") == [{"memTst.errCntW": 0}]
+
+
+def test_eeprom(cf):
+    """read_eeprom, write_eeprom: radio settings with a valid checksum, written and read back."""
+
+    eeprom = memory(cf, MemoryElement.TYPE_I2C)
+    answered(eeprom.update)
+    assert eeprom.valid
+    assert eeprom.elements["radio_channel"] == 80
+    assert eeprom.elements["radio_address"] == 0xE7E7E7E7E7
+    eeprom.elements["pitch_trim"] = 1.5
+    answered(eeprom.write_data)
+    eeprom.elements = {}
+    answered(eeprom.update)
+    assert (eeprom.valid, eeprom.elements["pitch_trim"]) == (True, 1.5)
+
+
+def test_deck_memory(cf):
+    """read_deck_mem: a manager that lists no deck with a memory."""
+
+    assert answered(memory(cf, MemoryElement.TYPE_DECK_MEMORY).query_decks) == [{}]
+
+
+def test_memories_of_the_led_ring(cf):
+
+    ring = memory(cf, MemoryElement.TYPE_DRIVER_LED)
+    ring.leds[3].set(r=0, g=100, b=0)
+    assert answered(ring.write_data)[0] is ring
+    timings = memory(cf, MemoryElement.TYPE_DRIVER_LEDTIMING)
+    timings.add(25, {"r": 100, "g": 0, "b": 0})
+    assert answered(timings.write_data)[0] is timings
+    assert len(cf.mem.get_mems(MemoryElement.TYPE_1W)) == 0  # no deck with a 1-wire memory
+
+
+# ---------------------------------------------------------------------- the rest
+
+
+def test_console(cf):
+    said = []
+    cf.console.receivedChar.add_callback(said.append)
+    cf.param.set_value("system.assertInfo", 1)
+    until(lambda: "No assert" in "".join(said), "text on the console")
+
+
+def test_supervisor(cf):
+    assert cf.supervisor.is_auto_armed
+    assert cf.supervisor.can_fly
+    assert not any((cf.supervisor.is_crashed, cf.supervisor.is_tumbled, cf.supervisor.is_locked))
+
+
+def test_scan():
+    """radio/scan: twins started by hand are where cflib looks."""
+    asked = DeviceRequest(request("crazyflie", ["crazyflie-twin"] * 2), Faults(), by_hand=True)
+    with Served(lambda _: open_device(asked), asked.body) as twins:
+        assert all(address.startswith("udp://127.0.0.1:1985") for address in twins.addresses)
+        scan = "from cflib.crtp.udpdriver import UdpDriver; print(*(uri for uri, _ in UdpDriver().scan_interface()))"
+        # a process of its own: each port without an answer leaks a socket
+        found = subprocess.run([sys.executable, "-c", scan], capture_output=True, text=True, check=True, timeout=60)
+        assert set(twins.addresses) <= set(found.stdout.split())
+
+
+def test_power_cycle():
+    """As the acceptance tests restart a drone; the link of cflib itself does not notice."""
+
+    with Served(open_device, request("crazyflie", ["crazyflie-twin"])) as other:
+        switch = PowerSwitch(other.addresses[0])
+        try:
+            switch.stm_power_down()
+            until(lambda: not other.device.drones[0].on, "it is off")
+            switch.stm_power_up()
+            until(lambda: other.device.drones[0].on, "it is on again")
+        finally:
+            switch.close()
+
+
+def test_trajectories_and_spirals_are_flown(connected):
+    """autonomous_sequence_high_level, ..._compressed, circling_square, christmas_tree: flown, not only answered."""
+
+    scf, twin = connected
+    cf, high = scf.cf, scf.cf.high_level_commander
+    rise = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 m in 1 s, at rest at both ends
+    trajectories = memory(cf, MemoryElement.TYPE_TRAJ)
+    trajectories.trajectory = [Poly4D(1.0, x=Poly4D.Poly(rise)), Poly4D(0.2, x=Poly4D.Poly([1.0] + 7 * [0.0]))]
+    assert trajectories.write_data_sync()
+    trajectories.trajectory = [
+        CompressedStart(0.0, 0.0, 0.0, 0.0),
+        CompressedSegment(1.0, [], [0.0, 1.0, 1.0], [], []),
+        CompressedSegment(0.0, [], [], [], []),
+    ]
+    assert trajectories.write_data_sync(0x200)
+    high.define_trajectory(1, 0, 2)
+    high.define_trajectory(2, 0x200, 1, high.TRAJECTORY_TYPE_POLY4D_COMPRESSED)
+
+    def place():
+        return twin.truth()[0][0]
+
+    def reached(x, y, z):
+        until(lambda: math.dist(place(), (x, y, z)) < 0.06, f"it is at {x}, {y}, {z}: {place()}")
+
+    high.takeoff(0.4, 1.0)
+    reached(0.0, 0.0, 0.4)
+    high.start_trajectory(1, 0.8, relative_position=True)
+    reached(1.0, 0.0, 0.4)
+    high.start_trajectory(2, 1.0, relative_position=True)
+    reached(1.0, 1.0, 0.4)
+    high.spiral(math.pi / 2, 0.4, 0.4, 0.2, 1.0, clockwise=True)
+    reached(1.4, 0.6, 0.6)
+    high.land(0.0, 1.0)
+    until(lambda: place()[2] == 0.0, "landed")
+
+
+def test_too_many_variables_and_blocks(cf):
+
+    blocks = [LogConfig(f"many {i}", 1000) for i in range(17)]
+    for block in blocks:
+        block.add_variable("radio.rssi", "uint8_t")
+        cf.log.add_config(block)
+    for block in blocks[:16]:
+        block.start()
+    with pytest.raises(AttributeError):
+        blocks[16].start()
+    wide = LogConfig("wide", 10)
+    for name in ("x", "y", "z", "vx", "vy", "vz", "yaw"):
+        wide.add_variable(f"stateEstimate.{name}", "float")
+    with pytest.raises(AttributeError):
+        cf.log.add_config(wide)
