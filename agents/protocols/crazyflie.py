@@ -169,7 +169,8 @@ def overload(radio: str, each: Sequence[CrazyflieSettings], carried_hz: float) -
     asked = sum(settings_.packets_hz for settings_ in each)
     if asked <= carried_hz:
         return ""
+    slow = " (little: is this computer busy, the channel disturbed?)" if carried_hz < PACKETS_PER_RADIO else ""
     return (
-        f"radio {radio}: {len(each)} robots ask for {asked:.0f} packets/s, up and down; it carries {carried_hz:.0f}: "
-        f"in each device table write {fitting_rates(each[0], carried_hz / asked)}, or plug in another radio"
+        f"radio {radio}: {len(each)} robots ask for {asked:.0f} packets/s, up and down; it carries {carried_hz:.0f}"
+        f"{slow}: in each device table write {fitting_rates(each[0], carried_hz / asked)}, or plug in another radio"
     )

@@ -31,7 +31,9 @@ from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
 STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
 WINDOW_S: Final = 0.25  # in which the exchanges of a radio are counted
-MEASURING_S: Final = 2.0  # a radio that carries too little in each window of this time is refused
+MEASURING_S: Final = (
+    8.0  # [s] a radio that carries too little in each window of this time is refused; others may still start
+)
 
 
 class CrazyflieBody:

@@ -23,7 +23,7 @@ from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.telemetry import Telemetry
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
-GENTLE: Final = 0.2  # [m/s] mean speed of a landing after a gap of the radio: less than 0.5 m/s at most
+GENTLE: Final = 0.15  # [m/s] mean speed of a landing after a gap of the radio: never 0.5 m/s, at the floor neither
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
