@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from importlib.metadata import distributions
 from pathlib import Path
@@ -23,6 +25,10 @@ METRICS: Final = "metrics.json"
 LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
 DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
 LARGEST: Final = 1 << 34  # [bytes] of all members together
+# what the library raises of archives that are damaged, ciphered or of another method
+DAMAGED: Final = (
+    OSError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, LookupError, RuntimeError
+)  # fmt: skip
 README: Final = """{title}
 
 A run of zenpark, {date}, with all that is needed to repeat it:
@@ -100,7 +106,7 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
                 raise RecordingError(f"{bundle}: more than {LARGEST >> 30} GB unpacked")
             archive.extractall(into)  # names with .. or / at the front are made harmless by the library
         sums = (into / "SHA256SUMS").read_text("utf-8")
-    except (OSError, zipfile.BadZipFile, UnicodeDecodeError, RuntimeError, NotImplementedError) as error:
+    except DAMAGED as error:
         raise RecordingError(f"{bundle}: is no bundle of `zenpark export RUN --bundle`: {error}") from None
     for line in sums.splitlines():
         wanted, _, name = line.partition("  ")

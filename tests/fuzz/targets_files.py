@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import io
 import json
+import shutil
 import struct
 import tempfile
 import time
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -280,6 +284,57 @@ def cdr() -> Iterator[Target]:
     yield Target(examples, take, (Undecodable, Unencodable))
 
 
+# ---------------------------------------------------------------------- runs
+
+
+def run_files() -> Iterator[Target]:
+    """`run.json`, `metrics.json` and the experiment file of a past run: what cannot be read is not known."""
+    from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, differences, past_runs  # noqa: PLC0415
+
+    origin = {"command": "zenpark run a.toml", "file": "a.toml", "begun": 1e9, "tags": ["a"], "changes": ["seed=3"]}
+    figures = [{"case": "a", "seed": 1, "mean": {"f_hz": 2.5, "iae": None}}]
+    example = b"\0".join([json.dumps(origin).encode(), json.dumps(figures).encode(), b"title = 'A'\nx = [1, 2]\n"])
+    with place_for(SOURCE) as file:
+        (file.parent / "good").mkdir()
+        (file.parent / "good" / SOURCE).write_text("title = 'B'")
+        (file.parent / "good" / ORIGIN).write_text(json.dumps(origin))
+
+        def take(data: bytes) -> None:
+            for name, part in zip((ORIGIN, METRICS, SOURCE), (*data.split(b"\0", 2), b"", b""), strict=False):
+                (file.parent / name).write_bytes(part)
+            found = past_runs([file.parent])
+            for run in found:
+                run.matches(["a", "b"])
+                differences(found[0], run)
+
+        yield Target([example], take)
+
+
+def bundles() -> Iterator[Target]:
+    """Archives of runs: damaged and forged ones are refused, and nothing is written outside of their folder."""
+    from experiments.recording import bundle  # noqa: PLC0415
+    from experiments.recording.run_folder import ORIGIN, SOURCE  # noqa: PLC0415
+
+    parts = {ORIGIN: b'{"file": "a.toml"}', SOURCE: b"title = 'A'\n"}
+    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in parts.items())
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in {**parts, "SHA256SUMS": sums.encode()}.items():
+            archive.writestr(name, data)
+    with place_for("bundle.zip") as file:
+
+        def take(data: bytes) -> None:
+            file.write_bytes(data)
+            into = file.parent / "into"
+            try:
+                bundle.unpack(file, into)
+            finally:
+                shutil.rmtree(into, ignore_errors=True)
+                assert [left.name for left in file.parent.iterdir()] == [file.name]
+
+        yield Target([packed.getvalue()], take, (RecordingError,))
+
+
 # ---------------------------------------------------------------------- sweeps
 
 
@@ -421,6 +476,8 @@ PLACES = {
     "forged-recording": Place(forged, 10_000, 60),
     "cdr": Place(cdr, 50_000, 500),
     "sweep-runs": Place(sweep_runs, 30_000),
+    "run-files": Place(run_files, 10_000),
+    "bundles": Place(bundles, 10_000),
     "sweep-arguments": Place(sweep_arguments, 6_000, 30),
     "words": Place(words, 60_000, 400),
 }
