@@ -113,6 +113,21 @@ def _announced(process: Process, pattern: str, count: int, interrupted: Callable
         time.sleep(POLL_S)
 
 
+def await_routers(launcher: Launcher, routers: Sequence[Router]) -> None:
+    """Wait until started routers listen.
+
+    Without that, robots would join a stranger's router where another run took the port at the same moment.
+
+    Raises:
+        StandInError: If one does not.
+    """
+    for router in routers:
+        try:
+            _announced(launcher.get(router.name), r"^(router) (ready)\b", 1, lambda: False)
+        except StandInError as error:
+            raise StandInError(f"{error}; if another run has just begun, start this one again") from None
+
+
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 STARTS: Final = 4  # a process that dies more often is not helped by another start
 

@@ -1,12 +1,17 @@
 """Who serves a whole run is started again, where others look for it, and not for ever."""
 
+import re
+import socket
 from types import SimpleNamespace
 
+import pytest
+
+from agents.network.endpoints import free_endpoint
 from experiments.file import document
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.support import STARTS, Servants
+from experiments.real_time.conductor.support import STARTS, Router, Servants, StandInError, await_routers
 from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import ROUTER
+from experiments.real_time.hosts.launcher import ROUTER, Launcher
 
 
 class Starts:
@@ -36,3 +41,15 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
     )
     assert servants.start_centre() == ()
     assert servants.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
+
+
+@pytest.mark.system
+def test_a_port_that_another_run_took_at_the_same_moment_ends_the_run(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken, Launcher(tmp_path / "logs") as launcher:
+        router = Router("router", [f"tcp/127.0.0.1:{taken.getsockname()[1]}"])
+        router.start(launcher)
+        with pytest.raises(StandInError, match=re.compile("already in use.*start this one again", re.DOTALL)):
+            await_routers(launcher, [router])
+        free = Router("router2", [free_endpoint(preferred_port=0)])
+        free.start(launcher)
+        await_routers(launcher, [free])
