@@ -24,6 +24,7 @@ from agents.agent import Actions, Agent
 from agents.arrays import Index, some
 from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
+from agents.clock import uptime
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import Phase
 from agents.decision.transmission import Transmission
@@ -47,7 +48,6 @@ ROUTER_S: Final = 0.045  # between two checks of the router
 STOOD_S: Final = (
     0.5 * network.ROBOT_LEASE_S
 )  # a process that stood still for longer may have lost the ownership of its name
-_CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
 
 
 class Runtime:
@@ -70,7 +70,7 @@ class Runtime:
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
-        self._awake_at = np.inf  # [s] last run of the process, on `_CLOCK`
+        self._awake_at = np.inf  # [s] last run of the process, on `uptime`
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names])
         self._hands_off = False  # another process drives the bodies, or may do so
         self._reason_to_end: Callable[[], str | None] = lambda: None
@@ -222,7 +222,7 @@ class Runtime:
             NameTaken: If another process has taken one of them.
             network.Unreachable: If the process was told to end, and no router has answered within `ANSWER_S`.
         """
-        last, self._awake_at = self._awake_at, time.clock_gettime(_CLOCK)
+        last, self._awake_at = self._awake_at, uptime()
         if self._awake_at - last < STOOD_S or self._watchdog.tripped:  # a hanging loop is the business of the watchdog
             return False
         woke, self._hands_off = self._awake_at, True
@@ -236,7 +236,7 @@ class Runtime:
                 )
             self._watchdog.beat()
             time.sleep(self._dt)
-            self._awake_at = time.clock_gettime(_CLOCK)
+            self._awake_at = uptime()
         self._hands_off = False
         return True
 
@@ -408,7 +408,7 @@ class Runtime:
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
         self._joined, self._reason_to_end = True, stopping
-        self._awake_at = time.clock_gettime(_CLOCK)
+        self._awake_at = uptime()
         self._watchdog.start()
         self._go_round(zero, stopping)
 

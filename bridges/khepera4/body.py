@@ -13,9 +13,9 @@ from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays, settings
+from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
-from bridges.khepera4.drivers import awake
 from bridges.khepera4.link import Address, Khepera4Link
 
 OPEN_S: Final = 3.0  # deadline of the first odometry
@@ -35,7 +35,7 @@ class KheperaBody:
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._names))
         self._links: list[Khepera4Link] = []
-        self._read_at = -math.inf  # [s, `awake`] the state on which the next command is decided
+        self._read_at = -math.inf  # [s, `uptime`] the state on which the next command is decided
 
     def open(self) -> None:
         """See `Body.open`. Robots without answer are retried while the others drive."""
@@ -57,7 +57,7 @@ class KheperaBody:
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
-        now, self._read_at = time.monotonic(), awake()
+        now, self._read_at = time.monotonic(), uptime()
         odometry = [link.odometry for link in self._links]
         rows = len(odometry)
         # unknown before the first odometry: the pose is counted by the robot, not read from the file

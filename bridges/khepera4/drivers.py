@@ -13,19 +13,14 @@ from typing import Final, Protocol
 import numpy as np
 
 from agents.arrays import Array
+from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.odometry import Odometer
 
-BOOT_CLOCK: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # goes on while the machine sleeps
 NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
 PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
-
-
-def awake() -> float:
-    """Time [s] on a clock that counts suspensions of the machine."""
-    return time.clock_gettime(BOOT_CLOCK)
 
 
 class UnknownAnswer(OSError):
@@ -97,7 +92,7 @@ class Driver(Protocol):
         ...
 
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
-        """Drive at v [m/s] and ω [rad/s]; zeros stop the robot, as does whatever is sent after `until` [s, `awake`]."""
+        """Drive at v [m/s], ω [rad/s]; zeros stop the robot, as does whatever is sent after `until` [s, `uptime`]."""
         ...
 
     def move(self, odometer: Odometer) -> None:
@@ -169,7 +164,7 @@ class Park:
     def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
         """Send a command in a segment of its own, or `instead` if it is past `until`; returns when [s]."""
         time.sleep(max(0.0, self._free - time.monotonic()))  # of two commands in one segment the second is lost
-        self._wire.send(command if awake() <= until else instead)
+        self._wire.send(command if uptime() <= until else instead)
         now = time.monotonic()
         self._free = now + protocol.GAP_S
         self._sent = self._sent[1], now
@@ -340,7 +335,7 @@ class KTeam:
 
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
         """See `Driver`."""
-        left, right = protocol.units(v, turn) if awake() <= until else (0, 0)
+        left, right = protocol.units(v, turn) if uptime() <= until else (0, 0)
         self._request(f"D,{left},{right}")
 
     def move(self, odometer: Odometer) -> None:

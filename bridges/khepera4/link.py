@@ -17,8 +17,9 @@ from urllib.parse import parse_qsl, urlsplit
 from agents.arrays import Array
 from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, TROUBLE, BodyError
+from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
-from bridges.khepera4.drivers import Driver, KTeam, Wire, WrongServer, awake, identify
+from bridges.khepera4.drivers import Driver, KTeam, Wire, WrongServer, identify
 from bridges.khepera4.odometry import Odometer
 
 CONNECT_S: Final = 1.5
@@ -146,7 +147,7 @@ class Khepera4Link:
         self.odometry = Odometry()
         self.scan: tuple[float, Array, Array] | None = None  # monotonic time [s], bearings [rad], distances [m]
         self.battery = math.nan  # charge, 0 to 1
-        self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `awake`] of what it was decided on
+        self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `uptime`] of what it was decided on
         self.halted_since = math.inf  # monotonic [s]; infinity while the robot may move
         self.refused = False  # the server must not be driven; it is not tried again
         self.server = ""  # that runs on the robot, by its answers; empty while not known
@@ -163,7 +164,7 @@ class Khepera4Link:
         self._thread.start()
 
     def drive(self, v: float, turn: float, decided: float) -> None:
-        """Drive at v [m/s], ω [rad/s], `decided` on the state of that time [s, `awake`], for `FRESH_S` from then."""
+        """Drive at v [m/s], ω [rad/s], `decided` on the state of that time [s, `uptime`], for `FRESH_S` from then."""
         if v or turn:
             self.halted_since = math.inf
         self.setpoint = (v, turn, decided)
@@ -295,8 +296,8 @@ class Khepera4Link:
             return
 
     def _current_twist(self) -> tuple[float, float, float]:
-        """v [m/s], ω [rad/s], and until when they may be sent [s, `awake`]."""
+        """v [m/s], ω [rad/s], and until when they may be sent [s, `uptime`]."""
         v, turn, decided = self.setpoint
-        if self.battery_empty or awake() > decided + FRESH_S:
+        if self.battery_empty or uptime() > decided + FRESH_S:
             return 0.0, 0.0, math.inf
         return v, turn, decided + FRESH_S

@@ -15,6 +15,7 @@ from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyError, BodyRequest, BodyState, Rays, call_all
+from agents.clock import uptime
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.messages import Inspection, number
@@ -36,19 +37,20 @@ class TurtleBot3:
 
     Args:
         request: Robots to open.
-        clock: Monotonic [s].
+        clock: Monotonic [s]; commands from before a suspension of the machine are old by it.
 
     Raises:
         BodyError: If an address or a setting is wrong.
     """
 
-    def __init__(self, request: BodyRequest, clock: Clock = time.monotonic) -> None:
+    def __init__(self, request: BodyRequest, clock: Clock = uptime) -> None:
         self._clock = clock
         self._robots = [Robot(request, row) for row in range(len(request.names))]
         self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._robots))
+        self._read_at = -np.inf  # [s] the state on which the next command is decided
 
     def open(self) -> None:
         """See `Body.open`: returns after the first odometry of every robot."""
@@ -116,13 +118,13 @@ class TurtleBot3:
 
     def read(self, t: float) -> BodyState:
         """See `Body.read`."""
-        now = self._clock()
+        now = self._read_at = self._clock()
         robots = self._robots
         for robot in robots:
             robot.receive_messages(t, now)
             if robot.time == -np.inf and robot.odometry_received > -np.inf:
                 robot.time = t - (now - robot.odometry_received)  # received during `open`
-            robot.send_command(now)
+            robot.send_command(self._clock())
         rows = len(robots)
         pose = np.array([robot.pose for robot in robots])
         speed = np.array([robot.speed[0] for robot in robots])
@@ -154,11 +156,10 @@ class TurtleBot3:
 
     def command(self, setpoint: Array) -> None:
         """See `Body.command`: v [m/s] and ω [rad/s]."""
-        now = self._clock()
         for robot, (v, w, _, _) in zip(self._robots, setpoint.tolist(), strict=True):
             if np.isfinite(v) and np.isfinite(w):
-                robot.drive(v, w, now)
-            robot.send_command(now)
+                robot.drive(v, w, self._read_at)
+            robot.send_command(self._clock())
 
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`: no effect on a ground robot."""

@@ -176,7 +176,11 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
     captured = bodies == WORLD and experiment.positioning == VICON_TWIN
     robots = {
         name: msgspec.structs.replace(
-            robot, body=bodies, position=robot.position if captured else "body", ranges="body", device={}
+            robot,
+            body=bodies,
+            position=robot.position if captured else "body",
+            ranges="body",
+            device={name: value for name, value in robot.device.items() if name == "watchdog_s"},
         )
         for name, robot in experiment.robots.items()
     }

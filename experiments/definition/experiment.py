@@ -345,6 +345,13 @@ class World(Part, frozen=True):
     sensor_noise: Annotated[
         NotNegative, Meta(description="of range sensors, as a multiple of the noise of real ones")
     ] = 1.0
+    wheels_stop_s: Annotated[
+        Positive | None,
+        Meta(
+            description="robots on wheels stop after so long without a command, as if each had a watchdog [s]; left "
+            "out: they drive on, as Khepera IV and TurtleBot3 do, unless `watchdog_s` is in their `device` table"
+        ),
+    ] = None
     patience_s: Annotated[
         Positive, Meta(description="a robot whose world is gone holds for this long, then lands [s]")
     ] = 30.0

@@ -55,7 +55,8 @@ def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path)
     low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge
     flight = Flight(folder, "triangle", "--case", "event", "--no-report", *low)
     flight.until_said(r"hazard CF01: land: its battery is low: 98% \(limit 98%\)")
-    assert flight.finish()[0] == 0
+    assert flight.finish()[0] == 1
+    assert "zenpark: Failed in event: CF01 at " in flight.said()
     played = playback.read(folder / "event.mcap")
     trace = played.trace
     said = [pose.position[2] for pose in typed(folder / "event.mcap", "/CF01/pose") if pose.stamp > played.started]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +117,8 @@ def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> Non
     flight.children()["KH02"].kill()
     flight.until_said(r"lost KH02: its process ended \(killed by SIGKILL\)")
     code, out = flight.finish()
-    assert code == 0
+    assert code == 1
+    assert re.search(r"zenpark: Failed in event: KH02 at \d.\d s: was lost: its process ended", flight.said())
     assert gone(everyone)
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert robots["CF01"]["messages"] > 0
@@ -213,7 +215,8 @@ def test_a_robot_that_cannot_start_ends_the_run_or_not_as_the_file_says(tmp_path
         tmp_path / "go-on", "triangle", *absent, "--set", "start.missing=go-on", "--set", "start.deadline_s=3"
     )
     code, out = flight.finish(60.0)
-    assert code == 0
+    assert code == 1
+    assert "zenpark: Failed in event: CF01 " in flight.said()
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert robots["KH01"]["messages"] > 5, "the others fly"
     assert robots["CF01"]["messages"] == 0

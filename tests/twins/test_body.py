@@ -136,19 +136,6 @@ def test_latency_from_command_to_effect(ticks):
 
 
 @pytest.mark.parametrize("latency", [None, 0.05])
-def test_silence_stops_the_wheels_with_latency_too(latency):
-    twin = body("khepera4", nature={"all": Disturbance(latency_s=latency)})
-    for tick in range(50):
-        twin.read(tick * DT)
-        twin.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
-    moving = 0
-    for tick in range(50, 200):
-        twin.read(tick * DT)
-        moving += twin.engine.velocity[0, 0] > 1e-9
-    assert moving * DT == pytest.approx(0.5 + 0.07 + (latency or 0.0), abs=0.03)
-
-
-@pytest.mark.parametrize("latency", [None, 0.05])
 def test_what_is_left_alone_climbs_by_itself_with_latency_too(latency):
     twin = body("crazyflie", nature={"all": Disturbance(latency_s=latency)})
     twin.read(0.0)

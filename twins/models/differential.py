@@ -1,8 +1,7 @@
 """Differential drive: unicycle on two wheels with limits of speed and acceleration.
 
-Without a new command the wheels stop after `FRESH_S`: this model is a robot together with its bridge, and the bridges
-of Khepera IV and TurtleBot3 do that. The robots themselves drive on when the bridge's process is frozen or dead
-(docs/hanging.md), and so do their protocol twins.
+A command holds until the next one, as on the robots themselves: what stops wheels that are told nothing more is their
+bridge, a watchdog on the robot, or nothing (docs/hanging.md).
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, clamp, every
-from agents.body.interface import FRESH_S
 from agents.body.kinds import Kind
 
 
@@ -46,7 +44,6 @@ class Differential:
         self._least = -self._change
         self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
         self._wanted = np.zeros((2, len(drives)))
-        self._patience = np.full(len(drives), np.inf)
         self.position = np.array(start, dtype=float)  # (n, 3) [m]; z stays 0
         self.yaw = np.array(yaw, dtype=float)  # (n,) [rad]
         self.velocity = np.zeros_like(self.position)  # (n, 3) [m/s]
@@ -59,10 +56,8 @@ class Differential:
         given = np.isfinite(wanted[0])
         if every(given):
             self._wanted = wanted
-            self._patience[:] = FRESH_S
         else:
             np.copyto(self._wanted, wanted, where=given)
-            self._patience[given] = FRESH_S
 
     def halt(self, rows: Index) -> None:
         """Command zero wheel speed."""
@@ -80,8 +75,7 @@ class Differential:
 
     def advance(self) -> None:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
-        self._patience -= self._dt
-        wanted = self._wanted * (self._patience >= 0.0)
+        wanted = self._wanted.copy()
         # both wheels are slowed by the same factor, which keeps the curvature
         speed = np.abs(wanted)
         over = np.maximum(speed[0], speed[1]) / self._limit

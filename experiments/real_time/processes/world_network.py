@@ -25,12 +25,11 @@ from agents.runtime import range_inbox
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.real_time.processes.world_population import Population
+from experiments.real_time.processes.world_population import HOLD_S, Population
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
 TRUTH_HZ: Final = 50.0
-HOLD_S: Final = 0.5  # without a command for this long a robot holds its position,
-LAND_S: Final = 3.0  # and lands after this
+LAND_S: Final = 3.0  # without a command for this long a flying robot lands
 CLIMB_S: Final = 15.0  # limit for the first setpoint after a climb, or after a restart of the world
 GONE_S: Final = 1.0  # without a state for this long a mirrored robot is removed
 HANG_S: Final = 0.3  # after a longer suspension of the world silence proves nothing
@@ -203,11 +202,13 @@ class Exchange:
             self._quiet = np.where(np.isfinite(self._quiet), np.maximum(self._quiet, t), self._quiet)
 
     def apply_commands(self, t: float) -> None:
-        """Applies the commands; robots without commands hold, and land after `LAND_S`."""
+        """Applies the commands; robots without commands hold, drive on, or land after `LAND_S`."""
         population = self._population
+        hold_s: float | Array = population.hold_s
         if self._router.silent_since(t) < inf:  # without a router no command arrives: robots hold, but need not land
             self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
-        silent = t - self._quiet > HOLD_S
+            hold_s = HOLD_S
+        silent = t - self._quiet > hold_s
         if some(silent):
             holding = np.flatnonzero(silent & ~self._held)
             if len(holding):

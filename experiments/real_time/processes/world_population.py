@@ -29,6 +29,7 @@ WALL: Final = "wall"  # name of the walls of the arena in contacts
 TAKEN: Final = (WALL, "world", "all", "run", "estop", *KINDS)  # words of keys and of the experiment file
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 ROUNDING: Final = 1e-9  # [m]
+HOLD_S: Final = 0.5  # without a command for this long a flying robot holds its position
 
 
 class Refused(ValueError):
@@ -51,6 +52,7 @@ class Population:
     names: tuple[str, ...]  # of the n rows, those of the experiment first
     carried: Mask  # (n,) rows that are simulated here; the others are mirrors
     seen: Mask  # (n,) rows with simulated range sensors: carried ones, and those that ask for them
+    hold_s: Array  # (n,) [s] a row is held after so long without a command; infinity: it drives on
     body: TwinBody  # of these rows
     time: float  # [s] simulated since the start
     state: BodyState  # last reading of the body
@@ -250,6 +252,8 @@ class Population:
         robots = [experiment.robots[name] for name in self.names]
         self._kinds = bodies.kinds(experiment, self.names)
         self.flies = np.array([kind.flies for kind in self._kinds])
+        wheels = [robot.device.get("watchdog_s") or experiment.world.wheels_stop_s or math.inf for robot in robots]
+        self.hold_s = np.where(self.flies, HOLD_S, wheels)
         self.takes_position = np.array([kind.takes == "position" for kind in self._kinds])
         self.carried = np.array([robot.body == bodies.WORLD for robot in robots])
         self.seen = self.carried | np.array([robot.ranges == "world" for robot in robots])

@@ -27,7 +27,7 @@ class Lab:
         self.now, self.due, self.gap_until = 0.0, DT, -math.inf
         self.queue, self.answers, self.heard = b"", b"", []
         monkeypatch.setattr(drivers, "time", self)
-        monkeypatch.setattr(drivers, "awake", self.monotonic)
+        monkeypatch.setattr(drivers, "uptime", self.monotonic)
         self.program.begin_session()
         self.device._servers[0]._client = self  # a client is there
         chosen = protocol.Khepera4Settings(server=server if named else None, **settings)

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from agents.body.interface import FRESH_S, BodyError
+from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.drivers import WrongServer
@@ -104,10 +105,10 @@ def test_a_command_is_as_old_as_the_state_on_which_it_was_decided(monkeypatch):
     link = Khepera4Link(
         "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
-    link.drive(0.1, 0.2, drivers.awake())
+    link.drive(0.1, 0.2, uptime())
     assert link._current_twist()[:2] == (0.1, 0.2)
-    assert link._current_twist()[2] == pytest.approx(drivers.awake() + FRESH_S, abs=0.4)
-    link.drive(0.1, 0.2, drivers.awake() - FRESH_S - 3.0)  # read before a suspension, commanded after it
+    assert link._current_twist()[2] == pytest.approx(uptime() + FRESH_S, abs=0.4)
+    link.drive(0.1, 0.2, uptime() - FRESH_S - 3.0)  # read before a suspension, commanded after it
     assert link._current_twist()[:2] == (0.0, 0.0)
 
 

@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from math import pi
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3 import body as bridge
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3, open_turtlebot3
-from bridges.turtlebot3.robot import ranges
+from bridges.turtlebot3.robot import Robot, ranges
 from tests.bridges.turtlebots import Stage, clock, request
 from tests.conftest import RouterProcess
 from tests.waiting import until
@@ -505,3 +506,17 @@ def test_no_router_is_named_in_time(monkeypatch):
     assert OPEN_S < 5.0
     with pytest.raises(BodyError, match="TB0: 'nonsense' is not an endpoint"):
         open_turtlebot3(request("nonsense", addresses=("ros2dds://tb3_0",))).open()
+
+
+def test_a_command_from_before_a_suspension_is_sent_as_zeros() -> None:
+    robot = Robot(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
+    sent = []
+    robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
+    robot._command = SimpleNamespace(put=lambda message: sent.append(message.linear.x))  # type: ignore[assignment]
+    robot.odometry_received = 103.0
+    robot.drive(0.1, 0.0, 100.0)  # decided on what was read then, commanded after the suspension
+    robot.send_command(103.0)
+    assert sent == [0.0]
+    robot.drive(0.1, 0.0, 103.0)
+    robot.send_command(103.1)
+    assert sent[-1] == pytest.approx(0.102)

@@ -1,11 +1,10 @@
-"""Wheels: arcs are arcs, limits keep the curve, and silence stops them."""
+"""Wheels: arcs are arcs, limits keep the curve, and a command holds."""
 
 import math
 
 import numpy as np
 import pytest
 
-from agents.body.interface import FRESH_S
 from agents.body.kinds import KHEPERA4, TURTLEBOT3
 from twins.models.differential import DRIVES, Differential
 
@@ -85,28 +84,22 @@ def test_acceleration_of_wheels_is_limited():
     assert speed[-1] == pytest.approx(0.2)
 
 
-def test_without_commands_the_wheels_stop():
+def test_a_command_holds_until_the_next_one():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
-    speeds = []
-    for _ in range(100):
+    for _ in range(1000):
         twin.advance()
-        speeds.append(np.linalg.norm(twin.velocity[0]))
-    moving = np.count_nonzero(np.array(speeds) > 1e-12) * DT
-    ramp = 0.2 / DRIVES["khepera4"].acceleration
-    assert moving == pytest.approx(FRESH_S + ramp, abs=0.03)
-    drive(twin, (0.2, 0.0), 0.2)
     assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
 
 
 def test_nan_is_no_command():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
-    drive(twin, (np.nan, np.nan), FRESH_S - 0.03)
+    drive(twin, (np.nan, np.nan), 0.5)
     assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
     drive(twin, (np.nan, 0.0), 0.5)
     drive(twin, (0.0, np.nan), 0.5)
-    assert np.linalg.norm(twin.velocity[0]) == 0.0
+    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
     assert np.isfinite(twin.position).all()
 
 

@@ -258,3 +258,16 @@ def test_whatever_is_ordered_ends_well(busy: Population, name: str, where: tuple
     assert apart.min() > 0.065 + 0.07 - 1e-9
     assert (np.abs(there) < 2.0).all()
     busy.remove(name)
+
+
+def test_wheels_stop_without_commands_only_with_a_watchdog(world: Population) -> None:
+    flying = row(world, "CF01")
+    assert world.hold_s[flying] == 0.5
+    assert world.hold_s[row(world, "KH01")] == np.inf
+    watched = msgspec.structs.replace(
+        world._experiment, world=msgspec.structs.replace(world._experiment.world, wheels_stop_s=0.7)
+    )
+    assert Population(watched).hold_s[row(world, "KH01")] == 0.7
+    go(world, 10, KH01=(0.2, 0.0, 0.0, 0.0))
+    go(world, 300)
+    assert at(world, "KH01")[0] > 0.5, "it drives on, as the real one"
