@@ -118,7 +118,7 @@ def desk(router: RouterProcess) -> Iterator[Desk]:
 def world(router: RouterProcess, desk: Desk, file: Path) -> Iterator[WorldProcess]:
     made = WorldProcess(router.endpoint, file)
     assert made.ready == (
-        f"world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors nobody; realm park at {router.endpoint}"
+        f"world ready: point-mass at 100 Hz carries KH01, CF01, TE01; mirrors none; realm park at {router.endpoint}"
     )
     desk.until(lambda: len(desk.at) == 3 and desk.world, "everybody is there")
     yield made
