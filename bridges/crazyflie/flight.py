@@ -81,6 +81,7 @@ class Flight:
         self._sent = -math.inf
         self._goal: Target | None = None
         self._held_since = -math.inf  # last gap after which the planner on board was given the drone
+        self._descent = CLIMB  # mean speed of the next landing [m/s]
         self._gaps: list[float] = []  # end of each gap of the last seconds [s]
         self._span = 0.0  # duration of the landing [s]
 
@@ -105,7 +106,7 @@ class Flight:
         """Climb to `height` [m] above the ground here; on refusal, `trouble` gives the reason."""
         if self.airborne:
             return
-        self._held_since = -math.inf
+        self._held_since, self._descent = -math.inf, CLIMB
         self.trouble = self.takeoff_refusal() or self._arm()
         if self.trouble:
             return
@@ -127,7 +128,7 @@ class Flight:
             self._enter(Phase.FLYING)
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
-        self._land(CLIMB)
+        self._land(self._descent)
 
     def _land(self, speed: float) -> None:
         span = max(float(self._telemetry.position[2]) / speed, SHORTEST_S)
@@ -159,7 +160,7 @@ class Flight:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if self.phase is Phase.LANDING and now - self._since > self._span + AGAIN_S and self._flying:
-            self._land(CLIMB)  # a gap took the order
+            self._land(self._descent)  # a gap took the order
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
@@ -204,7 +205,8 @@ class Flight:
         if gap > LANDING_GAP_S or len(self._gaps) > MOST_GAPS:
             many = f"{len(self._gaps)} gaps of the radio in {STUTTERING_S:g} s"
             self.trouble = f"landed: no radio for {gap:.1f} s" if gap > LANDING_GAP_S else f"landed: {many}"
-            self._land(GENTLE)
+            self._descent = GENTLE
+            self.land()
             return
         target = self._target
         if self.phase is Phase.FLYING and target is not None and self._settings.control != "high-level":
@@ -257,7 +259,8 @@ class Flight:
         """Continue on a new link after a loss; True if the drone is in the air."""
         if self.phase is Phase.STOPPING:
             return True
-        if Info.FLYING in self._telemetry.info and self.phase is not Phase.STOPPED:
+        if self._flying and self.phase is not Phase.STOPPED:
+            self._descent = GENTLE
             if not self.airborne:
                 self._enter(Phase.FLYING)
             return True
