@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders
 LABEL_ROUNDS: Final = 3  # of more robots than that, labels move at every third round
+COARSE: Final = 5  # of more robots than that, trails have each fifth point
 SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
 TALL: Final = 1.2  # [m] walls and obstacles are drawn no higher
 
@@ -186,7 +187,7 @@ class SceneDrawing:
             f"{self._root}/{name}", mesh.vertices.astype(np.float32), mesh.faces,
             np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1)), np.tile(np.array(NOWHERE), (count, 1)),
             batched_scales=scales, batched_colors=_linear(np.full((count, 3), 128) if colours is None else colours),
-            opacity=opacity, lod="off", flat_shading=True, cast_shadow=cast and len(self.stage.names) <= SHADOWS,
+            opacity=opacity, lod="auto", flat_shading=True, cast_shadow=cast and len(self.stage.names) <= SHADOWS,
             receive_shadow=False,
         )  # fmt: skip
 
@@ -224,21 +225,23 @@ class SceneDrawing:
 
     def _draw_robots(self, moment: Moment) -> None:
         place, turned = appearance.shown(moment.position), appearance.orientation(moment)
-        goals = appearance.shown(moment.goal) if self.shown.goals else np.broadcast_to(np.array(NOWHERE), place.shape)
+        goals = appearance.shown(moment.goal)
         accents = appearance.accents(self.stage, moment)
         for kind in self._kinds:
             rows = kind.rows
             for part in kind.parts:
                 part.batched_positions, part.batched_wxyzs = place[rows], turned[rows]
             _update(kind.parts[1], "batched_colors", accents[rows])
-            _update(kind.ghosts, "batched_positions", goals[rows])
+            _show(kind.ghosts, shown=self.shown.goals)
             if self.shown.goals:
+                _update(kind.ghosts, "batched_positions", goals[rows])
                 kind.ghosts.batched_wxyzs = turned[rows]
             if kind.shadows is not None and moment.shadow is not None:
                 kind.shadows.batched_positions = appearance.shown(moment.shadow[kind.shadow_rows])
                 if moment.shadow_yaw is not None:
                     kind.shadows.batched_wxyzs = appearance.quaternions(moment.shadow_yaw[kind.shadow_rows])
         rings, colours = appearance.rings(moment)
+        _show(self._rings, shown=bool((rings[:, 2] > NOWHERE[2]).any()))
         _update(self._rings, "batched_positions", rings)
         _update(self._rings, "batched_colors", colours)
         below = moment.position.copy()
@@ -263,12 +266,13 @@ class SceneDrawing:
         _update(self._broken, "points", dashes if len(dashes) else np.array([[NOWHERE, NOWHERE]]))
 
     def _draw_trails(self, moment: Moment) -> None:
-        count = moment.trail.shape[1]
-        if count < 2:
+        if self._trails is not None:
+            _show(self._trails, shown=self.shown.trails)
+        trail = moment.trail if self._few else moment.trail[:, ::COARSE]
+        count = trail.shape[1]
+        if count < 2 or not self.shown.trails:
             return
-        ends = appearance.trail_segments(moment.trail)
-        if not self.shown.trails:
-            ends = np.broadcast_to(np.array(NOWHERE), ends.shape)
+        ends = appearance.trail_segments(trail)
         if self._trails is None or self._trails.points.shape != ends.shape:
             colours = appearance.trail_colours(self.stage, count, self._look.background)
             self._trails = self._lines("trails", ends, colours, thickness=2.5)
@@ -331,6 +335,12 @@ def _same(handle: Any, pose: Array) -> bool:  # noqa: ANN401
 def _linear(colours: Colours | Array | Colour) -> Colours:
     """Colours as viser shows them unchanged: it takes those of lines and batches for linear light."""
     return np.asarray(np.round(255.0 * (np.asarray(colours) / 255.0) ** 2.2), dtype=np.uint8)
+
+
+def _show(handle: Any, *, shown: bool) -> None:  # noqa: ANN401
+    """Shows or hides a node: what is merely out of sight costs a browser nearly as much as what is seen."""
+    if handle.visible != shown:
+        handle.visible = shown
 
 
 def _update(handle: Any, name: str, value: Array | Colours) -> None:  # noqa: ANN401

@@ -13,7 +13,7 @@ from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3, Kind
 from twins.scene import Scene
 
-SIDES: Final = 14  # of what looks round
+SIDES: Final = 10  # of what looks round
 ROUND: Final = 28  # of a cylinder among the obstacles
 WALL_M: Final = 0.02  # drawn thickness of a wall
 

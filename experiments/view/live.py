@@ -18,7 +18,7 @@ import zenoh
 from agents.network.keys import Keys
 from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
-from experiments.scene.stage import Condition, LinkTracker, Moment
+from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer, RobotReport
 from experiments.view.panel import PLOT_S, Panel, Row
@@ -49,10 +49,10 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
         dark_mode=dark,
         show_logo=False,
         show_share_button=False,
-        control_layout="collapsible",
         control_width="large",
         brand_color=(0, 114, 178),
     )
+    server.gui.main_panel.dock_right()
     light(server)
     return server
 
@@ -78,6 +78,7 @@ class ShowFolder:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.shown = Shown()
+        self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
             for name, text in (
                 ("names", "names"), ("trails", "trails"), ("goals", "goals"), ("links", "links"),
@@ -85,6 +86,12 @@ class ShowFolder:
             ):  # fmt: skip
                 box = server.gui.add_checkbox(text, getattr(self.shown, name))
                 box.on_update(partial(self._set, name))
+                self._boxes[name] = box
+
+    def fit(self, stage: Stage) -> None:
+        """Goals of many robots are not drawn until they are asked for."""
+        if len(stage.names) > MANY:
+            self._boxes["goals"].value = self.shown.goals = False
 
     def _set(self, name: str, event: viser.GuiEvent[Any]) -> None:
         setattr(self.shown, name, event.target.value)
@@ -138,6 +145,7 @@ class LiveView:
             if self._drawing is not None:
                 self._drawing.remove()
             self._drawing = SceneDrawing(self._server, stage, self._look)
+            self._show.fit(stage)
             self._drawing.shown = self._show.shown
             self._panel.set_stage(stage)
             look_at(self._server, (stage.scene.high - stage.scene.low).tolist())

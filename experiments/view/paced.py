@@ -58,6 +58,7 @@ class PacedView:
             if self._drawing is not None:
                 self._drawing.remove()
             self._drawing = SceneDrawing(self._server, stage, self._look)
+            self._show.fit(stage)
             self._drawing.shown = self._show.shown
             self._panel.set_stage(stage)
             look_at(self._server, (stage.scene.high - stage.scene.low).tolist())

@@ -224,6 +224,7 @@ class ReplayView:
             for k, film in enumerate(films):
                 drawing = SceneDrawing(server, film.stage, look, root=f"/case{k}")
                 drawing.offset = ((k - 0.5 * (len(films) - 1)) * pitch, 0.0, 0.0)
+                self._show.fit(film.stage)
                 drawing.shown = self._show.shown
                 if len(films) > 1:
                     drawing.name(film.tracks.case)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 import pytest
 import zstandard
 
@@ -89,8 +92,28 @@ class Page:
         })"""
         return float(self.page.evaluate(script, seconds))
 
+    def frames_alone(self) -> float:
+        """Frames a second that the page draws where nothing else needs the processors: more than it draws here.
+
+        Without a graphics card all of the drawing is done by the processors, as many at once as there are.
+        """
+        before, begun = _processor_s(), time.monotonic()
+        rate = self.frames_per_second()
+        worked = (_processor_s() - before) / (time.monotonic() - begun)  # processors
+        return rate * max(1.0, (os.cpu_count() or 1) / worked)
+
     def button(self, text: str) -> Any:
         return self.page.get_by_role("button", name=text)
+
+
+def _processor_s() -> float:
+    """Processor time of the browser of this process [s]."""
+    total = 0.0
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            if "chrom" in child.name():
+                total += sum(child.cpu_times()[:2])
+    return total
 
 
 def _array(value: Any, arrays: list[bytes]) -> Any:
