@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from experiments.metrics.statistics import Spread
+from experiments.recording import version
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,9 +109,12 @@ def render(
     command: str,
     verdict: Sequence[Finding],
     sections: Sequence[Section],
-    foot: Sequence[str] = (),
+    foot: Sequence[str] | None = None,
 ) -> Path:
-    """Writes a page that needs nothing else: facts and findings on top, then the sections, a `foot` of small lines."""
+    """Writes a page that needs nothing else: facts and findings on top, then the sections, a `foot` of small lines.
+
+    Left out, the foot tells code and versions of this process.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
 
     pages = Environment(
@@ -121,7 +125,13 @@ def render(
         lstrip_blocks=True,
     )
     page = pages.get_template(TEMPLATE).render(
-        title=title, source=source, facts=facts, command=command, findings=verdict, sections=sections, foot=foot
+        title=title,
+        source=source,
+        facts=facts,
+        command=command,
+        findings=verdict,
+        sections=sections,
+        foot=version.provenance().words[:2] if foot is None else foot,
     )
     target.write_text(page, encoding="utf-8")
     return target

@@ -146,7 +146,7 @@ def write(
         command=made.command,
         verdict=[*first_of_all, *(Finding("fair", note) for note in notes), *verdict[len(first_of_all) :]],
         sections=sections,
-        foot=() if made.made_by is None else made.made_by.words,
+        foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
     )
 
 
