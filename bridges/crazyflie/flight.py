@@ -25,6 +25,7 @@ from bridges.crazyflie.telemetry import Telemetry
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
 GENTLE: Final = 0.15  # [m/s] mean speed of a landing after a gap of the radio: never 0.5 m/s, at the floor neither
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
+LONGEST_S: Final = 8.0  # duration of a landing, which others wait 15 s for
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
 SETPOINT_EVERY: Final = 3  # tries: no setpoint for longer than 0.45 s
@@ -131,7 +132,7 @@ class Flight:
         self._land(self._descent)
 
     def _land(self, speed: float) -> None:
-        span = max(float(self._telemetry.position[2]) / speed, SHORTEST_S)
+        span = min(max(float(self._telemetry.position[2]) / speed, SHORTEST_S), LONGEST_S)
         if not math.isfinite(span):
             span = SHORTEST_S
         self._command_planner(HighLevel.LAND, lambda: self._planner.land(0.0, span, yaw=None))

@@ -146,6 +146,15 @@ def test_missing_deck():
         pass
 
 
+def test_missing_multiranger():
+    """Without the deck all ranges are 0: an obstacle everywhere."""
+    with (
+        pytest.raises(BodyError, match="no Multi-ranger deck"),
+        flown(device={"multiranger": True}, serve={"multiranger": False}),
+    ):
+        pass
+
+
 def test_lighthouse(tmp_path):
     """Geometry and calibration arrive, are stored, and only then does the estimate settle."""
     device = {"positioning": {"system": "lighthouse", "file": lighthouse_file(tmp_path, 0, 1)}}
@@ -157,6 +166,23 @@ def test_lighthouse(tmp_path):
         assert twin.device.drones[0].value("stabilizer.estimator") == 2
         assert twin.device.flock.estimator.variance[0] < 1e-2
         process.until(lambda: process.state.notes[0] == "", "nothing to say")
+        process.close()
+        memories.stored = (0, 0)
+        again = Process(open_crazyflie(request("crazyflie", twin.addresses, device=device)))
+        again.close()
+        assert memories.stored == (0, 0), "the same geometry is not written again: that wears the flash memory"
+        other = device["positioning"] | {"file": lighthouse_file(tmp_path, 0, 1, 2)}
+        again = Process(open_crazyflie(request("crazyflie", twin.addresses, device={"positioning": other})))
+        again.close()
+        assert memories.stored == (0b1111, 0b1111)
+
+
+def test_flow_deck_begins_at_the_start():
+    """Without positioning from outside the estimator is told where the robot stands, and is not left at (0, 0)."""
+    start = [[0.7, -0.4, 0.0]]
+    with flown(start=start) as (twin, process):
+        assert [twin.device.drones[0].value(f"kalman.initial{axis}") for axis in "XYZ"] == pytest.approx(start[0])
+        process.until(lambda: np.abs(process.state.position - start).max() < 0.05, "there")
 
 
 def test_loco():
