@@ -88,7 +88,7 @@ def twin() -> Callable[[], float]:
         nonlocal tick
         tick += 1
         estimator.add_external(0, DT * tick, (0.0, 0.0, 0.0))
-        estimator.advance(DT * tick, DT, np.zeros((1, 3)), np.array([False]))
+        estimator.advance(DT * tick, DT, np.zeros((1, 3)), np.array([False]), np.array([False]))
         return float(estimator.variance[0])
 
     return advance

@@ -26,6 +26,7 @@ SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and vari
 PRECISE: Final = 1e-5  # [m²] final variance
 LOST: Final = 100.0  # [m²] variance after a reset
 GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
+UPWARDS: Final = np.array([False, False, True])
 FRESH_S: Final = 0.5  # older external positions are ignored
 
 
@@ -48,15 +49,25 @@ class Estimator:
         self.external[row], self._external_time[row] = position, t
         self.received[row] += 1
 
-    def advance(self, t: float, dt: float, truth: Array, ready: Mask) -> None:
-        """Advance one step of dt [s]; rows `ready` (N,) have a working positioning system on board."""
+    def advance(self, t: float, dt: float, truth: Array, ready: Mask, flow: Mask) -> None:
+        """Advance one step of dt [s].
+
+        Args:
+            t: Current time [s].
+            dt: [s].
+            truth: (N, 3) true positions [m].
+            ready: (N,) rows with a working positioning system on board.
+            flow: (N,) rows with a Flow deck: velocity and height are measured, so an error of the place stays.
+        """
         outside = t - self._external_time <= FRESH_S
         share = -np.expm1(-dt / SETTLING_S)
-        wanted = np.where(ready[:, None], 0.0, self.external - truth)
+        wanted = np.where((ready | flow)[:, None], 0.0, self.external - truth)
         measured = ready | outside
-        self.error += np.where(measured[:, None], share * (wanted - self.error), 0.0)
+        axes = measured[:, None] | (flow[:, None] & UPWARDS)
+        self.error += np.where(axes, share * (wanted - self.error), 0.0)
         settled = self.variance + share * (PRECISE - self.variance)
-        self.variance = np.where(measured, settled, np.minimum(self.variance + GROWTH * dt, LOST))
+        growth = np.where(flow, 0.0, GROWTH * dt)
+        self.variance = np.where(measured, settled, np.minimum(self.variance + growth, LOST))
 
 
 # voltage [V] of a battery at rest by charge: the curve from which the firmware gives pm.batteryLevel, and full
@@ -86,8 +97,8 @@ class Flock:
         self.loco = [isinstance(each.positioning, Loco) for each in settings]
         self.multiranger = [each.multiranger for each in settings]
         outside = np.array([isinstance(each.positioning, Outside) for each in settings])
-        self._on_board = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
-        self.flow = self._on_board.tolist()
+        self._flow = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
+        self.flow = self._flow.tolist()
         self.tables = [tuple(each.tables) for each in settings]
         self._faults, self._fault_tumbled = faults, False
         by_hand = [faults.refuse_arming or each.platform == "brushless" for each in settings]
@@ -109,7 +120,7 @@ class Flock:
         self._latency = Latency(request.disturbance, self.dt)
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
         self._gain, self._turn_gain = np.array(response.position), kind.turn_response
-        self.estimator.error[~self._on_board] = -self.quadrotor.position[~self._on_board]
+        self.estimator.error[:] = -self.quadrotor.position  # it believes to be where it was switched on
         self.place = self.quadrotor.position.copy()  # (N, 3) true positions [m]
         self.estimate = self.place + self.estimator.error  # (N, 3) reported positions [m]
         self.velocity = np.zeros((rows, 3))  # reported, from measured positions [m/s]
@@ -154,7 +165,7 @@ class Flock:
 
     def ready(self) -> Mask:
         """Rows (N,) with a working positioning system on board."""
-        working = self._on_board.copy()
+        working = np.zeros(len(self.flow), dtype=bool)
         for row, memories in enumerate(self.memories):
             if self.lighthouse[row]:
                 working[row] = self.station_status(row) == 2
@@ -174,8 +185,7 @@ class Flock:
         self.commander.stop(row)
         self.supervisor.restart(row)
         self.quadrotor.stop(np.array([row]))
-        if not self._on_board[row]:
-            self.estimator.reset(row, -self.quadrotor.position[row])
+        self.estimator.reset(row, -self.quadrotor.position[row])
 
     def advance(self, t: float) -> Mask:
         """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked or crashed on the way."""
@@ -220,7 +230,7 @@ class Flock:
             self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
-        self.estimator.advance(t, self.dt, self.place, self.ready())
+        self.estimator.advance(t, self.dt, self.place, self.ready(), self._flow)
         measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
         self.estimate = measured + self.estimator.error
         self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)

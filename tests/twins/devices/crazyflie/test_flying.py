@@ -406,6 +406,20 @@ def test_disarmed_in_the_air_it_locks():
 # ---------------------------------------------------------------------- where it believes to be
 
 
+def test_a_flow_deck_does_not_measure_where_it_is():
+    """It believes to be where it was switched on, in the air too, until its estimator is reset elsewhere."""
+    wire = Wire(start=[[0.5, 0.2, 0.0]]).hovering()
+    assert wire.flock.estimate[0] == pytest.approx([0.0, 0.0, 1.0], abs=0.01)
+    wire.go_to(0.3, 0.0, 1.0, 0.0, 2.0)
+    wire.wait(5.0)
+    assert wire.position == pytest.approx([0.8, 0.2, 1.0], abs=0.01)
+    for axis, value in zip("XYZ", wire.position, strict=True):
+        wire.drone.values[wire.drone.parameters.number[f"kalman.initial{axis}"]] = value
+    wire.put(Port.PARAM, 2, struct.pack("<H", wire.drone.parameters.number["kalman.resetEstimation"]), 1)
+    wire.wait(0.1)
+    assert wire.flock.estimate[0] == pytest.approx(wire.position, abs=0.01)
+
+
 def test_position_from_outside():
     """Before the first one it believes to stand where it was told to; after that, it flies what it is told."""
     wire = Wire(external=True, start=[[0.5, 0.2, 0.0]])

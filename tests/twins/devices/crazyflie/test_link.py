@@ -148,6 +148,9 @@ def test_every_parameter_packs():
 def test_log_block():
     """Values, types, stamps in milliseconds, and the rate."""
     wire = Wire(start=[[1.5, -0.25, 0.0]])
+    for name, value in (("kalman.initialX", 1.5), ("kalman.initialY", -0.25)):
+        wire.put(Port.PARAM, 2, number(name), struct.pack("<f", value))
+    wire.put(Port.PARAM, 2, number("kalman.resetEstimation"), 1)
     items = variable(0x77, "stateEstimate.x") + variable(0x55, "stateEstimateZ.y") + variable(0x88, "pm.vbat")
     assert wire.put(Port.LOG, 1, int(Log.CREATE), 3, items)[0][2] == bytes((Log.CREATE, 3, 0))
     assert wire.wait(0.1) == []
