@@ -83,10 +83,19 @@ class CrazyflieSettings(Part, frozen=True):
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 
     @property
+    def up_hz(self) -> float:
+        """Packets per second to the drone."""
+        return self.stream_hz + (self.positioning.rate_hz if isinstance(self.positioning, Outside) else 0.0)
+
+    @property
+    def down_hz(self) -> float:
+        """Packets per second from the drone."""
+        return self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
+
+    @property
     def packets_hz(self) -> float:
         """Packets per second over the radio, up and down."""
-        up = self.stream_hz + (self.positioning.rate_hz if isinstance(self.positioning, Outside) else 0.0)
-        return up + self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
+        return self.up_hz + self.down_hz
 
 
 def address(name: str, given: str) -> str:
@@ -145,9 +154,14 @@ def radio_loads(addresses: Sequence[str], each: Sequence[CrazyflieSettings]) -> 
     return [load[radio] if radio else None for radio in radios]
 
 
-def capacity(exchanges_hz: float) -> float:
-    """Packets per second that a radio carries, up and down, which makes so many exchanges per second."""
-    return max(min(PACKETS_PER_RADIO, exchanges_hz), MEASURED_SHARE * exchanges_hz)
+def capacity(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> float:
+    """Packets per second, up and down, that a radio carries of robots with these settings.
+
+    One exchange takes one packet up and one down: of neither are there more than `MEASURED_SHARE` of the exchanges.
+    """
+    usable = MEASURED_SHARE * exchanges_hz
+    up, down = sum(one.up_hz for one in each), sum(one.down_hz for one in each)
+    return min(max(PACKETS_PER_RADIO, usable), usable * (up + down) / max(up, down))
 
 
 def fitting_rates(each: CrazyflieSettings, share: float) -> str:

@@ -113,7 +113,7 @@ class CrazyflieBody:
             before, begin = self._exchanges(rows), time.monotonic()
             time.sleep(WINDOW_S)
             best = max(best, (self._exchanges(rows) - before) / (time.monotonic() - begin))
-            self._capacity[radio] = capacity(best)
+            self._capacity[radio] = capacity(settings, best)
             refusal = overload(radio, settings, self._capacity[radio])
             if not refusal:
                 break

@@ -289,7 +289,8 @@ def test_fleets_on_one_radio(rows, monkeypatch, tmp_path):
         assert descent.fastest.max() < LANDS
 
 
-def test_a_radio_that_carries_too_little_is_refused():
+def test_a_radio_that_carries_too_little_is_refused(monkeypatch):
+    monkeypatch.setattr(body, "MEASURING_S", 0.5)
     device = RADIO | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
     with (
         pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 510 packets/s.*write log_hz = .*stream_hz"),

@@ -206,9 +206,10 @@ def test_other_robots():
         open_crazyflie(request("tello", [RADIO.format(1)]))
 
 
-@pytest.mark.parametrize(("exchanges", "carried"), [(200.0, 200.0), (300.0, 250.0), (600.0, 420.0)])
+@pytest.mark.parametrize(("exchanges", "carried"), [(100.0, 126.0), (300.0, 250.0), (600.0, 420.0)])
 def test_what_a_radio_carries(exchanges, carried):
-    assert capacity(exchanges) == pytest.approx(carried)
+    """Of 45 packets per second and robot, 25 come down: at most 70 % of the exchanges."""
+    assert capacity([CrazyflieSettings()] * 5, exchanges) == pytest.approx(carried)
 
 
 def test_crowded_radio():
