@@ -89,7 +89,7 @@ class PageFigure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page; whatever it has is shown in this order. `folded` is the text on which to click, if folded."""
+    """A part of the page; whatever it has is shown in this order."""
 
     title: str
     prose: tuple[str, ...] = ()
@@ -97,7 +97,13 @@ class Section:
     pictures: tuple[PageFigure, ...] = ()
     listing: str = ""
     terms: tuple[tuple[str, str], ...] = ()
-    folded: str = ""
+    more: tuple[str, Table] | None = None  # a folded table at the end, behind the text on which to click
+    folded: str = ""  # what is in it, in a few words; then the whole section is folded
+
+    @property
+    def anchor(self) -> str:
+        """Its id in the page, for links."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
 def render(
@@ -110,10 +116,14 @@ def render(
     verdict: Sequence[Finding],
     sections: Sequence[Section],
     foot: Sequence[str] | None = None,
+    replay: str = "",
 ) -> Path:
-    """Writes a page that needs nothing else: facts and findings on top, then the sections, a `foot` of small lines.
+    """Writes a page that needs nothing else: findings, facts, sections with their contents, a `foot` of small lines.
 
-    Left out, the foot tells code and versions of this process.
+    Args:
+        foot: Code and versions of this process if left out.
+        replay: HTML of an embedded replay, trusted as it is, shown right after the findings; none if left out.
+        target, title, source, facts, command, verdict, sections: As the page shows them.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
 
@@ -132,6 +142,7 @@ def render(
         findings=verdict,
         sections=sections,
         foot=version.provenance().words[:2] if foot is None else foot,
+        replay=replay,
     )
     target.write_text(page, encoding="utf-8")
     return target

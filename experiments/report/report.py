@@ -24,7 +24,7 @@ from experiments.report.tables import (
     clearance_tables,
     clocks_table,
     collision_table,
-    events_table,
+    events_tables,
     gaps_table,
     links_table,
     network_tables,
@@ -65,7 +65,6 @@ NETWORK: Final = (
 )
 GAPS: Final = "Between two transmissions within the run; silence before the first and after the last is not counted."
 BELIEF: Final = "Distance of the last pose received on each link, carried on by the prediction, from the true one."
-MOST_LINKS: Final = 60  # longer tables are folded
 
 
 def write(
@@ -121,21 +120,22 @@ def write(
         ("Cases", ", ".join(by_case(cases))),
     ]
     drawn = _pictures(cases, first)
+    short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)]),
+        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
         Section("Figures", pictures=drawn),
-        Section("Each robot", tables=robot_tables(cases)),
-        Section("Was anything lost?", (PROOF,), proof_tables(cases)),
-        *_tables("What the modelled network did", NETWORK, network_tables(cases)),
+        Section("Events", tables=(short,), more=every_event),
+        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
+        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
+        *_tables("Network model", NETWORK, network_tables(cases)),
         *_tables("Time between transmissions", GAPS, [gaps_table(cases)]),
-        *_tables("Belief of neighbours", BELIEF, [links_table(cases)]),
+        *_tables("Belief error", BELIEF, [links_table(cases)]),
         *_of_worlds(cases, first, len(drawn)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
-        Section("What happened", tables=(events_table(first),)),
-        Section("The experiment", listing=listing, folded="Show the file"),
-        Section("Definitions", terms=DEFINITIONS),
+        Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
+        Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
     ]
     first_of_all, verdict = [*failures(cases), *interruptions(cases)], findings(cases)
     return render(
@@ -189,12 +189,12 @@ def compare(
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
-        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)]),
+        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
-        Section("Each robot", tables=robot_tables(cases), folded="Show all tables"),
-        Section("Was anything lost?", tables=proof_tables(cases), folded="Show all tables"),
-        *_tables("What the modelled network did", NETWORK, network_tables(cases)),
-        Section("Definitions", terms=DEFINITIONS),
+        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
+        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
+        *_tables("Network model", NETWORK, network_tables(cases)),
+        Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     source = "; ".join(experiments)
@@ -209,11 +209,11 @@ def compare(
     )
 
 
-def _tables(title: str, prose: str, tables: Iterable[Table | None]) -> list[Section]:
-    """A section of tables with rows, folded if they are long; none without any."""
+def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: bool = True) -> list[Section]:
+    """A section of tables with rows; none without any."""
     shown = tuple(table for table in tables if table is not None and table.rows)
-    folded = "Show all links" if any(len(table.rows) > MOST_LINKS for table in shown) else ""
-    return [Section(title, (prose,), shown, folded=folded)] if shown else []
+    rows = f"{sum(len(table.rows) for table in shown)} rows"
+    return [Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
 def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
@@ -248,13 +248,19 @@ def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_be
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
         touched = (collision_table(cases),) if any(case.collisions for case in cases) else ()
+        count = sum(len(case.collisions) for case in cases)
+        contacts = f"{count} collisions" if count else "closest approaches"
         source = FROM_WORLD if all(case.watched for case in cases) else FROM_POSITIONS
-        sections.append(Section("Did anything touch?", (source,), (*touched, *clearance_tables(cases))))
+        sections.append(
+            Section("Contacts and clearances", (source,), (*touched, *clearance_tables(cases)), folded=contacts)
+        )
     if tables := shadow_tables(cases):
         seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
         drawn = ((figure, f"{SHADOWS}{seed}") for figure in figures.shadow_figures(traces).values())
         pictures = numbered(drawn, figures_before + 1)
-        sections.append(Section("Twins beside robots", tables=tables, pictures=pictures))
+        sections.append(
+            Section("Twins beside robots", tables=tables, pictures=pictures, folded="shadow twins against their robots")
+        )
     return sections
 
 

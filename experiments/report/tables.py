@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Final, Generic, TypeVar
 
+from agents.network.messages import Event
 from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import by_case, ratios, spread
 from experiments.recording.trace import Trace
@@ -22,6 +23,7 @@ Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value 
 Column = tuple[str, Callable[[Sequence[T]], Cell]]  # head, cell of the same robot or link in all seeds
 
 MOST_EVENTS: Final = 200
+ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "says", "start")  # kinds that stand folded
 MOST_COLLISIONS: Final = 100
 
 SUMMARY: Final = (
@@ -316,8 +318,8 @@ def gaps_table(cases: Sequence[CaseMetrics]) -> Table:
 def links_table(cases: Sequence[CaseMetrics]) -> Table:
     """Belief error of each link, per case; the mean and the largest over several seeds."""
     columns = [("RMS", _cell(statistics.fmean, "rms", 1000.0)), ("largest", _cell(max, "max", 1000.0))]
-    name = "{0.receiver} of {0.sender}".format
-    return _Rows("Receiver of sender", attrgetter("belief"), name, columns).side_by_side(cases, "mm")
+    name = "{0.receiver}, {0.sender}".format
+    return _Rows("Receiver, sender", attrgetter("belief"), name, columns).side_by_side(cases, "mm")
 
 
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -467,12 +469,19 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
     return Table(heading, tuple(rows), words=True)
 
 
-def events_table(traces: Sequence[Trace]) -> Table:
-    """Events of the conductor and the robots, case by case."""
+def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | None]:
+    """Hazards, phases and orders, case by case; and if there was more, all events behind how many they are."""
     events = [(trace.case, event) for trace in traces for event in trace.events]
-    shown = [(case, f"{event.stamp:.2f}", event.kind, event.source, event.text) for case, event in events[:MOST_EVENTS]]
-    note = _more(len(events) - MOST_EVENTS, "the recording") or ("" if events else "Nothing.")
-    return Table(("Case", "t [s]", "Event", "Source", ""), tuple(map(Row, shown)), note=note, words=True)
+    head = ("Case", "t [s]", "Event", "Source", "")
+
+    def table(chosen: Sequence[tuple[str, Event]]) -> Table:
+        rows = [Row((case, f"{e.stamp:.2f}", e.kind, e.source, e.text)) for case, e in chosen[:MOST_EVENTS]]
+        return Table(head, tuple(rows), note=_more(len(chosen) - MOST_EVENTS, "the recording"), words=True)
+
+    telling = [(case, event) for case, event in events if event.kind not in ROUTINE]
+    short = table(telling) if telling else Table(head, (), note="No hazard, no leg of the timeline, no order.")
+    hidden = len(events) > len(telling)
+    return short, (f"All {len(events)} events", table(events)) if hidden else None
 
 
 def _more(hidden: int, where: str) -> str:

@@ -16,7 +16,7 @@ from experiments.metrics.statistics import spread
 from experiments.report import report
 from experiments.report.metrics_files import write_csv
 from experiments.report.page import date_of, inline, interval, number
-from experiments.report.tables import proof_tables, robot_tables, summary_table
+from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table
 from experiments.report.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
@@ -106,6 +106,29 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
     assert path.stat().st_size < 1_500_000
 
 
+def test_contents_lead_to_every_section_and_details_are_folded(tmp_path, run):
+    html = report.write(tmp_path, run).read_text(encoding="utf-8")
+    contents = html[html.index("<nav") : html.index("</nav>")]
+    links = re.findall(r'href="#([^"]*)"', contents)
+    assert links[:4] == ["verdict", "results", "figures", "events"]
+    assert html.index('id="verdict"') < html.index('class="facts"') < html.index('id="results"')
+    folded = {anchor for anchor in links if f'<div id="{anchor}">' in html}
+    assert set(links) - folded == {"verdict", "results", "figures", "events"}
+    assert {"each-robot", "data-integrity", "belief-error", "experiment-file", "definitions"} <= folded
+
+
+def test_only_telling_events_stand_open():
+    said = (Event(0.0, "robot", "A", "running"), Event(1.0, "hazard", "A", "hold: no position"))
+    known = dataclasses.replace(crowd(3, duration=2.0), events=said)
+    short, every = events_tables([known])
+    assert [row.cells[2] for row in short.rows] == ["hazard"]
+    assert every is not None
+    assert (every[0], len(every[1].rows)) == ("All 2 events", 2)
+    quiet, every = events_tables([dataclasses.replace(known, events=said[1:])])
+    assert len(quiet.rows) == 1
+    assert every is None
+
+
 @pytest.mark.slow
 def test_report_is_the_same_every_time(tmp_path, run):
     texts = [report.write(tmp_path, run, command="c", name=name).read_bytes() for name in ("a.html", "b.html")]
@@ -183,9 +206,9 @@ def broken(tmp_path_factory):
 
 
 def test_an_interrupted_run_says_so_first(broken):
-    first = broken.words.split("In short")[1]
+    first = broken.words.split("In short")[2]
     assert first.split("It rained.")[0].strip(" !") == ("Interrupted after 7.9 s of 45 s: all figures are up to there.")
-    assert "7.9 s of 45 s" in broken.words.split("In short")[0]
+    assert "Duration 7.9 s of 45 s" in broken.words
     assert "dropped out" not in broken.words
     assert "never stayed" not in broken.words
     assert "After the leg" not in broken.words
@@ -232,7 +255,7 @@ def test_another_file_of_that_name_is_left_alone(tmp_path, text):
 def test_without_a_command_nothing_is_kept(tmp_path):
     page = checked(report.write(tmp_path, [crowd(3, duration=2.0)], date=date_of(1.76e9)).read_text())
     assert "2025-10-09 08:53 UTC" in page.words
-    assert "Do it again" not in page.words
+    assert "Reproduce" not in page.words
     assert not (tmp_path / "run.json").exists()
 
 
