@@ -44,6 +44,7 @@ from experiments.recording.trace import Trace
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
+PRESENT: Final = 0.8  # a robot whose position is known for less of the run was out of reach
 KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
 
 
@@ -61,16 +62,17 @@ def _mean(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
     return mean
 
 
-def _failures(trace: Trace, died: Sequence[str]) -> tuple[str, ...]:
-    """The first thing that kept each robot from its part of the experiment; `died` have no position for long."""
+def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
+    """The first thing that kept each robot from its part of the experiment."""
     found: dict[str, str] = {}
     for event in trace.events:
         lost = event.kind == "lost" or (event.kind == "hazard" and failed(event.text))
         if lost and event.source in trace.robots and event.source not in found:
             what = f"was lost: {event.text}" if event.kind == "lost" else event.text.removeprefix("warn: ")
             found[event.source] = f"{event.source} at {max(event.stamp, 0.0):.1f} s: {what}"
-    for name in died:
-        found.setdefault(name, f"{name}: its position was not known for {1.0 - KNOWN:.0%} of the time or more")
+    for each in robots:
+        if each.known < PRESENT:
+            found.setdefault(each.robot, f"{each.robot}: its position was known for {each.known:.0%} of the time only")
     return tuple(found.values())
 
 
@@ -150,7 +152,7 @@ def measure(trace: Trace) -> CaseMetrics:
         world_factor=_slowest(trace),
         away_s=network_away(errors.alive, trace.time)[0],
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
-        failures=_failures(trace, died),
+        failures=_failures(trace, robots),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=centralised.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),

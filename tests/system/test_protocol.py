@@ -36,7 +36,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     assert addressed["TB01"]["body"].startswith(("ros2dds://", "rmw://"))
     everyone = list(children.values())
     code, out = flight.finish(90.0)
-    assert code == 0
+    assert code == 0, flight.said()
     until(lambda: gone(everyone), "nothing is left", LAND_S)
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert all(robot["lost"] == 0 for robot in robots.values())

@@ -139,7 +139,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     everyone = list(flight.children().values())
     assert "world" in flight.children()
     code, out = flight.finish(90.0)
-    assert code == 0
+    assert code == 0, flight.said()
     until(lambda: gone(everyone), "nothing is left")
     robots = json.loads(out)["cases"]["event"]["robots"]
     followers = {name: robot for name, robot in robots.items() if name != "TB01"}

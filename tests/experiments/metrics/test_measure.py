@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.network.messages import Event
 from experiments.metrics import measure, statistics
 from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, net_rotation
@@ -371,3 +372,39 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
     assert measured.away_s == 0.0
     assert measured.robots[1].known < 0.5
     assert measured.robots[1].robot in measured.died
+
+
+@pytest.mark.parametrize(
+    ("events", "expected"),
+    [
+        ([("hazard", "warn: a neighbour is lost: L")], ()),
+        ([("hazard", "hold: its own position is lost: none")], ()),
+        ([("hazard", "over: it is told to move and does not, after 2.00 s")], ()),
+        (
+            [("hazard", "warn: it is told to move and does not: told 0.21 m in vain"), ("lost", "its process ended")],
+            ("F at 3.0 s: it is told to move and does not: told 0.21 m in vain",),
+        ),
+        ([("hazard", "warn: its device does not answer: for 1.0 s")],
+         ("F at 3.0 s: its device does not answer: for 1.0 s",)),
+        ([("hazard", "land: it came down by itself: its motors are off")],
+         ("F at 3.0 s: land: it came down by itself: its motors are off",)),
+        ([("hazard", "cut: it has tipped over: 80°")], ("F at 3.0 s: cut: it has tipped over: 80°",)),
+        ([("lost", "its process ended (exit code 1)")], ("F at 3.0 s: was lost: its process ended (exit code 1)",)),
+    ],
+)  # fmt: skip
+def test_robots_that_did_not_do_their_part_are_named_first(events: list[tuple[str, str]], expected: tuple[str, ...]):
+    made = [Event(3.0 + k, kind, "F", text) for k, (kind, text) in enumerate(events)]
+    measured = measure.measure(dataclasses.replace(pair(1.0 + np.exp(-T)), events=tuple(made)))
+    assert measured.failures == expected
+    first = verdict.findings([measured])[0]
+    assert (
+        (first.mark == "bad" and first.text == f"Failed in only: {expected[0]}.") if expected else first.mark != "bad"
+    )
+
+
+def test_a_robot_without_a_position_for_a_fifth_of_the_run_did_not_do_its_part():
+    known = pair(1.0 + np.exp(-T))
+    place = known.true_position.copy()
+    place[T > 15.0, 1] = np.nan
+    measured = measure.measure(dataclasses.replace(known, true_position=place, position=place))
+    assert measured.failures == ("F: its position was known for 75% of the time only",)
