@@ -73,10 +73,27 @@ def _explained() -> tuple[type[BaseException], ...]:
     return tuple(getattr(sys.modules[module], name) for module, name in EXPLAINED if module in sys.modules)
 
 
+UsageError: Final[type[typer.BadParameter]] = typer.BadParameter.__mro__[
+    1
+]  # its own click's, which has no name in typer
+
+
 def main() -> None:
     """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
     try:
-        app()
+        sys.exit(app(prog_name="zenpark", standalone_mode=False))
+    except UsageError as error:
+        words = [] if error.ctx is None else error.ctx.command_path.split()[1:]
+        message = error.format_message()
+        if error.ctx is not None and message == error.ctx.get_help():
+            print(message)
+        else:
+            asked = " ".join(["./zenpark", *words, "--help"])
+            remedy = f"`{asked}` shows what there is"
+            print(f"zenpark: {message}\n  {remedy}", file=sys.stderr)
+        sys.exit(2)
+    except typer.Abort:
+        sys.exit(130)
     except _explained() as error:
         print(f"zenpark: {error}", file=sys.stderr)
         sys.exit(2)

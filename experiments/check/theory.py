@@ -24,12 +24,15 @@ RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for l
 
 def network(analysis: Analysis) -> Iterator[Claim]:
     """Check that the network is connected, and that every robot is reached by a leader."""
-    names, links, leaders = analysis.names, analysis.assignment.links, analysis.plan.leaders
+    names, links = analysis.names, analysis.assignment.links
     path = ("formation", "links")
     if not len(links):
         yield Claim("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")
         return
     rows = len(names)
+    linked = np.union1d(links.receiver, links.sender)
+    named = analysis.experiment.formation.leader
+    leaders = tuple(name for name in analysis.plan.leaders if name == named or names.index(name) in linked)
     sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
     receives = np.isin(np.arange(rows), links.receiver)
     anchors = analysis.assignment.anchors
@@ -43,7 +46,6 @@ def network(analysis: Analysis) -> Iterator[Claim]:
             message = f"{subject} cannot be reached by the leader ({join_names(leaders)}), directly or through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Claim("error", "leader-unknown", message, remedy, path))
-    linked = np.union1d(links.receiver, links.sender)
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
     apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
     if parts > 1 and anchors is not None and reachable(links, rows, anchors.row)[linked].all():
@@ -56,7 +58,7 @@ def network(analysis: Analysis) -> Iterator[Claim]:
         problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
     isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
     if isolated:
-        message = f"{join_names(isolated)} has no neighbours and is no leader: it takes no part in the formation"
+        message = f"{join_names(isolated)} has no links: it takes no part in the formation"
         problems.append(Claim("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
     for name in leaders:
         if names.index(name) not in links.sender:

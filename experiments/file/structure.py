@@ -260,6 +260,12 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
         limit = " of letters, digits and _ that begins with a letter"
     if isinstance(value, bool) or not isinstance(value, list | dict):
         limit += f", not {shown(value)}"
+    tables = [part for part in (plain, *get_args(plain)) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
+    for table in tables[:1] if not isinstance(value, dict) else []:
+        fields = msgspec.structs.fields(table)
+        needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]
+        form = ", ".join(f"{field} = ..." for field in needed)
+        note = f"write {name} = {{ {form} }}: {note}" if note else f"write {name} = {{ {form} }}"
     return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", note)
 
 

@@ -119,9 +119,10 @@ def wish_of(text: str) -> Wish:
         if not found:
             raise wrong(place, f"'{part}' is no limit", "write one as iae<=1.01")
         limits.append(Limit(_known(found[1], place), float(found[2])))
+    least = _known(first, place)
     if not limits:
         raise wrong(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
-    return Wish(_known(first, place), tuple(limits))
+    return Wish(least, tuple(limits))
 
 
 def searched(tuning: Sequence[int]) -> tuple[int, ...]:

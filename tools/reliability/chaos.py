@@ -142,7 +142,7 @@ def _kinds(given: Sequence[str]) -> list[str]:
     words = [word for part in given for word in part.split(",") if word]
     for word in words:
         if word not in KINDS:
-            hint = did_you_mean(word, KINDS) or f"there are: {', '.join(KINDS)}"
+            hint = f"{did_you_mean(word, KINDS)} there are: {', '.join(KINDS)}"
             raise DocumentError([Problem(f"--kinds {word}", 0, 0, "no such fault", hint)])
     return words or list(KINDS)
 

@@ -277,7 +277,7 @@ def test_gains(gain, code):
             "multiple of 0.02",
         ),
         (PARK, "rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
-        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 has no neighbours", "> TB01"),
+        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 has no links", "> TB01"),
         (TRIANGLE, "robots.CF01.start=[0.0,-0.5]", ("warning", "local-minimum"), "another shape", "order"),
         (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
     ],
