@@ -178,6 +178,7 @@ class Memory(IntEnum):
     """Kinds of memories."""
 
     EEPROM = 0x00
+    DECK = 0x01
     LED_RING = 0x10
     TRAJECTORY = 0x12
     LOCO = 0x13

@@ -268,19 +268,16 @@ class Drone:
         kinds, memories = self.memories.kinds, self.memories
         if channel == 0:
             if data[0] == 1:
-                self.send(Port.MEMORY, 0, bytes((1, len(kinds))))
-            elif data[0] == 2 and data[1] < len(kinds):
-                kind = kinds[data[1]]
-                self.send(Port.MEMORY, 0, crtp.MEMORY_INFO.pack(2, data[1], kind, memories.size(kind)))
+                self.send(Port.MEMORY, 0, bytes((1, memories.count)))
+            elif data[0] == 2 and (listed := memories.listed(data[1])) is not None:
+                self.send(Port.MEMORY, 0, crtp.MEMORY_INFO.pack(2, data[1], *listed))
             return
         number, address = crtp.MEMORY.unpack_from(data)
         head, rest = data[: crtp.MEMORY.size], data[crtp.MEMORY.size :]
         read: bytes | None = b""
-        if number >= len(kinds):
-            read = None
-        elif channel == 1:
-            read = memories.read(kinds[number], address, rest[0])
-        elif not memories.write(kinds[number], address, rest):
+        if channel == 1:
+            read = memories.read_number(number, address, rest[0])
+        elif number >= len(kinds) or not memories.write(kinds[number], address, rest):
             read = None
         self.send(Port.MEMORY, channel, head + bytes((Status.IO if read is None else Status.OK,)) + (read or b""))
 

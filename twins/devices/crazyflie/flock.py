@@ -108,7 +108,11 @@ class Flock:
         self.supervisor = Supervisor(~np.array(by_hand))
         self.estimator = Estimator(rows)
         self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
-        self.memories = [Memories() for _ in range(rows)]
+        decks = zip(self.lighthouse, self.loco, self.multiranger, self.flow, strict=True)
+        boards = "bcLighthouse4", "bcDWM1000", "bcMultiranger", "bcFlow2"
+        self.memories = [
+            Memories([name for name, present in zip(boards, each, strict=True) if present]) for each in decks
+        ]
         self.charge = np.full(rows, faults.battery)  # 0 to 1
         self._low_since = np.full(rows, np.inf)  # [s]
         self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s

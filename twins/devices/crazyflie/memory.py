@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Final
+from zlib import crc32
 
 from agents.protocols.crtp import ANCHOR, Memory
 
 STATIONS: Final = 4  # the firmware's default
 ANCHORS: Final = 8
 PAGE: Final = 0x100
+ONE_WIRE_BYTES: Final = 112  # size of a deck's memory
 GEOMETRY_BYTES: Final = 49  # origin, rotation, valid
 CALIBRATION_BYTES: Final = 61  # two sweeps of seven floats, identifier, valid
 CALIBRATION: Final = 0x1000  # address of the calibrations
 ACTIVE: Final = 0x1000  # address of the list of active anchors
 ANCHOR_PAGES: Final = 0x2000
 
+BOARDS: Final = {"bcDWM1000": 0x06, "bcMultiranger": 0x0C, "bcFlow2": 0x0F, "bcLighthouse4": 0x10}  # product numbers
 DECK_VERSION: Final = 3  # of the list of deck memories, which is empty otherwise
 
 SIZES: Final = {
@@ -31,11 +35,13 @@ SIZES: Final = {
 
 
 class Memories:
-    """The memories of one Crazyflie, numbered in the order of `kinds`."""
+    """The memories of one Crazyflie, numbered in the order of `kinds`; those of its decks follow."""
 
     kinds: Final = tuple(SIZES)
 
-    def __init__(self) -> None:
+    def __init__(self, decks: Sequence[str] = ()) -> None:
+        """`decks`: names of `BOARDS`."""
+        self.decks = [_board(name, BOARDS[name]) for name in decks]
         self._bytes = {kind: bytearray(size) for kind, size in SIZES.items()}
         loco = self._bytes[Memory.LOCO]
         for where in (0, ACTIVE):  # all anchors are active, without positions
@@ -45,6 +51,25 @@ class Memories:
         self._bytes[Memory.EEPROM][: len(settings) + 1] = settings + bytes((sum(settings) % 0x100,))
         self.write_errors = 0  # of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
+
+    def listed(self, number: int) -> tuple[int, int] | None:
+        """Kind and size [bytes] of a memory by its number; None if there is none."""
+        if number < len(self.kinds):
+            return self.kinds[number], SIZES[self.kinds[number]]
+        return (Memory.DECK, ONE_WIRE_BYTES) if number < self.count else None
+
+    @property
+    def count(self) -> int:
+        """Number of memories."""
+        return len(self.kinds) + len(self.decks)
+
+    def read_number(self, number: int, address: int, count: int) -> bytes | None:
+        """Read by the number of a memory, see `read`."""
+        if number < len(self.kinds):
+            return self.read(self.kinds[number], address, count)
+        if number >= self.count or address + count > ONE_WIRE_BYTES:
+            return None
+        return self.decks[number - len(self.kinds)][address : address + count]
 
     @staticmethod
     def size(kind: Memory) -> int:
@@ -105,3 +130,14 @@ class Memories:
     def _exists(kind: Memory, address: int) -> bool:
         """Whether an address is valid: pages of base stations beyond the firmware's number are not."""
         return kind != Memory.LIGHTHOUSE or address % CALIBRATION < STATIONS * PAGE
+
+
+def _board(name: str, product: int) -> bytes:
+    """Content of a deck's 1-wire memory: header and elements, each with a checksum."""
+    header = struct.pack("<BIBB", 0xEB, 0, 0xBC, product)
+    parts = b"".join(
+        bytes((number, len(text))) + text for number, text in ((1, name.encode()), (2, b"A"))
+    )  # board name, revision
+    elements = bytes((0, len(parts))) + parts
+    content = b"".join(part + bytes((crc32(part) & 0xFF,)) for part in (header, elements))
+    return content.ljust(ONE_WIRE_BYTES, b"\xff")

@@ -228,7 +228,15 @@ def test_memories_of_the_led_ring(cf):
     timings = memory(cf, MemoryElement.TYPE_DRIVER_LEDTIMING)
     timings.add(25, {"r": 100, "g": 0, "b": 0})
     assert answered(timings.write_data)[0] is timings
-    assert len(cf.mem.get_mems(MemoryElement.TYPE_1W)) == 0  # no deck with a 1-wire memory
+
+
+def test_one_wire_memories_of_decks(cf):
+    """read_ow, and the acceptance test of memories: each deck says its name."""
+    deck = memory(cf, MemoryElement.TYPE_1W)
+    answered(deck.update)
+    assert deck.valid
+    assert deck.elements["Board name"] == "bcFlow2"
+    assert (deck.vid, deck.pid) == (0xBC, 0x0F)
 
 
 # ---------------------------------------------------------------------- the rest

@@ -250,10 +250,11 @@ def test_every_variable_packs():
 
 def test_memories_are_listed():
     wire = Wire()
-    assert wire.put(Port.MEMORY, 0, 1)[0][2] == bytes((1, len(Memories.kinds)))
+    assert wire.put(Port.MEMORY, 0, 1)[0][2] == bytes((1, len(Memories.kinds) + 1))  # and the one of its Flow deck
+    assert wire.put(Port.MEMORY, 0, 2, len(Memories.kinds))[0][2][2] == Memory.DECK
+    assert wire.put(Port.MEMORY, 0, 2, len(Memories.kinds) + 1) == []
     kinds = [wire.put(Port.MEMORY, 0, 2, i)[0][2][2] for i in range(len(Memories.kinds))]
     assert kinds == list(Memories.kinds)
-    assert 1 not in kinds  # cflib would want the content of a 1-wire memory
 
 
 def test_lighthouse_memory():
