@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Annotated, Final
 
 import typer
 
 from tools.bench import bench
 from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep, view
+from tools.commands.options import Group, example
 from tools.reliability import chaos, soak
 
 
@@ -19,6 +21,7 @@ def _exit(code: object, **_: object) -> None:
 
 app: Final = typer.Typer(
     name="zenpark",
+    cls=Group,
     help="Distributed experiments with several robots, on Zenoh.",
     no_args_is_help=True,
     result_callback=_exit,
@@ -26,11 +29,35 @@ app: Final = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _module in (run, view, sweep, check, soak, chaos, bench, processes, network, orders, estop):
+for _module in (run, view, sweep, check, soak, chaos, bench, processes, network, estop):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
-app.add_typer(lab.app, name="keys")
-app.add_typer(orders.robot_app, name="robot", help="Change the robots of a run that is under way.")
+app.add_typer(lab.app, name="cert")
+app.add_typer(orders.robot_app, name="robot")
+app.add_typer(orders.world_app, name="world")
+
+# what `./zenpark` itself does, before Python's packages are there
+LAUNCHER: Final = {
+    "install": "Add plug-ins of your own, or libraries for notebooks.",
+    "hardware": "Add the libraries that real robots need.",
+    "docs": "Serve the documentation site, or build it.",
+    "test": "Check the project: lint, types and tests.",
+}
+
+
+def _launched(name: str) -> Callable[[typer.Context], int]:
+    def command(context: typer.Context) -> int:
+        text = f"`{name}` is done by the script ./zenpark of the checkout, not by this command"
+        print(f"zenpark: {text}; in its folder: ./zenpark {name} {' '.join(context.args)}".rstrip(), file=sys.stderr)
+        return 2
+
+    return command
+
+
+for _name, _help in LAUNCHER.items():
+    _given = {"allow_extra_args": True, "ignore_unknown_options": True}
+    app.command(name=_name, help=_help, epilog=example(f"{_name} --help"), context_settings=_given)(_launched(_name))
+
 
 # The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
 # so that nothing needs to be imported to recognise it.
@@ -49,7 +76,6 @@ EXPLAINED: Final = (
     ("experiments.virtual_time.conductor", "Stuck"),
     ("experiments.sweep.workers", "SweepError"),
     ("experiments.real_time.conductor.support", "StandInError"),
-    ("tools.commands.orders", "WorldOrderError"),
     ("tools.commands.network", "KeyExpressionError"),
     ("tools.commands.view", "ViewError"),
 )
@@ -65,7 +91,9 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _zenpark(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
 ) -> None: ...
 
 

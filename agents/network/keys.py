@@ -57,7 +57,7 @@ class Keys:
     event = _RealmKey("run/event")  # phases, losses, orders
     experiment = _RealmKey("run/experiment")  # as it runs, late joiners included
     conductor = _RealmKey("run/conductor")  # liveliness token
-    run_order = _RealmKey("run/order")  # queryable: pause, resume, remove, restart, replace, add robots
+    run_order = _RealmKey("run/order")  # queryable: remove, restart, replace, add robots
     clock = _RealmKey("run/clock")  # clock offsets of other machines from the conductor's
     recorder = _RealmKey("run/recorder")  # liveliness token
     everything = _RealmKey("**")  # all keys of the realm

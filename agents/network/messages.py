@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 Setpoint = tuple[float, float, float, float]
 Encoding = Literal["json", "msgpack"]
 OrderKind = Literal["takeoff", "start", "hold", "resume", "leave", "land", "stop", "get", "set", "inspect", "go"]
-ChangeKind = Literal["pause", "resume", "remove", "restart", "replace", "add"]
+ChangeKind = Literal["remove", "restart", "replace", "add"]
 
 JSON: Final = "application/json"  # plain, without a schema suffix: REST and command-line tools then print it
 MSGPACK: Final = "application/msgpack"

@@ -159,7 +159,7 @@ class RobotProcess(Started):
 
 
 class WorldProcess(Started):
-    """`zenpark world`, whose first line is `ready`."""
+    """`zenpark world serve`, whose first line is `ready`."""
 
     patience_s = 40.0
 

@@ -1,4 +1,4 @@
-"""Robots that are paused, removed, restarted, replaced and added while the others fly on."""
+"""Robots that hold, are removed, restarted, replaced and added while the others fly on."""
 
 from __future__ import annotations
 
@@ -118,15 +118,15 @@ def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
     assert "takes part again after" in page
 
 
-@pytest.mark.mechanism("hot change: pause, remove, add")
-def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
+@pytest.mark.mechanism("hot change: hold, remove, add")
+def test_robots_hold_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     lab.fly()
     watcher = lab.watcher
-    said = lab.zenpark("pause", "CF01")
-    assert (said.returncode, said.stdout) == (0, "CF01: holds where it is\n"), said.stderr
+    said = lab.zenpark("hold", "CF01")
+    assert (said.returncode, said.stdout) == (0, "CF01: ordered to hold\n"), said.stderr
     watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
     assert lab.running("KH01", "KH02", "CF01")
-    assert lab.change("resume", "CF01").done == {"CF01": "goes on"}
+    assert lab.zenpark("resume").stdout.splitlines() == ["CF01: running", "KH01: running", "KH02: running"]
     watcher.until(lambda: watcher.status["CF01"].reason == "", "it goes on")
 
     before = watcher.status["KH02"].pid
@@ -135,7 +135,7 @@ def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
     assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
     assert lab.running("KH01", "CF01"), "the others go on"
-    assert "removed" in lab.change("pause", "KH02").refused["KH02"]
+    assert lab.zenpark("hold", "KH02").stderr == "KH02: no: no answer\n"
     assert "takes part" in lab.change("add", "KH02").done["KH02"], "who was removed may come back"
     watcher.until(lambda: watcher.status["KH02"].pid != before and lab.running("KH02"), "it runs")
     assert "already" in lab.change("add", "KH02").refused["KH02"]
@@ -144,6 +144,11 @@ def test_robots_pause_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     watcher.until(lambda: lab.running("KH03") and not watcher.status["KH01"].missing, "it is a neighbour")
     code, _ = lab.end()
     assert code in (0, 130)
+    events = [
+        (event.kind, event.source, event.text)
+        for event in playback.read(lab.folder / "run" / "event.mcap").trace.events
+    ]
+    assert ("order", "operator", "hold: CF01") in events
     assert " lost " not in (lab.folder / "run.stderr").read_text()
 
 
@@ -167,7 +172,7 @@ def test_a_spare_takes_over_a_name(lab: Lab) -> None:
     assert watcher.status["CF01"].origin == began  # plans of the name begin where they began
     assert "S1 has taken over CF01 already" in lab.change("replace", "CF01", spare="S1").refused["CF01"]
     assert lab.end()[0] in (0, 130)
-    orphan = lab.zenpark("pause", "CF01")
+    orphan = lab.zenpark("restart", "CF01")
     assert (orphan.returncode, orphan.stdout) == (2, "")
     assert re.search("no router answers|this run is not there", orphan.stderr)  # its port may be somebody else's by now
 

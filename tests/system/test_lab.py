@@ -27,7 +27,7 @@ def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
-    assert zenpark("keys", "init", tmp_path / "lab", file).returncode == 0
+    assert zenpark("cert", "init", tmp_path / "lab", file).returncode == 0
     flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")
@@ -42,7 +42,7 @@ def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None
     assert zenpark("echo", "park/*/pose", "-n", "3", *reach).stdout.count('"robot":') == 3
     assert "park/CF01/state" in zenpark("hz", "park/*/state", "--seconds", "1", *reach).stdout
     assert zenpark("echo", "park/*/pose", "--seconds", "0.3", "--connect", endpoint).returncode == 2
-    assert zenpark("order", "land", *reach, "--as", "observer").stdout.count("no, unknown: no answer") == 3
+    assert zenpark("robot", "land", *reach, "--as", "observer").stderr.count("no: no answer") == 3
     denied = zenpark("estop", *reach, "--as", "observer")
     assert denied.returncode == 1
     assert "NOT known to have stopped: CF01, KH01, KH02" in denied.stderr
@@ -56,15 +56,15 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
     authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
     for arguments, said in (
-        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`zenpark keys issue {lab} KH02 CF01`"),
-        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark keys init"),
-        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark keys init LAB FILE"),
-        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark keys init LAB FILE"),
+        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`zenpark cert issue {lab} KH02 CF01`"),
+        (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark cert init"),
+        (("router", "--listen", "tls/0.0.0.0:0"), "zenpark cert init LAB FILE"),
+        (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark cert init LAB FILE"),
         (("router", "--lab", lab), "name the experiment too"),
         (("router", "triangle", "--lab", lab, "--listen", "tcp/127.0.0.1:0"), "write tls/127.0.0.1:0"),
         (("agent", "triangle", "CF01", "--lab", lab), "CF01.pem is missing"),
         (("echo", "park/**", "--lab", lab), "observer.pem is missing"),
-        (("keys", "init", lab, "triangle"), "is a lab already"),
+        (("cert", "init", lab, "triangle"), "is a lab already"),
     ):
         done = zenpark(*arguments)
         assert done.returncode == 2, (arguments, done.stderr)

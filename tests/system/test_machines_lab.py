@@ -124,7 +124,7 @@ def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tm
     assert code == 2, out
     here = lab["desk"].address
     assert f"lab1: reaches the router at {here}, which stands in no router's certificate" in out
-    assert f"`zenpark keys renew {made.keys} router --host {here}`" in out
+    assert f"`zenpark cert renew {made.keys} router --host {here}`" in out
     shutil.rmtree(made.out)
     authority.renew(made.keys, ["router"], hosts=[here])
     made.flew()
@@ -152,7 +152,7 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
     until(lambda: register(made.keys), "a moment passes")
     code, out = made.zenpark("hosts", "install")
     assert code == 1
-    assert f"`zenpark keys renew {made.keys} KH02`" in out
+    assert f"`zenpark cert renew {made.keys} KH02`" in out
     code, out = made.zenpark("hosts", "check")
     assert "the certificate of KH02" in out
 

@@ -98,7 +98,7 @@ def test_an_observer_of_a_lab_has_no_buttons(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
-    assert zenpark("keys", "init", tmp_path / "lab", file).returncode == 0
+    assert zenpark("cert", "init", tmp_path / "lab", file).returncode == 0
     flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")

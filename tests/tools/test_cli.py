@@ -54,7 +54,6 @@ def test_commands():
                 "echo",
                 "hz",
                 "twin",
-                "order",
                 "estop",
                 "runs",
                 "robot",
@@ -62,9 +61,13 @@ def test_commands():
                 "centre",
                 "world",
                 "explain",
-                "world-order",
                 "hosts",
                 "station",
+                "cert",
+                "install",
+                "hardware",
+                "docs",
+                "test",
             ]
         )
         == COMMANDS
@@ -170,7 +173,6 @@ def test_no_router_is_explained(command):
             for each in (
                 (["echo", "park//pose"], "'park//pose' is not a key expression"),
                 (["keys", "--connect", "localhost"], "'localhost' is not an endpoint"),
-                (["world-order", "reste"], "no order 'reste' to a world; did you mean 'reset'?"),
             )
         ),
     ],

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import File, Lab, Settings
+from tools.commands.options import File, Lab, Settings, group
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment, Host
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from experiments.real_time.hosts.hosts import HostError, Station
     from experiments.real_time.hosts.station import Found
 
-app: Final = typer.Typer(help="Other machines of an experiment.", no_args_is_help=True, rich_markup_mode=None)
+app: Final = group("Check the other machines of an experiment, and put zenpark there.")
 On = Annotated[
     list[str] | None, typer.Option(metavar="HOST|TAG", help="Only this host, or those with this tag; may be repeated.")
 ]
@@ -298,7 +298,7 @@ def _mended(there: Station, router: Found, experiment: Experiment) -> str:
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
-        return f"ssh carries it, so look at the certificates: `zenpark keys show {there.lab}`"
+        return f"ssh carries it, so look at the certificates: `zenpark cert show {there.lab}`"
     if experiment.network.connect is not None:
         return "is it on (`zenpark router` starts one)? Else mend connect in [network]"
     if experiment.network.listen is not None:
@@ -319,7 +319,7 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
     row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
     row.trouble += [*wrong, *strays]
     if soon:
-        remedy = f"`zenpark keys renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
+        remedy = f"`zenpark cert renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong
 

@@ -1,4 +1,4 @@
-"""`zenpark keys`: alone it lists the members of the network; its commands manage the certificates of a lab."""
+"""`zenpark cert`: the certificates of a lab."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, AsJson, Connect, Lab
+from tools.commands.options import AsJson, group, print_json
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
     from experiments.definition.experiment import Experiment
 
-app: Final = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+app: Final = group("Make, renew and revoke the certificates of a lab: robots, people, routers.")
 
 Folder = Annotated[str, typer.Argument(metavar="LAB", help="Folder of the lab.")]
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Identities.")]
@@ -24,21 +24,6 @@ Hosts = Annotated[
     typer.Option("--host", metavar="HOST", help="Name or address at which it listens; may be repeated."),
 ]
 SOON_DAYS: Final = 14.0
-
-
-@app.callback(invoke_without_command=True)
-def keys(
-    context: typer.Context,
-    connect: Connect = None,
-    as_json: AsJson = False,
-    lab: Lab = None,
-    identity: As = "observer",
-) -> None:
-    """Show the members of the network and their keys; make certificates (init, issue, renew, revoke, show)."""
-    if context.invoked_subcommand is None:
-        from tools.commands.network import print_members
-
-        print_members(connect, lab, as_json=as_json, identity=identity)
 
 
 @app.command()
@@ -121,13 +106,11 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 @app.command()
 def show(folder: Folder, as_json: AsJson = False) -> int:
     """Show the members of a lab and the ends of their certificates; exit code 1 if a certificate has ended."""
-    import msgspec
-
     from agents.network.lab import register
 
     known = register(Path(folder))
     if as_json:
-        typer.echo(msgspec.json.format(msgspec.json.encode(known), indent=2).decode())
+        print_json(known)
     else:
         _print(Path(folder), known, list(known.identities))
     now = datetime.now(UTC)

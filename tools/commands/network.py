@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, Connect, KeyExpression, Lab, Seconds, session
+from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, print_json, session
 
 if TYPE_CHECKING:
     import zenoh
@@ -117,18 +117,18 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # not of this project
 
 
-def print_members(connect: list[str] | None, lab: str | None, *, as_json: bool, identity: str) -> None:
-    """Print the members of the network and the keys that they hold.
-
-    Raises:
-        Unreachable: If no router answers.
-    """
-    import msgspec
-
+@app.command()
+def keys(
+    connect: Connect = None,
+    as_json: AsJson = False,
+    lab: Lab = None,
+    identity: As = "observer",
+) -> None:
+    """Show the members of the network and the keys that they hold."""
     with session("keys", connect, lab, identity) as opened:
         found = members(opened)
     if as_json:
-        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print_json(found)
         return
     for member in found:
         print(f"{printable(member.name)}  ({member.id})")

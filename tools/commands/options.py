@@ -4,12 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer.core import TyperGroup
 
 if TYPE_CHECKING:
     import zenoh
+
+PANELS: Final = {
+    "Experiments": "new check explain run sweep report compare export list schema import recover clean",
+    "Watch": "view runs keys echo hz",
+    "Act": "robot world estop",
+    "By hand": "router agent centre twin bridge",
+    "Lab": "preflight hosts cert",
+    "Quality": "bench chaos soak",
+    "Set-up": "install hardware docs test",
+}
+
+
+class Group(TyperGroup):
+    """Commands of one subject; help shows the whole first sentence of each, those of zenpark itself in panels."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - of typer's private click
+        """Write the commands into the help."""
+        shown = {name: each for name, each in self.commands.items() if not each.hidden}
+        panels = {title: names.split() for title, names in PANELS.items()} if ctx.parent is None else {}
+        left = [name for name in shown if not any(name in names for names in panels.values())]
+        for title, names in {**panels, "Commands": left}.items():
+            if rows := [(name, (shown[name].help or "").partition("\n")[0]) for name in names if name in shown]:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+
+def group(text: str) -> typer.Typer:
+    """An empty group of commands with this help."""
+    return typer.Typer(
+        cls=Group, help=text, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+    )
+
+
+def example(*lines: str) -> str:
+    """Lines behind `./zenpark` that a command's help ends with, each as it can be typed."""
+    title = "Examples" if len(lines) > 1 else "Example"
+    return "\b\n" + "\n".join([f"{title}:", *(f"  ./zenpark {line}" for line in lines)])
+
 
 File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
 Connect = Annotated[
@@ -18,13 +57,13 @@ Connect = Annotated[
         metavar="ENDPOINT", help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]"
     ),
 ]
-Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark keys init`).")]
+Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark cert init`).")]
 As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="PATH=VALUE", help="Changes a value of the file; may be repeated."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="For programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
 Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
 Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")]
@@ -43,6 +82,13 @@ Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, 
 Report = Annotated[bool, typer.Option(help="Writes the report.")]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
+
+
+def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included
+    """Print a result as JSON: what every command does with `--json`."""
+    import msgspec
+
+    print(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())
 
 
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:

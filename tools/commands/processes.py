@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from tools.commands.options import As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
+from tools.commands.orders import world_app
 
 if TYPE_CHECKING:
     from agents.network.access_control import Rights
@@ -164,7 +165,7 @@ def centre(
     return serve(Launch(file=file, case=case, connect=connect or [], lifeline=lifeline, lab=lab))
 
 
-@app.command()
+@world_app.command(name="serve")
 def world(
     file: File,
     *,
@@ -176,7 +177,7 @@ def world(
     ] = False,
     lab: Lab = None,
 ) -> int:
-    """Be the world of an experiment: carry its twins, with obstacles, contacts and range sensors."""
+    """Run the world of an experiment: its twins, with obstacles, contacts and range sensors."""
     from experiments.real_time.processes.world import WorldLaunch, serve
 
     launch = WorldLaunch(file=file, case=case, connect=connect or [], lifeline=lifeline, engine=engine, lab=lab)

@@ -1,4 +1,4 @@
-"""Hot changes: robots are paused, removed, restarted, replaced or added while the run goes on.
+"""Hot changes: robots are removed, restarted, replaced or added while the run goes on.
 
 The conductor answers orders on a key of its own. A change takes seconds: it is a generator that advances one step at a
 time, so that the conductor never waits.
@@ -197,26 +197,12 @@ class HotChanges:
     def _steps(self, order: messages.RunOrder, names: tuple[str, ...]) -> Steps:
         """The change that an order asks for."""
         match order.order:
-            case "pause":
-                return self._order(names, messages.Order("hold"), "holds where it is")
-            case "resume":
-                return self._order(names, messages.Order("resume"), "goes on")
             case "remove":
                 return self._remove(names)
             case "replace":
                 return self._replace(names, order)
             case _:
                 return self._let_in(names, order)
-
-    def _order(self, names: Sequence[str], order: messages.Order, done: str) -> Steps:
-        yield from ()
-        for name in names:
-            if self._robots[name].gone:
-                raise Refused(f"{name} is not in the run: {self._robots[name].left_because}")
-        for name, reply in self._view.order(names, order).items():
-            if not reply.ok:
-                raise Refused(f"{name}: {reply.reason}")
-        return done
 
     def _remove(self, names: Sequence[str]) -> Steps:
         yield from self._leave(names)

@@ -57,7 +57,7 @@ def send_world_order(
     """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
     asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
     reply, why = _read(asked, messages.WorldReply)
-    nobody = "no world answers: is `zenpark world` running in this realm?"
+    nobody = "no world answers: is `zenpark world serve` running in this realm?"
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
 

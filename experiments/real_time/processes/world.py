@@ -269,7 +269,7 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    return command_line.run("zenpark world", WorldLaunch, serve, EXPLAINED, arguments)
+    return command_line.run("zenpark world serve", WorldLaunch, serve, EXPLAINED, arguments)
 
 
 if __name__ == "__main__":

@@ -247,8 +247,8 @@ def test_what_lies_where_it_was_lost_counts_unless_it_was_a_twin(stage: Stage) -
 
 def test_whole_orders_that_are_refused(stage: Stage) -> None:
     for query, said in (
-        (stage.ask("pause", "KH1"), "no robot 'KH1' in this run"),
-        (stage.ask("pause"), "name one or more of KH01, KH02, CF01"),
+        (stage.ask("remove", "KH1"), "no robot 'KH1' in this run"),
+        (stage.ask("remove"), "name one or more of KH01, KH02, CF01"),
         (stage.ask("restart", "KH01", body="twin"), "belong to replace"),
         (stage.ask("replace", "KH01", "KH02", body="twin"), "one robot at a time"),
     ):
@@ -274,7 +274,7 @@ def test_the_end_of_the_run_answers_everybody(stage: Stage) -> None:
     stage.changes.close()
     assert query.reply_sent is not None
     assert query.reply_sent.refused == {"CF01": "the run is over"}
-    assert "this run is not there" in stage.after(stage.ask("pause", "KH01")).reason
+    assert "this run is not there" in stage.after(stage.ask("remove", "KH01")).reason
 
 
 def test_a_lost_robot_is_started_again_three_times(monkeypatch: pytest.MonkeyPatch) -> None:
