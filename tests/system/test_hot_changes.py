@@ -123,10 +123,10 @@ def test_robots_hold_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     lab.fly()
     watcher = lab.watcher
     said = lab.zenpark("hold", "CF01")
-    assert (said.returncode, said.stdout) == (0, "CF01: ordered to hold\n"), said.stderr
+    assert (said.returncode, said.stdout) == (0, "CF01: holds where it is\n"), said.stderr
     watcher.until(lambda: watcher.status["CF01"].reason == "ordered to hold", "its status says so")
     assert lab.running("KH01", "KH02", "CF01")
-    assert lab.zenpark("resume").stdout.splitlines() == ["CF01: running", "KH01: running", "KH02: running"]
+    assert lab.zenpark("resume").stdout.splitlines() == ["CF01: goes on", "KH01: goes on", "KH02: goes on"]
     watcher.until(lambda: watcher.status["CF01"].reason == "", "it goes on")
 
     before = watcher.status["KH02"].pid

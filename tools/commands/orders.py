@@ -33,6 +33,14 @@ ORDERS: Final[Mapping[messages.OrderKind, str]] = {
     "resume": "Let robots go on that were told to hold.",
     "land": "Land robots where they are.",
 }
+DONE: Final[Mapping[str, str]] = {
+    "takeoff": "takes off",
+    "start": "starts",
+    "hold": "holds where it is",
+    "resume": "goes on",
+    "land": "lands",
+    "stop": "stops",
+}
 # changes of a run, which its conductor makes
 CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
     "remove": "Land robots and end their processes; the others go on without them.",
@@ -83,7 +91,7 @@ def _give(
         return _refuse(f"no robot in the realm '{keys.realm}'; `zenpark keys` shows the members", as_json=as_json)
     at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
     replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
-    done = {name: reply.reason or reply.phase for name, reply in replies.items() if reply.ok}
+    done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
     refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
     text = f"{what}: {', '.join(done) or 'no robot'}" + f"; refused by {', '.join(refused)}" * bool(refused)
     event = messages.Event(time.time(), "order", who, text)
