@@ -40,6 +40,7 @@ experiments.authoring experiments.real_time.hosts experiments.real_time.processe
 experiments.report experiments.real_time.conductor
 experiments.run
 experiments.sweep experiments.view
+tools.live_table
 tools.progress
 tools.commands
 tools.reliability tools.bench

@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from experiments.real_time.conductor.run_view import FROZEN_S, OUTPUT, News, Progress, RobotView, Shown
+from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, RobotView, Shown
+from tools.live_table import Row, Trends, heading, lines, metres
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
 
     from experiments.report.page import Finding
 
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
-EVENTS: Final = 5  # the last so many are shown below the table
 MARKS: Final = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
 
@@ -45,7 +45,7 @@ class Lines:
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
             errors = ", ".join(
-                f"{name} {'-' if view.gone else _metres(view.error)}" for name, view in progress.robots.items()
+                f"{name} {'-' if view.gone else metres(view.error)}" for name, view in progress.robots.items()
             )
             what = _silence(progress) or f"error [m] {errors}"  # – of robots that have no link, or no goal of their own
             print(f"{progress.case}: {progress.elapsed:5.1f} s, {progress.phase}; {what}", file=sys.stderr)
@@ -59,7 +59,7 @@ class Table:
         from rich.live import Live
 
         self._live = Live(console=Console(stderr=True), refresh_per_second=4, auto_refresh=False)
-        self._news, self._next = News(), 0.0
+        self._news, self._next, self._trends = News(), 0.0, Trends()
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -76,7 +76,7 @@ class Table:
         now = time.monotonic()
         if now >= self._next or progress.phase == "done":
             self._next = now + REFRESH_S
-            self._live.update(_table(progress), refresh=True)
+            self._live.update(_drawn(progress, self._trends, self._live.console), refresh=True)
 
 
 def shown(*, quiet: bool) -> Shown:
@@ -84,55 +84,28 @@ def shown(*, quiet: bool) -> Shown:
     return Table() if sys.stderr.isatty() and not quiet else Lines()
 
 
-def _table(progress: Progress) -> RenderableType:
-    from rich import box
+def _drawn(progress: Progress, trends: Trends, console: Console) -> RenderableType:
     from rich.console import Group
-    from rich.table import Table as Grid
-    from rich.text import Text
 
-    elapsed = "" if progress.elapsed is None else f"  {progress.elapsed:5.1f} / {progress.duration:g} s"
     silence = _silence(progress) and f"; {_silence(progress)}"
-    grid = Grid(title=f"{progress.case}: {progress.phase}{elapsed}{silence}", box=box.SIMPLE_HEAD, title_justify="left")
-    for heading in ("robot", "phase", "error, m", "sent", "1/s", "lost", "late", "CPU", "battery", ""):
-        grid.add_column(heading, justify="left" if heading in ("robot", "phase", "") else "right", no_wrap=True)
+    title = heading(f"{progress.case}: {progress.phase}{silence}", progress.elapsed, progress.duration)
     now = progress.clock.utc()
-    for name, view in progress.robots.items():
-        grid.add_row(name, *_cells(view, now))
-    news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)][-EVENTS:]
-    return Group(grid, *(Text(f"  {event.kind} {event.source}: {event.text}", style="dim") for event in news))
+    rows = [_row(trends, name, view, now) for name, view in progress.robots.items()]
+    news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)]
+    return Group(*lines(title, rows, news, console.width, console.height - 1))
+
+
+def _row(trends: Trends, name: str, view: RobotView, now: float) -> Row:
+    because = view.left_because
+    return trends.row(
+        name, view.status, now=now, error=view.error, rate=view.rate, gone=because, lost=because == "lost"
+    )
 
 
 def _silence(progress: Progress) -> str:
     """The outage of the network in words; empty while a router answers."""
     silent_s = time.monotonic() - progress.silent_since
     return f"no router answers for {silent_s:.1f} s" if silent_s > 0.0 else ""
-
-
-def _cells(view: RobotView, now: float) -> tuple[str, ...]:
-    status = view.status
-    out = f"[{'red' if view.left_because == 'lost' else 'dim'}]{view.left_because}[/]"
-    if status is None:
-        return (out if view.gone else "starting", *[""] * 8)
-    silent = now - status.stamp > FROZEN_S
-    phase = out if view.gone else ("[yellow]silent[/]" if silent else status.phase)
-    note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
-    if status.malformed:
-        note += f" {status.malformed} malformed"
-    return (
-        phase,
-        _metres(view.error),
-        str(status.sent),
-        f"{view.rate:.1f}",
-        str(sum(status.lost.values())),
-        str(status.missed),
-        f"{status.cpu_s:.1f} s",
-        "" if status.battery is None else f"{100 * status.battery:.0f} %",
-        note,
-    )
-
-
-def _metres(error: float | None) -> str:
-    return "–" if error is None else f"{error:.3f}"
 
 
 BAR_LINE_S: Final = 5.0  # where there is no terminal, progress is a line now and then

@@ -50,6 +50,7 @@ def test_commands():
                 "chaos",
                 "import",
                 "view",
+                "top",
                 "keys",
                 "echo",
                 "hz",

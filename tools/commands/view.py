@@ -1,4 +1,4 @@
-"""`zenpark view`: a run in three dimensions in the browser, live or from its recording."""
+"""`zenpark view`: a run in the browser, live or from its recording. `zenpark top`: its table in any terminal."""
 
 from __future__ import annotations
 
@@ -11,18 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
-from tools.commands.options import Connect, Lab, Realm, routers
+from tools.commands.options import As, Connect, Lab, Realm, Seconds, routers
 
 if TYPE_CHECKING:
+    import zenoh
+    from rich.text import Text
+
     from agents.runtime.run_registry import Run
     from experiments.run import Watch
     from experiments.view.acting import Watched
+    from tools.live_table import Row
 
 app: Final = typer.Typer()
 
 PORT: Final = 8080
 START_S: Final = 30.0  # until a run that was started just now is registered
 POLL_S: Final = 0.1
+REFRESH_S: Final = 0.25  # of the table
+FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
 
 
 class ViewError(RuntimeError):
@@ -66,6 +72,107 @@ def view(
         watched = _watched(connect, realm, lab, identity) if up is None else _of_run(up, identity)
         _live(watched, ended, port=port, dark=dark, open_page=open_page, with_run=with_run)
     return 0
+
+
+@app.command()
+def top(
+    *,
+    connect: Connect = None,
+    realm: Realm = "park",
+    lab: Lab = None,
+    identity: As = "observer",
+    seconds: Seconds = None,
+) -> int:
+    """Show the live table of a run, from any shell; in a pipe, the table once."""
+    from agents.network.session import open_session
+    from agents.network.shutdown import held
+    from agents.runtime.command_line import on_termination
+
+    ended = threading.Event()
+    with on_termination(ended.set):
+        watched = _watched(connect, realm, lab, identity)
+        opened = open_session(watched.endpoints, name="top", wait_s=5.0, identity=watched.identity)
+        with held(opened) as (session, declared):
+            table = _Top(session, watched)
+            declared.append(table)
+            return table.run(ended, seconds)
+
+
+class _Top:
+    """The table of a run that is seen from outside."""
+
+    def __init__(self, session: zenoh.Session, watched: Watched) -> None:
+        from agents.network.keys import Keys
+        from experiments.view.observer import Observer
+        from tools.live_table import Trends
+
+        self._watched, self._trends = watched, Trends()
+        self._observer = Observer(session, Keys(watched.realm))
+
+    def run(self, ended: threading.Event, seconds: float | None) -> int:
+        """Draws until it is ended, the run is over, or `seconds` [s] are; returns the exit code."""
+        import time
+        from math import inf
+
+        from rich.console import Console, Group
+        from rich.live import Live
+
+        console = Console()
+        began, over = time.monotonic(), False
+        limit_s = inf if seconds is None else seconds
+        if not console.is_terminal:
+            while not (over := self._heard()) and time.monotonic() - began < min(FIRST_S, limit_s):
+                if ended.wait(POLL_S):
+                    break
+            console.print(Group(*self._lines(console.width, len(self._observer.robots) + 20)), soft_wrap=True)
+            return int(not over)
+        with Live(console=console, auto_refresh=False, screen=True) as live:
+            while not (over or ended.wait(REFRESH_S)) and time.monotonic() - began < limit_s:
+                over = self._watched.run is not None and not self._watched.run.alive
+                self._observer.update()
+                live.update(Group(*self._lines(console.width, console.height)), refresh=True)
+        console.print(Group(*self._lines(console.width, console.height - 1)))  # what stood there last stays
+        return 0
+
+    def _heard(self) -> bool:
+        """Whether each robot has reported twice, or is gone."""
+        self._observer.update()
+        reports = self._observer.robots
+        return bool(reports) and all(
+            row.cpu is not None or row.rank == 0 or not reports[row.name].known for row in self._rows()
+        )
+
+    def _rows(self) -> list[Row]:
+        from agents.clock import Clock
+        from agents.decision.lifecycle import Phase
+        from agents.network.messages import EMERGENCY
+
+        observer, now, rows = self._observer, Clock().utc(), []
+        stage = observer.stage
+        linked = {stage.names[row] for row in stage.links.receiver.tolist()}
+        for name in [*stage.names, *sorted(observer.robots.keys() - {*stage.names})]:
+            report = observer.robots[name]
+            status = report.status
+            ended = status is not None and status.phase == Phase.DONE.word
+            stopped = status is not None and status.reason.startswith(EMERGENCY)
+            lost = stopped or (report.known and not report.alive and not ended)
+            rows.append(
+                self._trends.row(
+                    name, status, now=now,
+                    error=report.state.error if report.state is not None and (name in linked or not linked) else None,
+                    rate=report.rate, gone="stopped" if stopped else "lost" if lost else "", lost=lost,
+                )
+            )  # fmt: skip
+        return rows
+
+    def _lines(self, width: int, height: int) -> list[Text]:
+        from tools.live_table import common_phase, heading, lines
+
+        stage, rows, where = self._observer.stage, self._rows(), self._watched
+        title = stage.title or (where.run.title if where.run is not None else f"realm {where.realm}")
+        duration = None if stage.experiment is None else stage.experiment.duration_s
+        title = heading(common_phase([row.phase for row in rows]), self._observer.elapsed, duration, title)
+        return lines(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
 
 
 def require_viser() -> None:

@@ -1,0 +1,61 @@
+"""A run as it is watched from another shell: its table, attached to a router."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import msgspec
+import pytest
+import zenoh
+
+from agents.clock import Clock
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from tests.conftest import RouterProcess
+from tests.system.lab import Watcher, zenpark
+from tests.tools.commands.test_live_table import STATUS
+
+pytestmark = pytest.mark.system
+
+
+@contextmanager
+def reporting(session: zenoh.Session, names: list[str], hazard: str) -> Iterator[None]:
+    """Robots that report ten times a second; the last one has a hazard, and uses half a core."""
+    keys, over, begin = Keys(), threading.Event(), Clock().utc()
+    tokens = [pubsub.alive_token(session, keys.alive(name)) for name in names]
+    publishers = {name: pubsub.publisher(session, keys.status(name), messages.JSON) for name in names}
+
+    def report() -> None:
+        while not over.wait(0.1):
+            now = Clock().utc()
+            for name in names:
+                bad = name == names[-1]
+                status = msgspec.structs.replace(
+                    STATUS, robot=name, stamp=now, hazard=hazard if bad else "", cpu_s=(now - begin) * 0.5 * bad
+                )
+                publishers[name].put(messages.encode(status))
+
+    thread = threading.Thread(target=report)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        del tokens
+
+
+@pytest.mark.mechanism("table of a run from another shell")
+def test_top_shows_robots_of_a_router_the_worst_first(router: RouterProcess, watcher: Watcher) -> None:
+    with reporting(watcher.session, ["alpha", "beta", "gamma"], "hold: link silence"):
+        done = zenpark("top", "--connect", router.endpoint, timeout_s=30.0)
+    assert done.returncode == 0, done.stderr
+    title, heads, first, *others = done.stdout.splitlines()
+    assert "held 1" in title
+    assert "running 2" in title
+    assert heads.split()[:2] == ["robot", "phase"]
+    assert first.split()[:2] == ["gamma", "held"]
+    assert "50 %" in first
+    assert [line.split()[0] for line in others[:2]] == ["alpha", "beta"]

@@ -1,0 +1,102 @@
+"""The live table: what fits a terminal, in which order, and in which colour."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from agents.network.messages import Event, Status
+from tools.live_table import HEADS, Rank, Row, Trends, heading, lines, worst_first
+
+STATUS = Status(
+    "robot-01", 10.0, "running", "", "", 0.9, 100, 300, {"robot-02": 0}, {}, 0, 0, 500, 0, 500, 0, 0, 0.0, 1.0, [],
+    7, 2.0, 50.0,
+)  # fmt: skip
+EVENTS = [Event(float(k), "hazard", "robot-01", f"number {k} " + "far " * 40) for k in range(9)]
+
+
+def rows(count: int) -> list[Row]:
+    return [
+        Row(f"robot-{k:02}", "running", error=0.001 * k, rate=12.5, late=0, lost=3, cpu=0.04, battery=0.8, sent=900,
+            note="", pid=k + 1)
+        for k in range(count)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [40, 64, 80, 140])
+@pytest.mark.parametrize("height", [8, 14, 24, 50])
+@pytest.mark.parametrize("count", [3, 12, 100])
+def test_the_table_fits_the_terminal_and_names_are_whole(width, height, count):
+    held = msgspec.structs.replace(STATUS, hazard="hold: minimum separation: 0.18 m from robot-03 (limit 0.25 m)")
+    all_rows = rows(count)
+    all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0, rate=1.0)
+    drawn = [line.plain for line in lines(heading("event: formation", 5.3, 15.0), all_rows, EVENTS, width, height)]
+    assert max(map(len, drawn)) <= width
+    assert len(drawn) <= height
+    assert drawn[0].startswith("event: formation")
+    columns = drawn[1].split("  ")
+    heads = [word.strip() for word in columns if word.strip()]
+    assert heads == [head for head in HEADS if head][: len(heads)], "columns drop from the right"
+    named = [line.split()[0] for line in drawn[2:] if line.startswith("robot-")]
+    assert named[0] == f"robot-{count - 1:02}", "what needs attention comes first"
+    assert all(len(name) == len("robot-00") for name in named)
+    total = [line for line in drawn if line.startswith(f"all {count}")]
+    assert bool(total) == (len(named) < count)
+    if total:
+        assert f"+{count - len(named)} more" in total[0]
+
+
+def test_a_wide_table_has_all_columns_and_totals():
+    drawn = [line.plain for line in lines("t", rows(100), [], 140, 20)]
+    assert all(head in drawn[1] for head in HEADS)
+    assert drawn[-1].split()[:2] == ["all", "100"]
+    for figure in ("0.099", "1250.0", "300", "400 %", "80 %", "90000"):
+        assert figure in drawn[-1]
+    assert drawn[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
+
+
+def test_rows_that_fit_stay_in_their_order():
+    few = rows(5)
+    assert worst_first(few, fit=True) == few
+    few[3] = Row("robot-03", "lost", Rank.GONE)
+    assert [row.name for row in worst_first(few, fit=True)][:2] == ["robot-03", "robot-00"]
+
+
+def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
+    trends = Trends()
+    first = trends.row("robot-01", STATUS, now=10.0, error=None, rate=0.0)
+    assert (first.cpu, first.growing) == (None, frozenset())
+    later = msgspec.structs.replace(STATUS, stamp=12.0, cpu_s=2.1, missed=2, lost={"robot-02": 5}, battery=0.2)
+    row = trends.row("robot-01", later, now=12.0, error=0.01, rate=3.0)
+    assert row.cpu == pytest.approx(0.05)
+    assert row.growing == {"late", "lost"}
+    assert row.rank == Rank.LOW
+    styles = {line.plain[part.start : part.end].strip(): str(part.style) for line in lines("t", [row], [], 140, 10)
+              for part in line.spans}  # fmt: skip
+    assert styles["2"] == styles["5"] == styles["20 %"] == "yellow"
+    repeated = msgspec.structs.replace(later, stamp=20.0)
+    calm = trends.row("robot-01", repeated, now=20.0, error=0.01, rate=3.0)
+    assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
+    restarted = msgspec.structs.replace(later, stamp=21.0, pid=8, cpu_s=0.1)
+    assert trends.row("robot-01", restarted, now=21.0, error=None, rate=0.0).cpu is None
+
+
+@pytest.mark.parametrize(
+    ("changed", "now", "gone", "rank", "phase"),
+    [
+        ({}, 10.5, "", Rank.FINE, "running"),
+        ({}, 20.0, "", Rank.SILENT, "silent"),
+        ({"hazard": "hold: link silence"}, 10.5, "", Rank.HELD, "held"),
+        ({}, 10.5, "lost", Rank.GONE, "lost"),
+        ({}, 20.0, "removed", Rank.FINE, "removed"),
+    ],
+)
+def test_what_a_robot_needs(changed, now, gone, rank, phase):
+    status = msgspec.structs.replace(STATUS, **changed)
+    row = Trends().row("robot-01", status, now=now, error=None, rate=0.0, gone=gone, lost=gone == "lost")
+    assert (row.rank, row.phase) == (rank, phase)
+
+
+def test_text_of_others_cannot_steer_the_terminal():
+    drawn = lines("t", [Row("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
+    assert all(line.plain.isprintable() for line in drawn)

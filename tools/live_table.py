@@ -1,0 +1,267 @@
+"""Live table of the robots of a run, cut to the terminal: for the run's own process and for `zenpark top`.
+
+Rows that need attention come first; where rows do not fit, a line of totals stands for all of them. Columns drop from
+the right, names are never cut.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from math import inf
+from typing import TYPE_CHECKING, Final
+
+from agents.network.messages import Event, Status
+from experiments.real_time.conductor.run_view import FROZEN_S
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+WINDOW_S: Final = 0.9  # shortest time over which CPU and growth are measured
+RECENT_S: Final = 5.0  # a counter that grew within this time is coloured
+LOW_BATTERY: Final = 0.25
+FLAT_BATTERY: Final = 0.1
+EVENTS: Final = 5  # the last so many are shown below the table
+GAP: Final = "  "
+NOTE: Final = 10  # least width of the last column
+BAR: Final = 20
+
+
+class Rank(IntEnum):
+    """What a robot needs, the most urgent first."""
+
+    GONE = 0  # lost, dead, or stopped by an emergency stop
+    SILENT = 1
+    HELD = 2  # a hazard is present
+    LOW = 3  # battery
+    LATE = 4  # ticks were skipped in the last seconds
+    LOST = 5  # samples were lost in the last seconds
+    FINE = 6
+
+
+COLOURS: Final = {Rank.GONE: "bold red", Rank.SILENT: "magenta", Rank.HELD: "yellow"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One robot; None where nothing is known."""
+
+    name: str
+    phase: str
+    rank: Rank = Rank.FINE
+    error: float | None = None  # [m]
+    rate: float = 0.0  # [1/s] of transmitted poses
+    late: int | None = None  # ticks that were skipped
+    lost: int | None = None  # samples of neighbours
+    cpu: float | None = None  # share of a core; of its process, if several robots share one
+    battery: float | None = None  # 0 to 1
+    sent: int | None = None  # poses
+    note: str = ""
+    growing: frozenset[str] = frozenset()  # of "late" and "lost": those that grew in the last seconds
+    pid: int = 0
+
+
+@dataclass
+class _Counters:
+    """Counters of a robot at an earlier status, and what came of them."""
+
+    status: Status
+    cpu: float | None = None
+    grew: dict[str, float] = field(default_factory=dict)  # [s, UTC] last growth, by counter
+
+
+class Trends:
+    """What statuses say by their differences: share of a core, and counters that grow."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, _Counters] = {}
+
+    def add(self, status: Status) -> _Counters:
+        """Takes in the last status of a robot; repeated ones change nothing."""
+        known = self._known.get(status.robot)
+        if known is None or known.status.pid != status.pid:
+            known = self._known[status.robot] = _Counters(status)
+        span_s = status.stamp - known.status.stamp
+        if span_s >= WINDOW_S:
+            before = known.status
+            known.cpu = max(0.0, status.cpu_s - before.cpu_s) / span_s
+            for word, now, then in (
+                ("late", status.missed, before.missed),
+                ("lost", sum(status.lost.values()), sum(before.lost.values())),
+            ):
+                if now > then:
+                    known.grew[word] = status.stamp
+            known.status = status
+        return known
+
+    def row(
+        self,
+        name: str,
+        status: Status | None,
+        *,
+        now: float,
+        error: float | None,
+        rate: float,
+        gone: str = "",
+        lost: bool = False,
+    ) -> Row:
+        """The row of a robot.
+
+        Args:
+            name: Of the robot.
+            status: Its last one.
+            now: [s, UTC], by the clock of the statuses' stamps.
+            error: [m]
+            rate: [1/s] of transmitted poses.
+            gone: Why the run goes on without it; empty while it takes part.
+            lost: It should take part: process or token have vanished.
+        """
+        if status is None:
+            return Row(name, gone or "starting", Rank.GONE if lost else Rank.FINE)
+        trend = self.add(status)
+        growing = frozenset(word for word, when in trend.grew.items() if now - when < RECENT_S)
+        phase, rank = gone or status.phase, Rank.FINE
+        if lost:
+            rank = Rank.GONE
+        elif not gone and now - status.stamp > FROZEN_S:
+            phase, rank = "silent", Rank.SILENT
+        elif not gone:
+            rank = _rank(status, growing)
+            phase = "held" if status.hazard.startswith("hold") else phase
+        note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
+        if status.malformed:
+            note += f" {status.malformed} malformed"
+        return Row(
+            name, phase, rank, error, rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
+            status.sent, note.strip(), growing, status.pid,
+        )  # fmt: skip
+
+
+def _rank(status: Status, growing: frozenset[str]) -> Rank:
+    for rank, applies in (
+        (Rank.HELD, bool(status.hazard)),
+        (Rank.LOW, status.battery is not None and status.battery < LOW_BATTERY),
+        (Rank.LATE, "late" in growing),
+        (Rank.LOST, "lost" in growing),
+    ):
+        if applies:
+            return rank
+    return Rank.FINE
+
+
+def worst_first(rows: Sequence[Row], *, fit: bool) -> list[Row]:
+    """Rows by urgency; rows of one urgency by error where not all fit, else as they came: a table that stays still."""
+    return sorted(rows, key=lambda row: (row.rank, 0.0 if fit else -(row.error if row.error is not None else -inf)))
+
+
+def totals(rows: Sequence[Row], shown: int) -> Row:
+    """One row for all: the largest error, the lowest battery, sums of the rest, each process counted once."""
+    cpu = {row.pid or row.name: row.cpu for row in rows if row.cpu is not None}
+    notable = sum(row.rank < Rank.FINE for row in rows)
+    return Row(
+        f"all {len(rows)}",
+        f"+{len(rows) - shown} more",
+        error=max((row.error for row in rows if row.error is not None), default=None),
+        rate=sum(row.rate for row in rows),
+        late=sum(row.late or 0 for row in rows),
+        lost=sum(row.lost or 0 for row in rows),
+        cpu=sum(cpu.values()) if cpu else None,
+        battery=min((row.battery for row in rows if row.battery is not None), default=None),
+        sent=sum(row.sent or 0 for row in rows),
+        note=f"{notable} need attention" if notable else "largest error, lowest battery",
+        growing=frozenset().union(*(row.growing for row in rows)),
+    )
+
+
+HEADS: Final = ("robot", "phase", "error, m", "1/s", "late", "lost", "CPU", "battery", "sent", "")
+LEFT: Final = (0, 1, len(HEADS) - 1)  # columns that begin at the left
+
+
+def metres(error: float | None) -> str:
+    """An error [m] in words; a dash of robots that have no link, or no goal of their own."""
+    return "–" if error is None else f"{error:.3f}"
+
+
+def _cells(row: Row) -> list[tuple[str, str]]:
+    """Texts and styles of a row, by column."""
+    colour = COLOURS.get(row.rank, "")
+    counts = [("", "") if value is None else (str(value), "yellow" if word in row.growing else "")
+              for word, value in (("late", row.late), ("lost", row.lost))]  # fmt: skip
+    charge = ""
+    if row.battery is not None and row.battery < LOW_BATTERY:
+        charge = "bold red" if row.battery < FLAT_BATTERY else "yellow"
+    return [
+        (_safe(row.name), colour),
+        (_safe(row.phase), colour),
+        (metres(row.error), ""),
+        (f"{row.rate:.1f}", ""),
+        *counts,
+        ("" if row.cpu is None else f"{100 * row.cpu:.0f} %", ""),
+        ("" if row.battery is None else f"{100 * row.battery:.0f} %", charge),
+        ("" if row.sent is None else str(row.sent), "dim"),
+        (_safe(row.note), colour),
+    ]
+
+
+def lines(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, height: int) -> list[Text]:
+    """The table as lines, none longer than `width`, no more than `height` of them.
+
+    Args:
+        title: Above the table.
+        rows: One a robot, in the order of the experiment.
+        events: Below the table, as many of the last as have room.
+        width: Of the terminal [characters]; a name that is longer is shown all the same.
+        height: Of the terminal [lines].
+    """
+    from rich.text import Text
+
+    below = min(EVENTS, len(events), max(0, height // 4 - 1))
+    room = max(1, height - 2 - below)
+    fit = len(rows) <= room
+    chosen = worst_first(rows, fit=fit)[: room if fit else max(1, room - 1)]
+    if not fit:
+        chosen.append(totals(rows, len(chosen)))
+    cells = [[(head, "bold") for head in HEADS], *map(_cells, chosen)]
+    widths = [max(len(line[column][0]) for line in cells) for column in range(len(HEADS))]
+    made = [Text(_safe(title)[:width], style="bold")]
+    used, kept = widths[0], 1
+    for column in range(1, len(HEADS) - 1):
+        if used + len(GAP) + widths[column] > width:
+            break
+        used, kept = used + len(GAP) + widths[column], column + 1
+    note = width - used - len(GAP) if kept == len(HEADS) - 1 else 0
+    for line in cells:
+        text = Text()
+        for column, (word, style) in enumerate(line[:kept]):
+            text.append(GAP if column else "")
+            text.append(word.ljust(widths[column]) if column in LEFT else word.rjust(widths[column]), style or None)
+        if note >= NOTE and line[-1][0]:
+            word, style = line[-1]
+            text.append(GAP + (word if len(word) <= note else word[: note - 1] + "…"), style or None)
+        text.rstrip()
+        made.append(text)
+    said = [_safe(f"  {event.kind} {event.source}: {event.text}") for event in list(events)[len(events) - below :]]
+    return made + [Text(each[:width], style="dim") for each in said]
+
+
+def heading(what: str, elapsed: float | None, duration: float | None, name: str = "") -> str:
+    """Title: what goes on, the time since the common start, a bar of it where the end is known [s], and the run."""
+    if elapsed is not None and duration:
+        done = round(BAR * min(1.0, max(0.0, elapsed / duration)))
+        what += f"  {elapsed:5.1f} / {duration:g} s  " + "━" * done + "─" * (BAR - done)
+    elif elapsed is not None:
+        what += f"  {elapsed:.1f} s"
+    return f"{what}  {name}".rstrip()
+
+
+def _safe(text: str) -> str:
+    """Text of others, without what could steer the terminal."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def common_phase(phases: Sequence[str]) -> str:
+    """Phases of the robots in words, the most frequent first: `running 6, landing 1`."""
+    found = Counter(phases).most_common()
+    return found[0][0] if len(found) == 1 else ", ".join(f"{phase} {count}" for phase, count in found) or "no robot"
