@@ -3,7 +3,10 @@
 import os
 import re
 import select
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import tty
@@ -195,7 +198,7 @@ def test_nobody_there_is_said_with_the_remedy(impatient):
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("speaks", "bearings"),
-    [((PARK, PARK), 0), ((KTEAM, KTEAM), 13), ((ONCE | {"ranges": True}, {"server": "fork"}), 5)],
+    [((PARK, PARK), 0), ((KTEAM, KTEAM), 13), ((ONCE | {"ranges": True}, PARK), 5)],
 )
 def test_robots_drive_to_their_goals(served, speaks, bearings):
     rows = replace(request("khepera4", ["khepera4-twin"] * 2, yaw=0.5), device=speaks)
@@ -495,3 +498,57 @@ def test_kteam_over_a_serial_line():
         os.close(theirs)
     assert heard[:3] == ["D,0,0", "B", "U,31"]
     assert heard[-4:] == ["D,0,0"] * 3 + ["R"]
+
+
+DRIVING = """
+import sys, time
+import numpy as np
+from bridges.khepera4.body import open_khepera4
+from tests.twins.loopback import request
+
+body = open_khepera4(request("khepera4", [sys.argv[1]]))
+body.open()
+zero, change = time.monotonic(), float(sys.argv[2])
+while True:
+    now = time.monotonic()
+    body.read(now - zero)
+    body.command(np.array([[0.10 if now < change else 0.05, 0.0, 0.0, 0.0]]))
+    time.sleep(0.002)
+"""
+
+
+@pytest.mark.system
+def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before_but_a_stop():
+    """It drives at 0.10 m/s until a moment at which it is suspended, and at 0.05 m/s when it goes on."""
+    reads = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve():
+            client, _ = listener.accept()
+            with client:
+                while data := client.recv(255):
+                    reads.append((time.monotonic(), data))
+                    if data == b"p":
+                        client.sendall(b"0.0000,0.0000")
+
+        threading.Thread(target=serve, daemon=True).start()
+        place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}?server=2023-01-07"
+        begin = time.monotonic()
+        child = subprocess.Popen([sys.executable, "-c", DRIVING, place, str(begin + 8.0)])
+        try:
+            until(lambda: any(data.startswith(b"d 10.0") for _, data in reads), "it drives")
+            for _ in range(5):  # at any point of its loop
+                os.kill(child.pid, signal.SIGSTOP)
+                time.sleep(0.7)
+                woke, known = time.monotonic(), len(reads)
+                os.kill(child.pid, signal.SIGCONT)
+                until(lambda known=known: len(reads) > known + 3, "it goes on")
+            os.kill(child.pid, signal.SIGSTOP)
+            until(lambda: time.monotonic() > begin + 8.5, "the moment is over")
+            woke, known = time.monotonic(), len(reads)
+            os.kill(child.pid, signal.SIGCONT)
+            until(lambda: any(data.startswith(b"d 5.0") for at, data in reads[known:] if at > woke), "it drives slowly")
+        finally:
+            child.kill()
+            child.wait()
+    assert not [data for at, data in reads[known:] if at > woke and data.startswith(b"d 10.0")]
