@@ -44,8 +44,17 @@ def crazyflie_twin() -> Iterator[Target]:
         + packet(Port.LOG, 1, bytes((Log.START, 1, 1))),
         packet(Port.LOG, 1, bytes((Log.APPEND, 1, 3, 9, 0))), packet(Port.LOG, 1, bytes((Log.STOP, 1))),
         packet(Port.MEMORY, 0, b"\1"), packet(Port.MEMORY, 0, b"\2\1"),
-        *(packet(Port.MEMORY, 1, crtp.MEMORY.pack(k, 0) + b"\x10") for k in range(4)),
-        *(packet(Port.MEMORY, 2, crtp.MEMORY.pack(k, 0) + bytes(16)) for k in range(4)),
+        *(packet(Port.MEMORY, 1, crtp.MEMORY.pack(k, 0) + b"\x10") for k in range(9)),
+        *(packet(Port.MEMORY, 2, crtp.MEMORY.pack(k, 0) + bytes(16)) for k in range(9)),
+        packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, 0) + bytes((1, 0, 2, 0, 3, 0, 4, 0, 9, 100, 0, 9, 9, 9, 9)))
+        + up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, 1)) + crtp.DEFINE.pack(1, 1, 0, 1))
+        + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.START_2, 0)) + crtp.START_2.pack(1, 1, 0, 1, 1.0)),
+        packet(Port.MEMORY, 2, crtp.MEMORY.pack(4, 128) + b"\0\0\x80\x3f")
+        + up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, 2)) + crtp.DEFINE.pack(1, 0, 0, 1))
+        + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.START, 0)) + crtp.START.pack(1, 1, 2, 0.5)),
+        up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.SPIRAL, 0)) + crtp.SPIRAL.pack(0, 1, 1.0, 0.5, 0.6, 0.1, 1.0)),
+        packet(Port.PLATFORM, 0, b"\1\1"), packet(Port.PLATFORM, 0, b"\2"),
+        *(packet(Port.LINK, 3, bytes((crtp.NRF, command))) for command in crtp.PowerSwitch),
         up, up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.GO_TO, 0)) + crtp.GO_TO.pack(True, False, 0.1,
         0.2, 0.3, 1.0, 1.0)),
         up + packet(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + climb), packet(Port.HIGH_LEVEL, 0, b"\3\0"),
@@ -102,7 +111,8 @@ def tello_twin() -> Iterator[Target]:
     words = [
         "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
         "cw 90", "ccw 360", "go 50 60 70 50", "speed 20", "battery?", "attitude?", "tof?", "sn?", "wifi?", "streamon",
-        "flip l", "curve 1 2 3 4 5 6 20", "jump 1 2 3 4 5 m1 m2", "mon", "time?", "speed?", "height?", "baro?", "sdk?",
+        "flip l", "curve 1 2 3 4 5 6 20", "curve 71 29 0 100 100 0 30", "go 50 0 0 30 m1", "wifi a b", "keepalive",
+        "jump 1 2 3 4 5 m1 m2", "mon", "time?", "speed?", "height?", "baro?", "sdk?",
     ]  # fmt: skip
     examples = [b"command", *(f"command\0takeoff\0\0{word}".encode() for word in words)]
 

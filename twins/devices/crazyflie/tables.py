@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,10 +54,13 @@ class Variable:
 
 
 def pack(kind: str, value: float) -> bytes:
-    """Value in the type `kind`; whole numbers wrap, as in C."""
+    """Value in the type `kind`; whole numbers wrap, as in C, and floats that are too large are infinite."""
     packing = PACKINGS[kind]
     if kind[0] not in "ui":
-        return packing.pack(value)
+        try:
+            return packing.pack(value)
+        except OverflowError:
+            return packing.pack(math.copysign(math.inf, value))
     bits = 8 * packing.size
     whole = int(value) & ((1 << bits) - 1)
     return packing.pack(whole - (1 << bits) if kind[0] == "i" and whole >> (bits - 1) else whole)

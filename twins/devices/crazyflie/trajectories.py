@@ -22,6 +22,7 @@ UNCOMPRESSED: Final = 0
 COMPRESSED: Final = 1
 POINTS: Final = (0, 1, 3, 7)  # control points of a compressed element beside the one that the last piece ends with
 SCALES: Final = (crtp.MM, crtp.MM, crtp.MM, radians(0.1))  # units of compressed x, y, z [m], yaw [rad]
+LARGEST: Final = 2.0**32  # upper bound of coefficients and times
 FASTEST: Final = 0.01  # smallest time scale
 
 
@@ -81,7 +82,7 @@ class Trajectories:
 
 def _uncompressed(memory: bytes, number: int, scale: float) -> Piece:
     *values, span = crtp.PIECE.unpack_from(memory, crtp.PIECE.size * number)
-    if not np.isfinite(values).all() or not 0.0 < span < np.inf:
+    if not np.abs(values).max() <= LARGEST or not 0.0 < span <= LARGEST:  # NaN fails too
         raise ValueError("no numbers of a trajectory")
     return span * scale, np.array(values).reshape(4, ORDER + 1) / scale ** np.arange(ORDER + 1)
 

@@ -1,6 +1,7 @@
 """What a Crazyflie twin lists, its values, and whose tables they are."""
 
 import json
+import math
 import struct
 
 import pytest
@@ -9,7 +10,7 @@ from agents.body.interface import BodyError
 from agents.protocols.crtp import Log, Port
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.firmware_tables import FIRMWARE, cached
-from twins.devices.crazyflie.tables import EXTENDED, PACKINGS, READ_ONLY, inventory
+from twins.devices.crazyflie.tables import EXTENDED, PACKINGS, READ_ONLY, inventory, pack
 
 
 def logged(wire, *names):
@@ -31,6 +32,12 @@ def test_size_of_the_firmware():
     assert len(tables.parameters.variables) == 402
     assert sum(bool(variable.flags & EXTENDED) for variable in tables.parameters.variables) == 146
     assert len(tables.logs.variables) == 637
+
+
+def test_numbers_are_packed_as_in_c():
+    assert pack("u8", 257.9) == b"\1"
+    assert pack("i16", -1.0) == b"\xff\xff"
+    assert pack("half", 1e9) == PACKINGS["half"].pack(math.inf)
 
 
 def test_values_of_a_drone_that_stands():

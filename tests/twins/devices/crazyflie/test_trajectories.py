@@ -99,6 +99,8 @@ def test_what_is_not_there(corner):
     assert corner.pieces(4, None, turned=False, reverse=False, scale=1.0) == (Status.OK, [])  # as the firmware
     assert corner.define(10, IN_MEMORY, UNCOMPRESSED, 0, 1) == Status.NO_COMMAND
     with pytest.raises(ValueError, match="no numbers"):
+        uploaded(piece(1.0, [1e30]), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
+    with pytest.raises(ValueError, match="no numbers"):
         uploaded(piece(math.nan), count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
     with pytest.raises(ValueError, match="no numbers"):
         uploaded(b"", count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
