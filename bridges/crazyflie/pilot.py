@@ -24,6 +24,7 @@ LOGLESS_S: Final = 0.5  # without a log packet over a working link, the log bloc
 LINK_GAP_S: Final = 2.0  # so long after a loss of the link, a drone that flew by streamed setpoints is down
 STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
+LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
 LANDING_S: Final = 12.0  # `close` waits so long for a landing
 JOIN_S: Final = 5.0
 
@@ -67,10 +68,10 @@ class CrazyfliePilot:
         self._settle_deadline = inf
         self._closers: list[threading.Thread] = []
         self._logs_at = -inf  # last creation of the log blocks [s]
-        period = settings.stream_hz
+        rate = max(settings.stream_hz, LOOP_HZ)
         if isinstance(settings.positioning, Outside):
-            period = max(period, settings.positioning.rate_hz)
-        self._period = 1.0 / period
+            rate = max(rate, settings.positioning.rate_hz)
+        self._period = 1.0 / rate
         self._thread = threading.Thread(target=self._run, name=f"pilot of {name}", daemon=True)
 
     # ------------------------------------------------------------------ calls of the robot's loop, none blocks
