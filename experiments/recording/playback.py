@@ -259,7 +259,8 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
 
     def column(what: str, unknown: tuple[float, ...]) -> Array:
         values = [getattr(state, what) for state in states]
-        return np.array([unknown if each is None else each for each in values], dtype=float).reshape(-1, len(unknown))
+        blank = unknown if len(unknown) > 1 else unknown[0]
+        return np.array([blank if each is None else each for each in values], dtype=float).reshape(-1, len(unknown))
 
     measured, truth = column("position", NOWHERE), column("true_position", NOWHERE)
     return {
