@@ -53,6 +53,7 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
         brand_color=(0, 114, 178),
     )
     server.gui.main_panel.dock_right()
+    server.on_client_connect(_step_back)
     light(server)
     return server
 
@@ -65,6 +66,15 @@ def look_at(server: viser.ViserServer, size: Sequence[float], *, centre: Sequenc
     server.initial_camera.position, server.initial_camera.look_at = place, at
     for client in server.get_clients().values():
         client.camera.position, client.camera.look_at = place, at
+
+
+def _step_back(client: viser.ClientHandle) -> None:
+    """A page that is higher than wide, as a phone's, sees the arena from farther away, above the panel."""
+    camera = client.camera
+    if (aspect := camera.aspect) < 1.0:
+        away = (camera.position - camera.look_at) / max(aspect, 0.3)
+        below = np.array([0.0, 0.0, -0.3 * float(np.linalg.norm(away))])
+        camera.position, camera.look_at = camera.look_at + away + below, camera.look_at + below
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -192,6 +202,9 @@ class LiveView:
         duration = stage.experiment.duration_s if stage.experiment is not None else 0.0
         self._panel.show_head(phase, elapsed, duration, self._watched.words)
         self._panel.show_robots(rows)
+        net, names = stage.links, stage.names
+        ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
+        self._panel.show_links(moment.error, [observer.robots[names[i]].delay.get(names[j]) for i, j in ends])
         self._panel.show_events(list(observer.events), start)
 
 

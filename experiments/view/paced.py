@@ -156,4 +156,5 @@ class PacedView:
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
         self._panel.show_head(f"{self._case}: {phase}", moment.time, self._experiment.duration_s, where)
         self._panel.show_robots(rows)
+        self._panel.show_links(moment.error, [None] * len(moment.error))
         self._panel.show_events(self._events, 0.0)

@@ -34,6 +34,7 @@ PLOT_S: Final = 0.25
 CURVES: Final = 12  # of more robots, the largest, the median and the smallest value are plotted
 TABLE: Final = 20  # rows; of more robots, those that need attention first, then the worst
 EVENTS: Final = 12
+LINKS: Final = 30  # rows
 QUIET: Final = ("says",)  # kinds of events that are not shown
 
 
@@ -90,6 +91,8 @@ class Panel:
         self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0, visible=plots)
         self._error: Any = None
         self._rate: Any = None
+        with self._gui.add_folder("Links", order=25.0, expand_by_default=False):
+            self._links = self._gui.add_html("")
         with self._gui.add_folder("Events", order=30.0):
             self._list = self._gui.add_html("")
         with self._gui.add_folder("Legend", order=60.0, expand_by_default=False):
@@ -126,7 +129,7 @@ class Panel:
         """Title, phase, clock [s], and which run it is."""
         clock = "" if elapsed is None else f"{elapsed:.1f} s of {duration:g} s" if duration else f"{elapsed:.1f} s"
         text = (
-            f'<div style="padding:0 1em;font-size:0.85em"><b>{escape(self.stage.title or "robots")}</b><br>'
+            f'<div style="padding:0 1.4em 0 1em;font-size:0.85em"><b>{escape(self.stage.title or "robots")}</b><br>'
             f"<span>{escape(phase)}</span> <span style='float:right'>{clock}</span>"
             f"<div style='opacity:0.6;overflow-wrap:anywhere'>{escape(where)}</div></div>"
         )
@@ -138,6 +141,10 @@ class Panel:
     def show_robots(self, rows: Sequence[Row]) -> None:
         """The table of the robots."""
         _set(self._table, table(rows, self.stage))
+
+    def show_links(self, error: Array, delay: Sequence[float | None]) -> None:
+        """Errors (E,) [m] and delays of the last poses (E,) [s] of the links, the largest errors first."""
+        _set(self._links, link_table(self.stage, error, delay))
 
     def show_plots(self) -> None:
         """The curves as they are now."""
@@ -199,6 +206,24 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         "<div style='padding:0 0.75em;font-size:0.75em;font-variant-numeric:tabular-nums'>"
         "<table style='width:100%;border-spacing:0.35em 0.1em'>"
         f"<tr><th></th>{heads}</tr>{''.join(lines)}</table>{left}</div>"
+    )
+
+
+def link_table(stage: Stage, error: Array, delay: Sequence[float | None]) -> str:
+    """Table of links as HTML; links that are not there, or not known, are left out."""
+    order = [k for k in np.argsort(-np.nan_to_num(error)).tolist() if np.isfinite(error[k])][:LINKS]
+    lines = []
+    for k in order:
+        ends = (stage.names[int(stage.links.sender[k])], stage.names[int(stage.links.receiver[k])])
+        late = "" if (seconds := delay[k]) is None else f"{1e3 * seconds:.1f} ms"
+        shown = f"<span style='color:{css(_graded(float(error[k])))}'>{100 * error[k]:.1f} cm</span>"
+        cells = (" &rarr; ".join(map(escape, ends)), shown, late)
+        lines.append("<tr>" + "".join(f"<td style='text-align:right'>{cell}</td>" for cell in cells) + "</tr>")
+    left = len(error) - len(order)
+    more = f"<div style='opacity:0.6'>and {left} more</div>" if left else ""
+    return (
+        "<div style='padding:0 1em;font-size:0.75em;font-variant-numeric:tabular-nums'>"
+        f"<table style='width:100%'>{''.join(lines)}</table>{more}</div>"
     )
 
 

@@ -299,6 +299,8 @@ class ReplayView:
         phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
         panel.show_head(f"{tracks.case}: {phase}", t, tracks.experiment.duration_s, self._where)
         panel.show_robots(film.rows(min(t, tracks.end)))
+        error = film.moment(min(t, tracks.end)).error
+        panel.show_links(error, [None] * len(error))
         panel.show_events(said, 0.0)
         first, last = np.searchsorted(history.time, (t - HISTORY_S, t))
         first = min(int(first), int(last) - 2)

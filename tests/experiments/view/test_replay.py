@@ -11,7 +11,7 @@ from experiments.recording.reader import RecordingError
 from experiments.run import simulate
 from experiments.scene import tracks
 from experiments.scene.stage import Condition
-from experiments.view.panel import History, Row, event_list, table
+from experiments.view.panel import History, Row, event_list, link_table, table
 from experiments.view.replay import Clock, Film, marks
 
 GUIDED = ("architecture=centralised",)
@@ -120,3 +120,7 @@ def test_the_table_shows_the_worst_first_and_escapes_names(flown):
     assert "and 10 more" in text
     assert " R10<" not in text
     assert "none yet" in event_list([], None)
+    error = np.linspace(0.0, 0.1, len(stage.links))
+    links = link_table(stage, error, [0.0123] * len(error))
+    assert links.index("10.0 cm") < links.index("0.0 cm")
+    assert "12.3 ms" in links

@@ -1,0 +1,50 @@
+"""Orders of the page: who may give them, and which parameters have sliders."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.network import lab
+from agents.network.endpoints import free_endpoint
+from experiments.file.document import load
+from experiments.run import simulate, simulate_seeds
+from experiments.scene.stage import Stage
+from experiments.view.acting import Watched, may_act, parameters
+
+
+def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
+    known = {
+        name: lab.Identity(role=role, common_name=name, serial="1", until="2027-01-01T00:00:00")
+        for name, role in (("operator", "operator"), ("observer", "observer"), ("ana", "operator"))
+    }
+    (tmp_path / lab.REGISTER).write_bytes(msgspec.json.encode(lab.Register(known)))
+    endpoints = lab.secured(["tls/127.0.0.1:7447"], tmp_path)
+    found = {name: may_act(Watched(endpoints, "park", name)) for name in (*known, "stranger")}
+    assert found == {"operator": True, "observer": False, "ana": True, "stranger": False}
+    assert may_act(Watched(["tcp/127.0.0.1:7447"], "park", "observer"))  # without a lab, on loopback
+    assert not may_act(Watched(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
+
+
+def test_numbers_of_the_trigger_and_the_law_have_sliders():
+    park = Stage.of_experiment(load("robotic-park").cases()["event"])
+    assert dict(parameters(park)) == {"trigger.threshold": 0.01, "clamp": 0.1, "tracking_gain": 3.0}
+
+
+def test_a_watched_run_in_virtual_time_is_the_same_to_the_last_bit(monkeypatch):
+    pytest.importorskip("viser", reason="needs viser")
+    from experiments.view import live, paced  # noqa: PLC0415
+
+    monkeypatch.setattr(paced, "PAGE_S", 0.0)
+    read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
+    server = live.open_server(int(free_endpoint(preferred_port=0).rpartition(":")[2]), "test", dark=True)
+    try:
+        page = paced.PacedView(server, pace=100.0, dark=True)
+        (watched,) = simulate_seeds(read, [1], watch=page.begin)
+    finally:
+        live.close_server(server)
+    alone = simulate(read, seed=1)
+    for case, trace in alone.traces.items():
+        np.testing.assert_array_equal(watched.traces[case].true_position, trace.true_position)
+    assert page.clock.t > 0.0
