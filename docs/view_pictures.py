@@ -1,6 +1,6 @@
 """Makes the pictures of docs/view.md and of the README: a run in the browser, live and replayed; needs chromium.
 
-.venv/bin/python docs/view_pictures.py [FOLDER]     # into docs/, if no folder is named
+`.venv/bin/python docs/view_pictures.py [FOLDER [NAME...]]`: all of them into docs/, if nothing is named.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class Picture:
 def main() -> None:
     """Makes all pictures."""
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs"
+    wanted = sys.argv[2:]
     with tempfile.TemporaryDirectory() as made, sync_playwright() as driver:
         both, one = Path(made) / "robotic-park", Path(made) / "robotic-park-event"
         for folder, cases in ((both, ()), (one, ("event",))):
@@ -55,6 +56,8 @@ def main() -> None:
             Picture("view-dark", one, 12.0, dark=True),
             Picture("view-phone", one, 30.0, size=(390, 844)),
         ):
+            if wanted and picture.name not in wanted:
+                continue
             with _viewing(picture.folder.name, *(["--dark"] if picture.dark else []), folder=Path(made)) as address:
                 page = _open(browser, address, picture.size)
                 if picture.size[0] > 600:
@@ -62,7 +65,8 @@ def main() -> None:
                     box.fill(str(picture.at_s))
                     box.press("Enter")
                 _save(page, target / f"{picture.name}.png")
-        _live(browser, target / "view-live.png", Path(made) / "live")
+        if not wanted or "view-live" in wanted:
+            _live(browser, target / "view-live.png", Path(made) / "live")
         browser.close()
 
 

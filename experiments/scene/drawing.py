@@ -201,7 +201,7 @@ class SceneDrawing:
         return self._scene.add_line_segments(
             f"{self._root}/{name}",
             ends.astype(np.float32),
-            _linear(colours),
+            colours if np.ndim(colours) == 1 else _linear(colours),  # a single one is not taken for linear light
             thickness=thickness,
             thickness_units="screen",
         )

@@ -31,6 +31,7 @@ FRAME_S: Final = 1.0 / 30.0
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
 LOOPBACK: Final = "127.0.0.1"
+FARTHEST: Final = 2.2  # times as far as on a wide page
 
 
 def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
@@ -53,7 +54,7 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
         brand_color=(0, 114, 178),
     )
     server.gui.main_panel.dock_right()
-    server.on_client_connect(_step_back)
+    server.on_client_connect(partial(_step_back, server))
     light(server)
     return server
 
@@ -68,13 +69,13 @@ def look_at(server: viser.ViserServer, size: Sequence[float], *, centre: Sequenc
         client.camera.position, client.camera.look_at = place, at
 
 
-def _step_back(client: viser.ClientHandle) -> None:
+def _step_back(server: viser.ViserServer, client: viser.ClientHandle) -> None:
     """A page that is higher than wide, as a phone's, sees the arena from farther away, above the panel."""
-    camera = client.camera
-    if (aspect := camera.aspect) < 1.0:
-        away = (camera.position - camera.look_at) / max(aspect, 0.3)
-        below = np.array([0.0, 0.0, -0.3 * float(np.linalg.norm(away))])
-        camera.position, camera.look_at = camera.look_at + away + below, camera.look_at + below
+    if (aspect := client.camera.aspect) < 1.0:
+        at = np.array(server.initial_camera.look_at)
+        away = (np.array(server.initial_camera.position) - at) * min(1.0 / aspect, FARTHEST)
+        at[2] -= 0.30 * float(np.linalg.norm(away))
+        client.camera.position, client.camera.look_at = at + away, at
 
 
 def close_server(server: viser.ViserServer) -> None:
