@@ -33,6 +33,8 @@ POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never 
 JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
 
+SLOWEST: Final = 20  # longest period of a log block, in units of 10 ms
+
 LogCallback = Callable[[float, int, Mapping[str, float]], None]
 
 
@@ -240,6 +242,14 @@ class CrazyflieLink:
         for block in list(self._blocks.values()):
             block.added = False
             block.start()
+
+    def slow_logs(self) -> bool:
+        """Halve the rate of all log blocks, down to 5 Hz; False if none is faster."""
+        fast = [block for block in list(self._blocks.values()) if block.period < SLOWEST]
+        for block in fast:
+            block.period = min(2 * block.period, SLOWEST)
+            block.start()
+        return bool(fast)
 
     def send_parameter(self, parameter: str, value: float | None) -> None:
         """Set a parameter, or ask for its value (None), without waiting for the answer; see `parameter_answer`.

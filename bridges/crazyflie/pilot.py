@@ -24,6 +24,9 @@ LOGLESS_S: Final = 0.5  # without a log packet over a working link, the log bloc
 LINK_GAP_S: Final = 2.0  # so long after a loss of the link, a drone that flew by streamed setpoints is down
 STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
+QUEUE_S: Final = 0.5  # poses that wait for longer, and not only for a moment, are too many: the rate of logs is halved
+LATE_S: Final = 1.0
+SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
 LANDING_S: Final = 12.0  # `close` waits so long for a landing
 JOIN_S: Final = 5.0
@@ -68,6 +71,7 @@ class CrazyfliePilot:
         self._settle_deadline = inf
         self._closers: list[threading.Thread] = []
         self._logs_at = -inf  # last creation of the log blocks [s]
+        self._late_since, self._slowed = inf, False  # begin of a queue before the radio [s]; logs were slowed down
         rate = max(settings.stream_hz, LOOP_HZ)
         if isinstance(settings.positioning, Outside):
             rate = max(rate, settings.positioning.rate_hz)
@@ -99,7 +103,14 @@ class CrazyfliePilot:
     def note(self) -> str:
         """Connection state and faults, for users."""
         return "; ".join(
-            part for part in (self._connection_note, self._flight.trouble, self._telemetry.status_text()) if part
+            part
+            for part in (
+                self._connection_note,
+                self._flight.trouble,
+                self._telemetry.status_text(),
+                "its radio carries less than was measured: fewer logs" if self._slowed else "",
+            )
+            if part
         )
 
     @property
@@ -237,6 +248,7 @@ class CrazyfliePilot:
         """
         settings, telemetry = self._settings, self._telemetry
         telemetry.reset_status()
+        self._slowed = False
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
         link.ask_firmware()
@@ -345,6 +357,14 @@ class CrazyfliePilot:
         if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.status_hz and link.gap < LOGLESS_S):
             self._logs_at = now
             link.restart_logs()
+        late = self._telemetry.pose_age - (now - self._telemetry.arrival)  # [s] time in queues
+        if not late > QUEUE_S:
+            self._late_since = inf
+        elif self._late_since == inf:
+            self._late_since = now
+        if now - self._late_since > LATE_S:
+            self._late_since = now + SLOWING_S
+            self._slowed = link.slow_logs() or self._slowed
         if gap > STUTTER_S:
             self._flight.hold_after_gap(gap)
 

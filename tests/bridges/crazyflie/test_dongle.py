@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from cflib.drivers import crazyradio
 
 from agents.protocols.crtp import Port
 from bridges.crazyflie import body, link
@@ -228,6 +229,20 @@ def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
         process.land()  # as the robot's loop does then
         process.until(lambda: supervised(twin) in {State.LANDED, State.READY}, "landed")
         assert descent.fastest.max() < LANDS
+
+
+def test_a_radio_that_becomes_slow_gets_fewer_logs():
+    """Fewer exchanges than logs: their rates are halved until poses are young again, and the drone flies on."""
+    with flown(device=RADIO) as (twin, process):
+        process.takeoff(HEIGHT)
+        hovering(process).run(0.2)
+        (dongle,) = crazyradio._find_devices()
+        dongle._air = dongle._air._replace(hz=22.0)
+        process.until(lambda: "fewer logs" in process.state.notes[0], "note")
+        process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
+        dongle._air = dongle._air._replace(hz=500.0)
+        process.land()
+        assert supervised(twin) != State.LOCKED
 
 
 def test_recovery_from_a_crash_is_asked_for():
