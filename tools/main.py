@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Final
 
 import typer
 
 from tools.bench import bench
 from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep, view
-from tools.commands.options import Group, example
+from tools.commands.options import Group, example, print_json
 from tools.reliability import chaos, soak
 
 
@@ -106,6 +106,13 @@ UsageError: Final[type[typer.BadParameter]] = typer.BadParameter.__mro__[
 ]  # its own click's, which has no name in typer
 
 
+def _report(message: str, remedy: str = "", problems: Sequence[object] | None = None) -> None:
+    """Print an error; where JSON was asked for, on standard output as JSON too."""
+    print(f"zenpark: {message}{remedy}", file=sys.stderr)
+    if "--json" in sys.argv:
+        print_json({"ok": False, "error": message, "problems": problems or []})
+
+
 def main() -> None:
     """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
     try:
@@ -118,10 +125,10 @@ def main() -> None:
         else:
             asked = " ".join(["./zenpark", *words, "--help"])
             remedy = f"`{asked}` shows what there is"
-            print(f"zenpark: {message}\n  {remedy}", file=sys.stderr)
+            _report(message, f"\n  {remedy}")
         sys.exit(2)
     except typer.Abort:
         sys.exit(130)
     except _explained() as error:
-        print(f"zenpark: {error}", file=sys.stderr)
+        _report(str(error), problems=getattr(error, "problems", None))
         sys.exit(2)

@@ -8,8 +8,9 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from agents.network.endpoints import free_endpoint
-from tools.main import EXPLAINED, app
+from agents.network.endpoints import EndpointError, free_endpoint
+from tools.commands.options import PANELS
+from tools.main import EXPLAINED, app, main
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)
@@ -104,6 +105,61 @@ finally:
         [sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True, check=False
     )
     return done.stdout, set(done.stderr.split())
+
+
+def test_help_shows_every_command_in_a_panel_with_its_whole_description():
+    shown = typer.main.get_command(app).commands
+    panels = [name for names in PANELS.values() for name in names.split()]
+    assert sorted(panels) == sorted(name for name, command in shown.items() if not command.hidden)
+    said = CliRunner().invoke(app, ["--help"]).stdout
+    assert [line for line in said.splitlines()[1:] if "..." in line or len(line) > 80] == []
+    assert [line[:-1] for line in said.splitlines() if line[:-1] in PANELS] == list(PANELS)
+    words = " ".join(said.split())
+    for name in panels:
+        assert " ".join(f"{name} {shown[name].help.partition(chr(10))[0]}".split()) in words
+
+
+def test_what_the_launcher_does_is_named():
+    done = zenpark("install", "--editable", "../mine")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "./zenpark install --editable ../mine" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["run", "robotic-prk", "--json"], "robotic-prk: neither a file nor an experiment"),
+        (["run", "--json"], "Missing argument 'FILE'."),
+        (["report", "/nowhere", "--json"], "/nowhere: "),
+        (["keys", "--connect", "localhost", "--json"], "'localhost' is not an endpoint"),
+    ],
+)
+def test_errors_are_json_where_it_is_asked_for(arguments, why, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["zenpark", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    printed = capsys.readouterr()
+    said = json.loads(printed.out)
+    assert (ended.value.code, said["ok"]) == (2, False)
+    assert said["error"].startswith(why)
+    assert printed.err.startswith(f"zenpark: {why}")
+
+
+def test_tables_are_json_where_it_is_asked_for():
+    said = CliRunner().invoke(app, ["list", "--json"])
+    assert "event" not in json.loads(said.stdout)
+    assert {"name": "triangle"}.items() <= {**json.loads(said.stdout)["experiments"][-1]}.items()
+    said = CliRunner().invoke(app, ["explain", "disturbance.hover_jitter", "--json"])
+    assert json.loads(said.stdout)[0]["key"].startswith("disturbance.")
+
+
+def test_routers_come_from_the_environment(monkeypatch):
+    monkeypatch.setenv("ZENPARK_CONNECT", "tcp/127.0.0.1:9 udp")
+    found = CliRunner().invoke(app, ["keys"]).exception
+    assert isinstance(found, EndpointError)
+    assert "'udp'" in str(found)
+    assert "'tcp'" in str(CliRunner().invoke(app, ["keys", "--connect", "tcp"]).exception)
+    assert "[env var: ZENPARK_CONNECT]" in CliRunner().invoke(app, ["robot", "hold", "--help"]).stdout
 
 
 def test_help_is_light():

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson
+from tools.commands.options import AsJson, print_json
 
 app: Final = typer.Typer()
 
@@ -33,10 +33,7 @@ def bench(
     as_json: AsJson = False,
 ) -> int:
     """Measure what this machine can do, each figure beside a baseline."""
-    import json
     from importlib import import_module
-
-    import msgspec
 
     if unknown := [name for name in names or () if name not in BENCHMARKS]:
         print(f"zenpark: no benchmark '{unknown[0]}'; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
@@ -49,5 +46,5 @@ def bench(
                 value = f"{figure.name:<50} {figure.value:10.3g} {figure.unit:<12}"
                 print(f"{figure.benchmark:<10} {value} {figure.ratio:8.3g} {figure.baseline}", flush=True)
     if as_json:
-        print(json.dumps(msgspec.to_builtins(figures)))
+        print_json(figures)
     return 0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, AsJson, Bodies, Cases, File, Here, Lab, Out, Settings, check_bodies
+from tools.commands.options import As, AsJson, Bodies, Cases, File, Here, Lab, Out, Settings, check_bodies, print_json
 
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
@@ -183,13 +183,8 @@ def _print_checks(found: Sequence[RobotChecks]) -> None:
 
 
 def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
-    import json
-
-    import msgspec
-
     ok = all(each.severity != "error" for each in found)
-    result = msgspec.to_builtins({"file": file, "ok": ok, "findings": found, "figures": numbers})
-    print(json.dumps(result, indent=2))
+    print_json({"file": file, "ok": ok, "findings": found, "figures": numbers})
 
 
 def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
@@ -269,6 +264,7 @@ def _spared(spare: int | None, vital: int) -> str:
 @app.command()
 def explain(
     key: Annotated[str, typer.Argument(help="such as disturbance.hover_jitter, trigger.threshold, safety")],
+    as_json: AsJson = False,
 ) -> int:
     """Explain a key of the experiment file: its text, unit, default, limits and an example."""
     from agents.plugins.registry import did_you_mean
@@ -280,6 +276,9 @@ def explain(
         hint = did_you_mean(key, known) or "`zenpark explain safety` shows the keys of a table"
         print(f"zenpark: no key of the experiment file is named {key!r}; {hint}", file=sys.stderr)
         return 2
+    if as_json:
+        print_json(found)
+        return 0
     first = found[0].text
     alike = [entry for entry in found if entry.text == first and not entry.key.startswith(f"{found[0].key}.")]
     print("\n".join(entry.key for entry in alike), "\n")
@@ -348,11 +347,15 @@ def import_(
         str | None,
         typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), a Webots world (.wbt), or a table."),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Turn an experiment file of Robotic Park's authors into one of zenpark."""
     from experiments.authoring.robotic_park.convert import convert
 
     path, notes = convert(file, target, duration, poses)
+    if as_json:
+        print_json({"file": path, "notes": notes})
+        return
     print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
     if notes:
         print("Not carried over, or not as it was:")
@@ -361,26 +364,31 @@ def import_(
 
 
 @app.command(name="list")
-def list_() -> None:
+def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
     from experiments.file import catalogue
 
+    plugins = {
+        "Bodies": registry.BODIES,
+        "Protocol twins": registry.DEVICES,
+        "Triggers": registry.TRIGGERS,
+        "Predictors": registry.PREDICTORS,
+        "Laws": registry.LAWS,
+        "Planners": registry.PLANNERS,
+        "Avoidances": registry.AVOIDANCES,
+        "Engines": registry.ENGINES,
+    }
+    if as_json:
+        found = {title.lower().replace(" ", "_"): registry.names(group) for title, group in plugins.items()}
+        print_json({"experiments": [{"name": name, "title": title} for name, title in catalogue.names()], **found})
+        return
     width = max(len(name) for name, _ in catalogue.names())
     print("Experiments (zenpark run NAME, zenpark new NAME):")
     for name, title in catalogue.names():
         print(f"  {name:<{width}}  {title}")
-    for what, group in (
-        ("Bodies", registry.BODIES),
-        ("Protocol twins", registry.DEVICES),
-        ("Triggers", registry.TRIGGERS),
-        ("Predictors", registry.PREDICTORS),
-        ("Laws", registry.LAWS),
-        ("Planners", registry.PLANNERS),
-        ("Avoidances", registry.AVOIDANCES),
-        ("Engines", registry.ENGINES),
-    ):
-        print(f"{what}: {', '.join(registry.names(group))}")
+    for title, group in plugins.items():
+        print(f"{title}: {', '.join(registry.names(group))}")
 
 
 @app.command()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, Lab, routers
+from tools.commands.options import CONNECT, AsJson, Lab, print_json, routers
 
 if TYPE_CHECKING:
     from experiments.real_time.conductor.orders import EmergencyStop
@@ -23,9 +23,13 @@ IDENTITY: Final = "operator"
 
 @app.command()
 def estop(
+    *,
     connect: Annotated[
         list[str] | None,
-        typer.Option(metavar="ENDPOINT", help="Only at this router; may be repeated. [all runs of this machine]"),
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Only at this router; may be repeated. [all runs of this machine, and the routers of ${CONNECT}]",
+        ),
     ] = None,
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     reason: Annotated[str, typer.Option(metavar="TEXT", help="Sent with the stop.")] = "zenpark estop",
@@ -33,6 +37,7 @@ def estop(
     identity: Annotated[
         str | None, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab. [the run's operator]")
     ] = None,
+    as_json: AsJson = False,
 ) -> int:
     """Cut the motors of every robot of every run of this machine, or at a router."""
     from agents.network import endpoints as topology
@@ -40,16 +45,32 @@ def estop(
     from experiments.real_time.conductor.orders import EmergencyStop
 
     if given := routers(connect, lab):
-        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], reason)
+        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], reason, as_json=as_json)
     up = run_registry.runs()
     stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
     known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
-    if topology.DEFAULT_ENDPOINT not in known:  # of a zenohd, say
-        stops.append(EmergencyStop([topology.DEFAULT_ENDPOINT], realm or "park", identity or IDENTITY))
-    return _stop_all(stops, reason)
+    for others in (_of_environment(lab), [topology.DEFAULT_ENDPOINT]):  # of another machine; of a zenohd, say
+        if others and known.isdisjoint(topology.bare(others)):
+            stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
+            known |= {*topology.bare(others)}
+    return _stop_all(stops, reason, as_json=as_json)
 
 
-def _stop_all(stops: Sequence[EmergencyStop], reason: str) -> int:
+def _of_environment(lab: str | None) -> list[str]:
+    """Routers that the environment names; none if they are wrong, which must not keep the others from being stopped."""
+    import os
+
+    from agents.network.endpoints import EndpointError
+    from agents.network.lab import LabError
+
+    try:
+        return routers(os.environ.get(CONNECT, "").split(), lab)
+    except (EndpointError, LabError) as error:
+        print(f"zenpark: {CONNECT}: {error}", file=sys.stderr)
+        return []
+
+
+def _stop_all(stops: Sequence[EmergencyStop], reason: str, *, as_json: bool) -> int:
     """Send all stops at the same time and print their results.
 
     Returns:
@@ -63,6 +84,20 @@ def _stop_all(stops: Sequence[EmergencyStop], reason: str) -> int:
         thread.start()
     for thread in threads:
         thread.join()
+    if as_json:
+        routers_asked = [
+            {
+                "where": stop.where,
+                "stopped": sorted(stop.seen - stop.moving),
+                "not_known_to_have_stopped": sorted(stop.moving),
+                "failure": None if stop.failure is None else str(stop.failure),
+            }
+            for stop in stops
+        ]
+        missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
+        ok = not missed and any(stop.seen for stop in stops)
+        print_json({"ok": ok, "routers": routers_asked})
+        return int(not ok)
     bad = False
     seen = [stop for stop in stops if stop.seen]
     for stop in stops:
@@ -117,8 +152,7 @@ def _show_running(*, as_json: bool) -> None:
 
     found = run_registry.runs()
     if as_json:
-        shown = [{**msgspec.to_builtins(run), "alive": run.alive} for run in found]
-        print(msgspec.json.format(msgspec.json.encode(shown), indent=2).decode())
+        print_json([{**msgspec.to_builtins(run), "alive": run.alive} for run in found])
         return
     for run in found:
         since = time.strftime("%H:%M:%S", time.localtime(run.since))
@@ -142,14 +176,12 @@ def _past(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
 
 
 def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
-    import msgspec
-
     from experiments.recording.run_folder import day_of
     from tools.progress import columns
 
     found = _past(words, below)
     if as_json:
-        print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
+        print_json(found)
         return
     if not found:
         print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")

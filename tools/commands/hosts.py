@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import File, Lab, Settings, group
+from tools.commands.options import AsJson, File, Lab, Settings, group, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment, Host
@@ -102,7 +102,7 @@ def watchdog(
 
 
 @app.command()
-def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
+def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None, as_json: AsJson = False) -> int:
     """Say whether each host can take part: version, clock, devices, certificates, router."""
     from experiments.definition import endpoints
     from experiments.file import document
@@ -115,9 +115,13 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None)
     rows = [_without_address(name, experiment, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
         rows += [_row(each, experiment, heading) for each in found]
-    print("\n".join(columns([heading, *(row.cells for row in rows)])))
-    for each in (each for row in rows for each in row.trouble):
-        print(each, file=sys.stderr)
+    if as_json:
+        shown = [{**dict(zip(heading, row.cells, strict=True)), "ok": row.well, "trouble": row.trouble} for row in rows]
+        print_json({"ok": all(row.well for row in rows), "hosts": shown})
+    else:
+        print("\n".join(columns([heading, *(row.cells for row in rows)])))
+        for each in (each for row in rows for each in row.trouble):
+            print(each, file=sys.stderr)
     return 0 if all(row.well for row in rows) else 1
 
 

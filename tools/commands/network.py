@@ -262,12 +262,16 @@ class Cadence:
 @app.command()
 def hz(
     key: KeyExpression,
+    *,
     connect: Connect = None,
     seconds: Seconds = None,
     lab: Lab = None,
     identity: As = "observer",
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each key and second.")] = False,
 ) -> None:
     """Print the rate, bytes and intervals of each key, second by second."""
+    import msgspec
+
     from agents.network.pubsub import subscriber
     from agents.network.session import received
 
@@ -277,7 +281,8 @@ def hz(
         session("hz", connect, lab, identity) as opened,
         subscriber(opened, expression, DEPTH) as samples,
     ):
-        print(HEADING, flush=True)
+        if not as_json:
+            print(HEADING, flush=True)
         began = printed = time.monotonic()
         end = math.inf if seconds is None else began + seconds
         while printed < end:
@@ -289,6 +294,6 @@ def hz(
                 cadence.add(str(sample.key_expr), at, len(sample.payload))
             if now - printed >= WINDOW_S or now >= end:
                 for rate in cadence.window(now - printed):
-                    print(printable(str(rate)), flush=True)
+                    print(msgspec.json.encode(rate).decode() if as_json else printable(str(rate)), flush=True)
                 printed = now
             time.sleep(POLL_S)

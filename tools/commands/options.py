@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 if TYPE_CHECKING:
     import zenoh
 
+CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
 PANELS: Final = {
     "Experiments": "new check explain run sweep report compare export list schema import recover clean",
     "Watch": "view runs keys echo hz",
@@ -54,7 +55,9 @@ File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or t
 Connect = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="ENDPOINT", help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]"
+        metavar="ENDPOINT",
+        envvar=CONNECT,
+        help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]",
     ),
 ]
 Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark cert init`).")]
@@ -85,10 +88,11 @@ OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browse
 
 
 def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included
-    """Print a result as JSON: what every command does with `--json`."""
+    """Print a result as JSON: what every command does with `--json`; NaN is null, a path its text."""
     import msgspec
 
-    print(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())
+    text = msgspec.json.encode(value, enc_hook=lambda other: other.item() if hasattr(other, "item") else str(other))
+    print(msgspec.json.format(text, indent=2).decode())
 
 
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
+from tools.commands.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
 from tools.commands.orders import world_app
 
 if TYPE_CHECKING:
@@ -220,7 +221,10 @@ def bridge(
     if what in ("-h", "--help"):
         typer.echo(context.get_help())
         raise typer.Exit
+    given = [part for each in os.environ.get(CONNECT, "").split() for part in ("--connect", each)]
     modules = {"vicon": "bridges.vicon.publisher", "ros2": "bridges.ros2"}
     if what not in modules:
         raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
-    return int(import_module(modules[what]).main(context.args))
+    return int(
+        import_module(modules[what]).main(context.args if "--connect" in context.args else [*context.args, *given])
+    )

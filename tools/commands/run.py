@@ -26,6 +26,7 @@ from tools.commands.options import (
     Report,
     Settings,
     check_bodies,
+    print_json,
 )
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
     _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
     chosen(read, options.cases)
-    if not sound(read, seeds=origin.seeds) and not origin.anyway:
+    if not sound(read, seeds=origin.seeds, as_json=show.as_json and not origin.anyway) and not origin.anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, show.out)
@@ -289,7 +290,6 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
 
 def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
     """Write and print the results."""
-    import json
     import webbrowser
 
     from experiments.metrics.statistics import across_seeds
@@ -300,7 +300,7 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
     if len(runs) > 1:
         summary["across"] = across_seeds([each.summary() for each in runs])
     if show.as_json:
-        print(json.dumps(summary))
+        print_json(summary)
     else:
         _print(runs, summary, page)
     if show.open_report and page is not None:
@@ -324,8 +324,11 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
             raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
 
 
-def sound(read: Document, *, seeds: int) -> bool:
-    """Print the warnings and errors of the check of a run of so many seeds; False if there are errors."""
+def sound(read: Document, *, seeds: int, as_json: bool) -> bool:
+    """Print the warnings and errors of the check of a run of so many seeds; False if there are errors.
+
+    With `as_json`, errors are on standard output as JSON too.
+    """
     from experiments.check.check import NOT_RANDOM, check
 
     found = [finding for finding in check(read) if finding.severity != "note"]
@@ -333,13 +336,17 @@ def sound(read: Document, *, seeds: int) -> bool:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     for finding in found:
         print(finding, file=sys.stderr)
-    return all(finding.severity != "error" for finding in found)
+    well = all(finding.severity != "error" for finding in found)
+    if as_json and not well:
+        print_json({"ok": False, "error": "the check found errors", "findings": found})
+    return well
 
 
 @app.command()
 def report(
     runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+    as_json: AsJson = False,
 ) -> int:
     """Write the report of one run, or compare several."""
     from experiments.recording.reader import RecordingError
@@ -354,14 +361,18 @@ def report(
     try:
         if len(read) == 1:
             _write_figures_of_merit(read, target)
-            print(_write_report(read, target))
+            page = _write_report(read, target)
         else:
             named = [(Path(f).name, list(r.traces.values())) for f, r in zip(runs, read, strict=True)]
-            print(pages.compare(target, named))
+            page = pages.compare(target, named)
     except OSError as error:
         raise RecordingError(
             f"{target}: cannot be written: {error.strerror}; choose another place with --out"
         ) from None
+    if as_json:
+        print_json({"report": page, "runs": [{"folder": run.folder, **run.summary()} for run in read]})
+    else:
+        print(page)
     return 0
 
 
@@ -372,8 +383,6 @@ def compare(
     as_json: AsJson = False,
 ) -> int:
     """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
-    import msgspec
-
     from experiments.recording.reader import RecordingError
     from experiments.recording.run_folder import differences, past_runs
     from tools.progress import columns
@@ -386,8 +395,7 @@ def compare(
     first = found[0]
     differ = {run.folder: differences(first, run) for run in found[1:]}
     if as_json:
-        said = {"reference": first.folder, "runs": msgspec.to_builtins(found), "differences": differ}
-        print(msgspec.json.format(msgspec.json.encode(said), indent=2).decode())
+        print_json({"reference": first.folder, "runs": found, "differences": differ})
     else:
         print(f"reference: {first.folder}")
         for folder, each in differ.items():
@@ -419,6 +427,7 @@ def export(
     as_bundle: Annotated[
         bool, typer.Option("--bundle", help="All that is needed to repeat it: an archive for a paper's supplement.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a run for MATLAB, its trajectories as one table, or all of it as a bundle that `zenpark run` repeats."""
     from experiments.recording import bundle
@@ -442,13 +451,17 @@ def export(
         bundle.write(Path(folder), file, [trace.experiment for trace in found.traces.values()])
     else:
         write_csv(found.traces, file)
-    print(f"{file}: {', '.join(found.traces)}")
+    if as_json:
+        print_json({"file": file, "cases": list(found.traces)})
+    else:
+        print(f"{file}: {', '.join(found.traces)}")
 
 
 @app.command()
 def recover(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Repair a recording whose writer was killed."""
     from experiments.recording.reader import recover as repair
@@ -456,6 +469,16 @@ def recover(
     source = Path(file)
     chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
     found = repair(source, chosen)
+    if as_json:
+        print_json(
+            {
+                "file": source if found.complete else chosen,
+                "was_whole": found.complete,
+                "messages": found.messages,
+                "robots": found.robots,
+            }
+        )
+        return
     what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
     print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings
+from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, print_json
 
 if TYPE_CHECKING:
     from experiments.sweep.optimise import TuningResult
@@ -54,7 +54,6 @@ def sweep(
     open_report: OpenReport = False,
 ) -> int:
     """Run cases x values x seeds in virtual time on all cores; finished runs are never repeated."""
-    import json
     import webbrowser
 
     from experiments.file.document import load
@@ -62,7 +61,7 @@ def sweep(
     from tools.commands.run import sound
 
     changes = settings or []
-    if not sound(load(file, *changes), seeds=2) and not anyway:
+    if not sound(load(file, *changes), seeds=2, as_json=as_json and not anyway) and not anyway:
         print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
@@ -88,7 +87,10 @@ def sweep(
         words += [part for setting in changes for part in ("--set", setting)]
         page = pages.write(found, shlex.join([*words, *(["--optimize", optimize] if optimize else [])]))
         lines.append(f"page: {page}")
-    print(json.dumps(table) if as_json else "\n".join(lines))
+    if as_json:
+        print_json(table)
+    else:
+        print("\n".join(lines))
     if open_report and page is not None and code != INTERRUPTED:
         webbrowser.open(page.resolve().as_uri())
     return code

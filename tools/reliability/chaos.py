@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Out, Settings
+from tools.commands.options import AsJson, File, Out, Settings, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
@@ -111,7 +111,7 @@ def chaos(
     words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
     if as_json:
-        print(msgspec.json.encode(result).decode())
+        print_json(result)
     else:
         _print(result)
         print(f"report: {page}")

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, Bodies, Case, Out, Settings
+from tools.commands.options import AsJson, Bodies, Case, Out, Settings, print_json
 
 app: Final = typer.Typer()
 
@@ -107,8 +107,6 @@ def soak(
     as_json: AsJson = False,
 ) -> int:
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
-    import json
-
     from agents.runtime.command_line import Interrupts
     from experiments.file.document import chosen, load, loads
     from experiments.recording.run_folder import SOURCE, new_folder
@@ -140,7 +138,7 @@ def soak(
     page = soak_verdict.write(folder, soaked, findings, " ".join([*words, "--minutes", f"{minutes:g}"]))
     if as_json:
         found = [{"mark": finding.mark, "text": finding.text} for finding in findings]
-        print(json.dumps({"run": str(folder), "passed": well, "findings": found}))
+        print_json({"run": folder, "passed": well, "findings": found})
     else:
         print_findings(findings)
         print(f"report: {page}")
