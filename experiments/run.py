@@ -90,12 +90,12 @@ class Run:
     notes: tuple[str, ...] = ()  # robots lost, a damaged recording, a case that never began
     made: float = field(default_factory=time.time)  # [s] UTC
 
-    def figures(self) -> dict[str, Figure]:
-        """The figures of the report, by name."""
+    def figures(self, width: float = 3.5) -> dict[str, Figure]:
+        """The figures of the report by name, `width` [in] wide: 3.5 for one column, 7.16 for a whole page."""
         from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
         traces = list(self.traces.values())
-        return figures.every(list(self.metrics.values()), traces) | figures.shadow_figures(traces)
+        return figures.every(list(self.metrics.values()), traces, width) | figures.shadow_figures(traces, width)
 
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `zenpark run --json` prints them."""

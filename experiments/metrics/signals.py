@@ -86,13 +86,24 @@ class LinkErrors:
         Seconds since the first sample; None if the last sample is still outside. A neighbour that died does not count.
         """
         known = np.isfinite(self.error)
+        total, count = self._over_window(window)
+        outside = total > tolerance * count + 1e-12
+        unknown = ((known.astype(float) @ self.own == 0.0) | ~self.alive) & ~self.away[:, None]
+        return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
+
+    def moving_mean(self, window: int) -> Array:
+        """Mean of each link over the last `window` samples (T, E) [m], as `acquired` judges it; NaN without any."""
+        total, count = self._over_window(window)
+        return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
+
+    def _over_window(self, window: int) -> tuple[Array, Array]:
+        """Sum and number (T, E) of the known errors over the last samples; the window fills up at the start."""
+        known = np.isfinite(self.error)
         edge = np.zeros((1, len(self.net)))
         total = np.concatenate([edge, np.cumsum(np.where(known, self.error, 0.0), axis=0)])
         count = np.concatenate([edge, np.cumsum(known, axis=0)])
-        before = np.maximum(np.arange(1, len(total)) - window, 0)  # the window fills up at the start
-        outside = (total[1:] - total[before]) > tolerance * (count[1:] - count[before]) + 1e-12
-        unknown = ((known.astype(float) @ self.own == 0.0) | ~self.alive) & ~self.away[:, None]
-        return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
+        before = np.maximum(np.arange(1, len(total)) - window, 0)
+        return total[1:] - total[before], count[1:] - count[before]
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
         """Per robot the mean error of its worst link [m], and the robot at its other end."""

@@ -11,18 +11,20 @@ from collections.abc import Iterable, Sequence
 from typing import Final, Literal
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import PathPatch
+from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from agents.arrays import Array
+from experiments.metrics.measure import WINDOW_S
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import formation_errors, leaders, phase_starts, transmission_gaps
+from experiments.metrics.signals import LinkErrors, leaders, phase_starts, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.style import (
@@ -31,8 +33,10 @@ from experiments.report.style import (
     HATCHES,
     INK,
     MAGENTA,
+    PAPER,
     SHORTEST_S,
     WIDTH,
+    Drawing,
     Line,
     boxes,
     legend_above,
@@ -41,7 +45,6 @@ from experiments.report.style import (
     name_ticks,
     panel_height,
     plain,
-    robot_legend,
     robot_lines,
     save,
     styled,
@@ -49,51 +52,63 @@ from experiments.report.style import (
     thinned,
     time_axis,
 )
-from experiments.report.trajectories import after, before, formation_after, formation_before, has_positions, plan_view
+from experiments.report.trajectories import formation, has_heights, has_positions, plan_view
 
-__all__ = ["formation_after", "formation_before", "plan_view", "save", "svg"]  # besides those of this module
+BAND: Final = "#009E73"  # the tolerance
+LEAST_ERROR: Final = 1e-3  # [m] below this an error axis does not go
+MOST_SEEDS: Final = 50  # of a case, for the range of its errors
+ALIKE_S: Final = 2e-3  # [s] delays that differ by less are those of a fixed one and of ticks
+SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
+
+__all__ = ["formation", "plan_view", "save", "svg"]  # besides those of this module
 
 
-def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> dict[str, Figure]:
-    """All figures of a run by name, in the order of the paper; motions of the first seed.
+def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = WIDTH) -> dict[str, Figure]:
+    """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
-    Figures without content are left out: all without a trace; `formation_after` without a leg in the timeline, where
-    it would show the same as `formation_before`; pictures of space where no position is known.
+    Figures without content are left out: all without a trace; ratios of a single case; pictures of space where no
+    position is known, or in perspective where all robots stay on the floor; delays where all are the same.
+
+    Args:
+        cases, traces: The run; several seeds of a case have one name.
+        width: Of each figure [in].
     """
-    first = [trace for trace in first_seed(traces) if len(trace.time)]
+    known = [trace for trace in traces if len(trace.time)]
+    first = first_seed(known)
     figures: dict[str, Figure] = {}
-    if cases:
-        figures["global_bars"] = global_bars(cases)
-    if any(has_positions(trace, before(trace)) for trace in first):
-        figures["formation_before"] = formation_before(first)
-    if any(len(phase_starts(trace)) > 1 and has_positions(trace, after(trace)) for trace in first):
-        figures["formation_after"] = formation_after(first)
-    if cases:
-        figures["robot_bars"] = robot_bars(cases)
-    if first:
-        figures["errors"], figures["events"] = errors(first), events(first)
-        figures["intervals"] = intervals(first)
     if any(has_positions(trace) for trace in first):
-        figures["plan_view"] = plan_view(first)
+        figures["plan_view"] = plan_view(first, width)
+        if any(map(has_heights, first)):
+            figures["formation"] = formation(first, width)
+    if first:
+        figures["errors"] = errors(known, cases, width)
+    if len(by_case(cases)) > 1:
+        figures["global_bars"] = global_bars(cases, width)
+    if cases:
+        figures["robot_bars"] = robot_bars(cases, width)
+    if first:
+        figures["events"], figures["intervals"] = events(first, width), intervals(first, width)
+    if any(len(_delays(trace)) for trace in first):
+        figures["delays"] = delays(first, width)
     return figures
 
 
 @styled
-def global_bars(cases: Sequence[CaseMetrics]) -> Figure:
+def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     """Mean transmission rate and errors, over those of the first case (paper, figure 12).
 
     Cases of one name and several seeds become one bar, the mean of the ratios, with its 95 % confidence interval.
     """
     grouped = by_case(cases)
     first = next(iter(grouped.values()), [])
-    figure = Figure(figsize=(WIDTH, 1.9 if len(grouped) <= 4 else 2.3), layout="constrained")
+    figure = Drawing(figsize=(width, 1.9 if len(grouped) <= 4 else 2.3), layout="constrained")
     axes = figure.subplots()
-    width = 0.8 / max(1, len(grouped))
+    share = 0.8 / max(1, len(grouped))
     tops = [1.0]
     for k, (name, runs) in enumerate(grouped.items()):
         found = [spread(ratios(runs, first, index)) for index, _, _ in BARS]
-        x = np.arange(len(BARS)) + (k - 0.5 * (len(grouped) - 1)) * width
-        height, error = _bars(axes, x, found, width=width, k=k, label=plain(name))
+        x = np.arange(len(BARS)) + (k - 0.5 * (len(grouped) - 1)) * share
+        height, error = _bars(axes, x, found, width=share, k=k, label=plain(name))
         for at, top, more in zip(x, height, error, strict=True):
             if math.isfinite(top):
                 size = 6.0 if len(grouped) <= 3 else 5.0
@@ -119,19 +134,19 @@ def global_bars(cases: Sequence[CaseMetrics]) -> Figure:
 
 
 @styled
-def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
+def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     """Transmission rate and errors of each robot (paper, figure 15); those that the means leave out in brackets."""
     grouped = by_case(cases)
     names = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots))
     out = {name for case in cases for name in (*case.leaders, *case.died)}
-    figure = Figure(figsize=(WIDTH, 4.3), layout="constrained")
+    figure = Drawing(figsize=(width, 4.3), layout="constrained")
     panels = figure.subplots(len(BARS), 1, sharex=True, squeeze=False)[:, 0]
-    width = 0.8 / max(1, len(grouped))
+    share = 0.8 / max(1, len(grouped))
     for axes, (index, label, unit) in zip(panels, BARS, strict=True):
         for k, (name, runs) in enumerate(grouped.items()):
             found = [spread([getattr(robot, index) for robot in _same(runs, name)]) for name in names]
-            x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * width
-            _bars(axes, x, found, width=width, k=k, label=plain(name))
+            x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * share
+            _bars(axes, x, found, width=share, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
         axes.tick_params(axis="x", length=0)
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
@@ -144,39 +159,116 @@ def robot_bars(cases: Sequence[CaseMetrics]) -> Figure:
 
 
 @styled
-def errors(traces: Sequence[Trace]) -> Figure:
-    """e_i(t) of each robot, one panel per case, legs of the timeline dashed (paper, figure 16)."""
-    height = panel_height(len(traces), 1.35)
-    figure = Figure(figsize=(WIDTH, height * len(traces) + 0.75), layout="constrained")
-    panels = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for axes, trace in zip(panels, traces, strict=True):
-        error, few = formation_errors(trace), thinned(trace, len(traces))
-        for i, line in enumerate(robot_lines(trace)):
-            axes.plot(trace.time[few], error[few, i], **line)
-        mark_phases(axes, trace)
-        axes.set_title(plain(trace.case), loc="right", pad=2.0)
-        axes.grid()
-    time_axis(panels[-1], traces)
-    panels[-1].set_ylim(bottom=0.0)
-    figure.supylabel("$e_i$ [m]", fontsize=8)
-    robot_legend(figure, traces)
+def errors(traces: Sequence[Trace], cases: Sequence[CaseMetrics] = (), width: float = WIDTH) -> Figure:
+    """Worst link of the formation and of each robot over time, as acquisition is judged, on a logarithmic axis.
+
+    All cases in one axis; the tolerance is a band, the acquisition by all followers a marker; legs of the timeline are
+    dashed (paper, figure 16, there Σ over the links on a linear axis). Of several seeds the median and the range.
+
+    Args:
+        traces: Of all seeds; the first `MOST_SEEDS` of each case are drawn.
+        cases: Where acquisitions are taken from; no markers if left out.
+        width: [in]
+    """
+    figure = Drawing(figsize=(width, min(0.5 * width + 0.75, 3.2)), layout="constrained")
+    axes = figure.subplots()
+    grouped: dict[str, list[Trace]] = {}
+    for trace in traces:
+        grouped.setdefault(trace.case, []).append(trace)
+    handles: dict[str, Artist] = {}
+    lowest, highest = np.inf, 0.0
+    for k, (name, runs) in enumerate(grouped.items()):
+        few = thinned(runs[0], 1)
+        line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
+        robots = [_worst_links(trace)[few] for trace in runs[:MOST_SEEDS]]
+        length = min(map(len, robots))
+        time = runs[0].time[few][:length]
+        worst = np.stack([_largest(each[:length]) for each in robots])
+        middle, low, high = np.median(worst, axis=0), worst.min(axis=0), worst.max(axis=0)
+        if len(runs) > 1:
+            axes.fill_between(time, low, high, color=line["color"], alpha=0.25, linewidth=0.0)
+        else:
+            for mine in robots[0].T:
+                axes.plot(time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
+        axes.plot(time, middle, **line, linewidth=1.3, zorder=3)
+        handles[plain(name)] = Line2D([], [], **line, linewidth=1.3)
+        known = low[np.isfinite(low) & (low > 0.0)]
+        lowest = min(lowest, float(known.min(initial=np.inf)))
+        highest = max(highest, float(np.nanmax(high, initial=0.0)))
+        at = _acquisitions([case for case in cases if case.case == name])
+        axes.plot(
+            at, [runs[0].experiment.tolerance] * len(at), "v", color=line["color"], ms=5.0, mec=PAPER, mew=0.5, zorder=4
+        )
+    tolerance = traces[0].experiment.tolerance
+    axes.set_yscale("log")
+    bottom = 10.0 ** math.floor(math.log10(min(max(lowest, LEAST_ERROR), 0.1 * tolerance)))
+    axes.set_ylim(bottom, max(1.6 * highest, 4.0 * tolerance))
+    axes.axhspan(bottom, tolerance, color=BAND, alpha=0.16, linewidth=0.0, zorder=0.2)
+    axes.axhline(tolerance, color=BAND, linewidth=0.6, zorder=0.3)
+    handles[f"within {100.0 * tolerance:g} cm"] = Patch(color=BAND, alpha=0.3, linewidth=0.0)
+    if any(value is not None for case in cases for value in case.acquired_s):
+        handles["acquired by all"] = Line2D([], [], color=to_rgb(INK), marker="v", linestyle="", ms=4.0)
+    mark_phases(axes, traces[0])
+    axes.grid()
+    time_axis(axes, traces)
+    axes.set_ylabel("error of the worst link [m]")
+    legend_above(figure, (list(handles.values()), list(handles)), columns=4)
     return figure
 
 
+def _worst_links(trace: Trace) -> Array:
+    """Error of the worst link of each follower (T, N) [m], moving mean over one second; NaN where none is known."""
+    window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0]))) if len(trace.time) > 1 else 1
+    known = LinkErrors.of_trace(trace)
+    starts = [int(np.searchsorted(trace.time, at - 1e-9)) for at in phase_starts(trace)]
+    ends = [*starts[1:], len(trace.time)]
+    mean = np.concatenate([known.part(a, b).moving_mean(window) for a, b in zip(starts, ends, strict=True)])
+    followers = [row for row, name in enumerate(trace.robots) if name not in leaders(trace)]
+    return np.stack([_largest(mean[:, known.own[:, row] > 0.0]) for row in followers], axis=1)
+
+
+def _largest(values: Array) -> Array:
+    """Largest known value of each row (T, n); NaN without any."""
+    known = np.isfinite(values)
+    largest = np.where(known, values, -np.inf).max(axis=1, initial=-np.inf)
+    return np.where(known.any(axis=1), largest, np.nan)
+
+
+def _acquisitions(runs: Sequence[CaseMetrics]) -> list[float]:
+    """When all followers had acquired in each phase [s] since the common start, mean over the seeds that did."""
+    found = []
+    longest = sorted((run.starts_s for run in runs), key=len)[-1:]
+    for k, start in enumerate(longest[0] if longest else ()):
+        mean = spread([run.acquired_s[k] for run in runs if k < len(run.acquired_s)]).mean
+        found += [] if mean is None else [start + mean]
+    return found
+
+
 @styled
-def events(traces: Sequence[Trace]) -> Figure:
-    """Transmissions: one row per robot, one panel per case; marks that would touch in print are one bar."""
+def events(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+    """Transmissions: one row per robot, one panel per case; marks that would touch in print are one bar.
+
+    A case in which all of them touch (a periodic one) is a line of text.
+    """
     rows = max((len(trace.robots) for trace in traces), default=0)
-    height = panel_height(len(traces), min(max(0.6, 0.13 * rows), 3.2))
-    figure = Figure(figsize=(WIDTH, height * len(traces) + 0.5 + 0.14 * len(traces)), layout="constrained")
-    panels = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, trace in zip(panels, traces, strict=True):
+    columns = 900 if rows * len(traces) <= 40 else 450  # a printed column shows no more
+    marks = [_marks(trace, columns) for trace in traces]
+    solid = [_solid(trace, each) for trace, each in zip(traces, marks, strict=True)]
+    drawn = [trace for trace, text in zip(traces, solid, strict=True) if not text]
+    height = panel_height(len(drawn), min(max(0.6, 0.13 * rows), 3.2))
+    heights = [0.02 if text else height for text in solid]
+    whole = sum(0.26 if text else height + 0.14 for text in solid) + 0.5
+    figure = Drawing(figsize=(width, max(whole, 1.1)), layout="constrained")
+    grid = figure.subplots(len(traces), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, trace, mark, text in zip(grid, traces, marks, solid, strict=True):
+        if text:
+            axes.set_title(text, loc="left", pad=2.0)
+            axes.spines[:].set_visible(False)
+            axes.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
+            continue
         colours = [line["color"] for line in robot_lines(trace)]
-        columns = 900 if rows * len(traces) <= 40 else 450  # a printed column shows no more
-        pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
-        for i in range(len(trace.robots)):
-            begin, end = merged(np.sort(trace.sent_by(i).stamp), pixel)
-            axes.add_patch(PathPatch(boxes(begin, end + pixel, i), facecolor=colours[i], linewidth=0.0))
+        for i, (begin, end) in enumerate(mark):
+            axes.add_patch(PathPatch(boxes(begin, end, i), facecolor=colours[i], linewidth=0.0))
         mark_phases(axes, trace)
         every = math.ceil(len(trace.robots) / max(1.0, height / 0.11))
         axes.set_yticks(range(0, len(trace.robots), every), trace.robots[::every], fontsize=6)
@@ -184,14 +276,66 @@ def events(traces: Sequence[Trace]) -> Figure:
         axes.tick_params(axis="y", length=0)
         axes.set_title(plain(trace.case), loc="right", pad=2.0)
         axes.grid(axis="x")
-    time_axis(panels[-1], traces)
+    if drawn:
+        last = max(k for k, text in enumerate(solid) if not text)
+        time_axis(grid[last], traces)
+        grid[last].tick_params(labelbottom=True)
     return figure
 
 
+def _marks(trace: Trace, columns: int) -> list[tuple[Array, Array]]:
+    """Beginnings and ends [s] of the marks of each robot, where a picture shows so many columns."""
+    pixel = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S) / columns
+    pairs = [merged(np.sort(trace.sent_by(i).stamp), pixel) for i in range(len(trace.robots))]
+    return [(begin, end + pixel) for begin, end in pairs]
+
+
+def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
+    """What to say of a case whose marks all touch; empty if there is anything to see."""
+    span = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S)
+    if not marks or any((end - begin).sum() < SOLID * span for begin, end in marks):
+        return ""
+    rates = [len(trace.sent_by(i).stamp) / span for i in range(len(trace.robots))]
+    low, high = f"{min(rates):.3g}", f"{max(rates):.3g}"
+    rate = low if low == high else f"{low} to {high}"
+    return f"{plain(trace.case)}: every robot throughout, {rate} Hz"
+
+
 @styled
-def intervals(traces: Sequence[Trace]) -> Figure:
+def delays(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+    """Histogram of the delays of received poses, from stamp to arrival, all links of a case together."""
+    figure = Drawing(figsize=(width, 2.0), layout="constrained")
+    axes = figure.subplots()
+    of_case = {plain(trace.case): 1e3 * _delays(trace) for trace in traces}
+    every_delay = np.concatenate(list(of_case.values()))
+    low, high = max(float(every_delay.min()), 0.01), max(float(every_delay.max()), 0.1)
+    edges = 10.0 ** np.arange(math.floor(math.log10(low)), math.floor(math.log10(high)) + 1.01, 1.0 / 12.0)
+    for k, (name, taken) in enumerate(of_case.items()):
+        if len(taken):
+            weights = np.full(len(taken), 100.0 / len(taken))
+            line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", "--", "-.", ":")[k % 4]}
+            axes.hist(np.maximum(taken, edges[0]), edges.tolist(), weights=weights, histtype="step", label=name, **line)
+            axes.axvline(float(np.percentile(taken, 95)), linewidth=0.6, **line)
+    axes.set_xscale("log")
+    axes.set_xlim(edges[0], edges[-1])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlabel("delay of a pose, from stamp to arrival [ms]")
+    axes.set_ylabel("share of poses [%]")
+    axes.grid()
+    legend_above(figure, axes.get_legend_handles_labels(), columns=3)
+    return figure
+
+
+def _delays(trace: Trace) -> Array:
+    """Delays of received poses [s]; none where all are the same, as in virtual time without a modelled network."""
+    taken = np.maximum(trace.received.arrival - trace.received.stamp, 0.0)
+    return taken if trace.clock == "real" or (len(taken) and np.ptp(taken) > ALIKE_S) else taken[:0]
+
+
+@styled
+def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """Share of inter-event times up to a length: each robot thin, all robots but the leaders thick."""
-    figure = Figure(figsize=(WIDTH, 2.2), layout="constrained")
+    figure = Drawing(figsize=(width, 2.2), layout="constrained")
     axes = figure.subplots()
     handles: dict[str, Line2D] = {}
     for k, trace in enumerate(traces):
@@ -271,17 +415,17 @@ PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
 )
 
 
-def shadow_figures(traces: Sequence[Trace]) -> dict[str, Figure]:
+def shadow_figures(traces: Sequence[Trace], width: float = WIDTH) -> dict[str, Figure]:
     """The figures of twins beside robots by name; nothing where there are none."""
-    return {"shadows": shadows(traces)} if any(map(_rows, traces)) else {}
+    return {"shadows": shadows(traces, width)} if any(map(_rows, traces)) else {}
 
 
 @styled
-def shadows(traces: Sequence[Trace]) -> Figure:
+def shadows(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """Each robot with its twin: the paths from above, and the difference over time, of the first few."""
     shown = [(trace, row) for trace in traces for row in _rows(trace)][:MOST]
     height = panel_height(len(shown), 1.15)
-    figure = Figure(figsize=(WIDTH, height * len(shown) + 0.8), layout="constrained")
+    figure = Drawing(figsize=(width, height * len(shown) + 0.8), layout="constrained")
     panels = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(1.0, 1.7))
     several = len(traces) > 1
     for (above, beside), (trace, row) in zip(panels, shown, strict=True):

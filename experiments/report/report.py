@@ -32,7 +32,7 @@ from experiments.report.tables import (
     robot_tables,
     shadow_tables,
     summary_table,
-    whole_table,
+    whole_tables,
 )
 from experiments.report.verdict import failures, findings, interruptions, left_out
 
@@ -119,11 +119,11 @@ def write(
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
-    drawn = _pictures(cases, first)
+    drawn = _pictures(cases, traces)
     short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
-        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
         *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
         Section("Figures", pictures=drawn),
         Section("Events", tables=(short,), more=every_event),
@@ -188,7 +188,7 @@ def compare(
     ]
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     sections = [
-        Section("Results", (left_out(cases),), (summary_table(cases), whole_table(cases))),
+        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
         *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
@@ -225,19 +225,22 @@ def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
 
 
 def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[PageFigure, ...]:
-    legs = any(len(case.starts_s) > 1 for case in cases)
-    seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+    legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
+    seeds = len({case.seed for case in cases})
+    seed = f" Seed {traces[0].seed}." if seeds > 1 else ""
     shown = [trace.experiment for trace in traces]
-    links = f"links at the start thin, at the end magenta.{scenery.caption(shown, space=True)}{seed}"
+    of_cases = "all cases, the first one's robots named" if len({trace.case for trace in traces}) > 1 else "by robot"
+    curves = f"median and range of {min(seeds, figures.MOST_SEEDS)} seeds" if seeds > 1 else "single robots thin"
     captions = {
         "global_bars": _global_caption(cases),
-        "formation_before": f"From the start to {'the first leg of the timeline' if legs else 'the end'}: {links}",
-        "formation_after": f"From the first leg of the timeline to the end: {links}",
+        "formation": f"Trajectories in space, {of_cases}; start hollow, end full, with its links."
+        f"{scenery.caption(shown, space=True)}{seed}",
         "robot_bars": _robot_caption(cases),
-        "errors": f"Formation error of each robot{'; legs of the timeline dashed' if legs else ''}.{seed}",
-        "events": f"When each robot transmitted.{seed}",
+        "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.",
+        "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
+        "delays": f"Delays of poses from stamp to arrival, all links; vertical: 95 % are shorter.{seed}",
     }
     drawn = figures.every(cases, traces)
     return numbered((figure, captions[name]) for name, figure in drawn.items())

@@ -28,7 +28,7 @@ from experiments.recording.trace import Trace
 P = ParamSpec("P")
 Line = dict[str, Any]  # keyword arguments of a curve
 
-WIDTH: Final = 3.5  # [in] one column
+WIDTH: Final = 3.5  # [in] one column of a page in two columns; its whole width is 7.16
 TALLEST: Final = 8.8  # [in] one page
 SHORTEST_S: Final = 0.1  # of a time axis, which a single sample would not have
 POINTS: Final = 1500  # of a curve; more than a printed column can show
@@ -39,8 +39,9 @@ MAGENTA: Final = "#D6007F"
 # Okabe and Ito; yellow is left out because it vanishes on white paper
 CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
-ROBOTS: Final = ("#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7")
-KINDS: Final = {"turtlebot3": "#000000", "khepera4": "#009E73", "crazyflie": "#0072B2", "tello": "#D55E00"}
+# robots: Tol's muted colours, so that none of them is taken for a case
+ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
+KINDS: Final = {"turtlebot3": "#000000", "khepera4": "#44AA99", "crazyflie": "#AA4499", "tello": "#999933"}
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
 BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
 
@@ -80,6 +81,13 @@ STYLE: Final[Mapping[Any, Any]] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "zenpark",  # the same figure gives the same bytes
 }
+
+
+class Drawing(Figure):
+    """A figure that notebooks show: it is drawn without pyplot, by which they would find it."""
+
+    def _repr_svg_(self) -> str:
+        return svg(self)
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
@@ -150,9 +158,11 @@ def robot_legend(
 
 
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
-    """A legend above all panels; none for a single entry."""
+    """A legend above all panels, with as many columns as fit between the edges; none without entries."""
     if entries[1]:
-        figure.legend(*entries, loc="outside upper center", ncols=min(columns, len(entries[1])))
+        widest = 28.0 + 3.3 * max(map(len, entries[1]))  # [pt]
+        columns = max(1, min(columns, len(entries[1]), int(72.0 * figure.get_figwidth() / widest)))
+        figure.legend(*entries, loc="outside upper center", ncols=columns)
 
 
 def name_ticks(axes: Axes, names: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, Final, Generic, TypeVar
 
@@ -38,6 +38,7 @@ SUMMARY: Final = (
     ("dropped", "Dropped by the modelled network"),
     ("missed_deadlines", "Missed deadlines"),
 )
+TROUBLES: Final = ("lost", "dropped", "missed_deadlines")  # rows that are hidden where none occurred
 DEFINITIONS: Final = (
     ("e(t)", "Formation error of a robot: the sum of |distance − target distance| over the links on which it listens;"
      " for one without incoming links, over its outgoing ones. Taken on true positions."),
@@ -107,11 +108,10 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
             return text
         return text, f"× {share.mean:.3f}" + ("" if share.ci95 is None else f" ± {share.ci95:.3f}")
 
-    modelled = any(case.modelled for case in cases)
     rows = [
         Row((label, *(cell(runs, index) for runs in grouped.values())))
         for index, label in SUMMARY
-        if modelled or index != "dropped"
+        if index not in TROUBLES or any(run.mean[index] for run in cases)
     ]
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
@@ -119,35 +119,64 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
     return Table(("Mean per robot", *grouped), tuple(rows), note=note)
 
 
-def whole_table(cases: Sequence[CaseMetrics]) -> Table:
-    """Numbers of the formation as a whole."""
-    phases = max(len(case.starts_s) for case in cases)
-    lines: list[Line] = []
-    for k in range(phases):
-        lines += [
-            (f"Acquired by all followers{_phase(cases, k)} [s]", lambda case, k=k: _at(case.acquired_s, k), 1.0),  # type: ignore[misc]
-            (f"Worst link{_phase_end(cases, k, phases)} [cm]", lambda case, k=k: _worst(case, k), 100.0),  # type: ignore[misc]
-            (f"Net rotation{_phase(cases, k)} [mrad/s]", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0),  # type: ignore[misc]
-        ]
-    lines += [
-        ("Belief error, RMS [mm]", attrgetter("belief_rms"), 1000.0),
-        ("Belief error, largest [mm]", attrgetter("belief_max"), 1000.0),
-        ("Closest approach of two robots [m]", attrgetter("closest"), 1.0),
-        ("Closest approach of two surfaces [cm]", lambda case: None if case.near is None else case.near.gap, 100.0),
-        (
-            "Closest approach to the arena [cm]",
-            lambda case: None if case.near_arena is None else case.near_arena.gap,
-            100.0,
-        ),
-        ("Collisions", lambda case: float(len(case.collisions)), 1.0),
-        ("Hardest impulse [mN s]", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0),
-        ("Changed by safety [% of ticks]", attrgetter("intervened_share"), 100.0),
-        ("Changed by avoidance [% of ticks]", attrgetter("avoided_share"), 100.0),
-        ("Farthest outside the arena [mm]", attrgetter("excursion"), 1000.0),
-        ("Missed deadlines [% of ticks]", attrgetter("missed_share"), 100.0),
-        ("Cost J2", attrgetter("j2"), 1.0),
+def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
+    """Numbers of the formation as a whole, a table for each unit; without rows of what did not occur in any case."""
+    phases = range(max(len(case.starts_s) for case in cases))
+    over = " (mean over seeds)" if max(map(len, by_case(cases).values())) > 1 else ""
+    ends = {k: f"Worst link{_phase_end(cases, k, len(phases))}{over}" for k in phases}
+    lengths: list[Line] = [(ends[k], lambda case, k=k: _worst(case, k), 100.0) for k in phases]  # type: ignore[misc]
+    lengths += [
+        ("Belief error, RMS", attrgetter("belief_rms"), 100.0),
+        ("Belief error, largest", attrgetter("belief_max"), 100.0),
+        ("Closest two robots, between centres", attrgetter("closest"), 100.0),
+        ("Closest two robots, between surfaces", lambda case: None if case.near is None else case.near.gap, 100.0),
+        ("Closest to the arena", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
+        ("Farthest outside the arena", attrgetter("excursion"), 100.0),
     ]
-    return _across("Whole formation", cases, lines)
+    units: dict[str, list[Line]] = {
+        "Acquired by all followers [s]": [
+            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _at(case.acquired_s, k), 1.0)  # type: ignore[misc]
+            for k in phases
+        ],
+        "Distances [cm]": lengths,
+        "Net rotation [mrad/s]": [
+            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0)  # type: ignore[misc]
+            for k in phases
+        ],
+        "Delay of poses [ms]": [
+            ("mean", lambda case: _delay(case, mean_delay), 1000.0),
+            ("longest", lambda case: _delay(case, _longest_delay), 1000.0),
+        ],
+        "Share of all ticks [%]": [
+            ("Changed by safety", attrgetter("intervened_share"), 100.0),
+            ("Changed by avoidance", attrgetter("avoided_share"), 100.0),
+            ("Missed deadlines", attrgetter("missed_share"), 100.0),
+        ],
+        "Collisions": [("Number", lambda case: float(len(case.collisions)), 1.0)],
+        "Hardest impulse [mN s]": [
+            ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
+        ],
+        "Cost": [("J2", attrgetter("j2"), 1.0)],
+    }
+    tables = [_across(unit, cases, lines) for unit, lines in units.items()]
+    if any(case.belief for case in cases):  # a formation that was never acquired is a result
+        return tables[0], *(shown for table in tables[1:] if (shown := _occurred(table)).rows)
+    return tuple(shown for table in tables if (shown := _occurred(table)).rows)
+
+
+def _occurred(table: Table) -> Table:
+    """A table without the rows that are zero or unknown in every column."""
+    rows = [row for row in table.rows if any(cell not in (NONE, "0") for cell in row.cells[1:])]
+    return replace(table, rows=tuple(rows))
+
+
+def _delay(case: CaseMetrics, what: Callable[[Sequence[Passage]], float | None]) -> float | None:
+    """A statistic of the delays of a case; None in virtual time without a modelled network, where they are given."""
+    return what(case.passages) if case.clock == "real" or case.modelled else None
+
+
+def _longest_delay(links: Sequence[Passage]) -> float | None:
+    return _known(max, (link.delay_max for link in links))
 
 
 def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
@@ -271,7 +300,9 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     for k in range(1, max(len(run.starts_s) for run in runs)):
         later = lambda robots, k=k: _known(_mean, (p.acquired_s for r in robots for p in r.phases[k - 1 : k]))  # noqa: E731
         columns.append((f"{_phase(runs, k).strip()} [s]", lambda robots, later=later: number(later(robots))))  # type: ignore[misc]
-    columns.append(("Worst link [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
+    columns.append(
+        ("Worst link at the end [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0))
+    )
     if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
         columns.append(("Known [%]", _cell(_mean, "coverage", 100.0)))
     kept = [robot for run in runs for robot in run.robots if robot.robot not in left_out]

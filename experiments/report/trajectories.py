@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -18,10 +18,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 
 from agents.arrays import Array
 from experiments.check.analysis import Analysis
-from experiments.metrics.signals import phase_starts
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
+    CASES,
     INK,
     KINDS,
     MAGENTA,
@@ -29,9 +29,10 @@ from experiments.report.style import (
     PAPER,
     ROBOTS,
     WIDTH,
+    Drawing,
+    Line,
     edges,
     last_known,
-    panel_height,
     plain,
     robot_legend,
     robot_lines,
@@ -39,31 +40,20 @@ from experiments.report.style import (
     thinned,
 )
 
+LOW: Final = 0.2  # [m] robots below that are as well seen from above
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
 
 
 @styled
-def formation_before(traces: Sequence[Trace]) -> Figure:
-    """The way from the start into the formation, before the first leg of the timeline (paper, figure 13)."""
-    return _spatial(traces, before)
-
-
-@styled
-def formation_after(traces: Sequence[Trace]) -> Figure:
-    """The way from the first leg of the timeline to the end (paper, figure 14); the whole run if there is no leg."""
-    return _spatial(traces, after)
-
-
-@styled
-def plan_view(traces: Sequence[Trace]) -> Figure:
+def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """The trajectories from above, in the arena as it is; start hollow, end full, links of the end grey."""
     columns = min(2, len(traces))
     rows = math.ceil(len(traces) / columns)
     x, y, _ = traces[0].experiment.arena.size
-    side = (WIDTH - 0.5) / columns
+    side = (width - 0.5) / columns
     panel = min(side * y / x, 3.2) + 0.25
     things = scenery.legend([trace.experiment for trace in traces])
-    figure = Figure(figsize=(WIDTH, panel * rows + 0.7 + 0.17 * bool(things[1])), layout="constrained")
+    figure = Drawing(figsize=(width, panel * rows + 0.7 + 0.17 * bool(things[1])), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, trace in zip(grid.flat, traces, strict=False):
         x, y, _ = trace.experiment.arena.size
@@ -102,7 +92,7 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     columns = min(2, len(cases))
     rows = math.ceil(len(cases) / columns)
     panel = min((WIDTH - 0.5) / columns * y / x, 3.2) + 0.25
-    figure = Figure(figsize=(WIDTH, panel * rows + 0.4), layout="constrained")
+    figure = Drawing(figsize=(WIDTH, panel * rows + 0.4), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, (name, known) in zip(grid.flat, cases, strict=False):
         experiment, motion = known.experiment, known.prediction.position
@@ -136,103 +126,109 @@ def _laid_upon(shape: Array, place: Array) -> Array:
     return np.column_stack([(shape[:, :2] - middle) @ left @ right + at, shape[:, 2]])
 
 
-def before(trace: Trace) -> slice:
-    """Rows until the first leg of the timeline; all if there is none."""
-    starts = phase_starts(trace)
-    return slice(0, _row(trace, starts[1]) if len(starts) > 1 else len(trace.time))
+def has_positions(trace: Trace) -> bool:
+    """Whether the position of any robot is ever known."""
+    return bool(np.isfinite(trace.true_position).all(axis=2).any())
 
 
-def after(trace: Trace) -> slice:
-    """Rows from the first leg of the timeline on; all if there is none."""
-    starts = phase_starts(trace)
-    return slice(_row(trace, starts[1]) if len(starts) > 1 else 0, len(trace.time))
+def has_heights(trace: Trace) -> bool:
+    """Whether any robot is ever above the floor, by more than `LOW`."""
+    return bool((trace.true_position[..., 2] > LOW).any())
 
 
-def _row(trace: Trace, at: float) -> int:
-    return int(np.searchsorted(trace.time, at - 1e-9))
+@styled
+def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+    """The trajectories of the whole run in space, all cases in one panel: start hollow, end full, links of the end.
 
-
-def has_positions(trace: Trace, rows: slice = slice(None)) -> bool:
-    """Whether the position of any robot is known there."""
-    return bool(np.isfinite(trace.true_position[rows]).all(axis=2).any())
-
-
-def _spatial(traces: Sequence[Trace], rows_of: Callable[[Trace], slice]) -> Figure:
-    """Trajectories in space over a span of time, one panel per case, with the links at its start and its end."""
-    columns = 1 if len(traces) <= 2 else 2
-    rows = math.ceil(len(traces) / columns)
-    height = panel_height(rows, 2.6 / columns)
+    Cases have a colour each; the robots of a single case do (paper, figures 13 and 14).
+    """
+    shown = [trace for trace in traces if has_positions(trace)]
     things = scenery.legend([trace.experiment for trace in traces], space=True)
-    above = 0.3 + 0.16 * math.ceil(len(things[1]) / 4)
-    whole = height * rows + above
-    figure = Figure(figsize=(WIDTH, whole))
+    black = to_rgb(INK)
+    entries: dict[str, Artist] = {
+        plain(trace.case): Line2D([], [], color=CASES[k % len(CASES)]) for k, trace in enumerate(traces)
+    }
+    entries = entries if len(traces) > 1 else {}
+    entries["start"] = Line2D([], [], color=black, marker="o", linestyle="", ms=3.0, mfc="none", mew=0.6)
+    entries["end"] = Line2D([], [], color=black, marker="o", linestyle="", ms=3.5)
+    labels = [*entries, *things[1]]
+    fits = max(1, int(72.0 * width / (28.0 + 3.3 * max(map(len, labels)))))
+    above = 0.12 + 0.15 * math.ceil(len(labels) / fits)
+    height = min(0.7 * width, 3.9)
+    whole = height + above
+    figure = Drawing(figsize=(width, whole))
+    axes = figure.add_axes((-0.07, -0.05, 1.1, 1.1 * height / whole), projection="3d", computed_zorder=False)
+    assert isinstance(axes, Axes3D)
+    if not shown:
+        axes.set_axis_off()
+        axes.text2D(0.5, 0.5, "no position is known", transform=axes.transAxes, fontsize=7, ha="center")
+        return figure
     for k, trace in enumerate(traces):
-        row, column = divmod(k, columns)
-        box = ((column - 0.02) / columns, 1.0 - (above + height * (row + 1)) / whole, 1.0 / columns, height / whole)
-        axes = figure.add_axes(box, projection="3d", computed_zorder=False)
-        assert isinstance(axes, Axes3D)
-        if has_positions(trace, rows_of(trace)):
-            _draw_spatial(axes, trace, trace.true_position[rows_of(trace)], columns)
-        else:
-            axes.set_axis_off()
-            axes.text2D(0.5, 0.5, "nothing is known", transform=axes.transAxes, fontsize=7, ha="center")
-        if len(traces) > 1:
-            axes.text2D(0.06, 0.93, plain(trace.case), transform=axes.transAxes, fontsize=8)
-    black, magenta = to_rgb(INK), to_rgb(MAGENTA)
-    handles: list[Artist] = [
-        Line2D([], [], color=black, linewidth=0.7),
-        Line2D([], [], color=magenta, linewidth=0.9),
-        Line2D(
-            [], [], color=black, marker="*", linestyle="", markersize=5, markerfacecolor="none", markeredgewidth=0.6
-        ),
-        Line2D([], [], color=black, marker="*", linestyle="", markersize=5.5),
-    ]
-    labels = ["links, start", "links, end", "start", "end"]
-    figure.legend([*handles, *things[0]], [*labels, *things[1]], loc="upper center", ncols=4, bbox_to_anchor=(0.5, 1.0))
+        if has_positions(trace):
+            _draw_in_space(axes, trace, CASES[k % len(CASES)] if len(traces) > 1 else None)
+    _frame(axes, shown)
+    figure.legend(
+        [*entries.values(), *things[0]], labels, loc="upper center", ncols=min(fits, 5), bbox_to_anchor=(0.5, 1.0)
+    )
     return figure
 
 
-def _draw_spatial(axes: Axes3D, trace: Trace, place: Array, columns: int) -> None:
+def _draw_in_space(axes: Axes3D, trace: Trace, colour: str | None) -> None:
+    """One case, in one colour if it has one; the robots of the first case are named."""
+    place = trace.true_position
     known = np.asarray(np.isfinite(place).all(axis=2))
-    ends = place[len(place) - 1 - known[::-1].argmax(axis=0), np.arange(place.shape[1])]
-    starts = place[known.argmax(axis=0), np.arange(place.shape[1])]
+    starts, ends = place[known.argmax(axis=0), np.arange(place.shape[1])], last_known(trace)
     net = trace.plan.links
-    pairs = edges(net.receiver, net.sender)
-    thin = (1.0 if len(trace.robots) <= MANY else 0.5) / math.sqrt(columns)
-    for where, colour, width, order in ((starts, INK, 0.6, 1), (ends, MAGENTA, 0.9, 4)) if pairs else ():
-        lines = [where[[i, j]] for i, j in pairs]
-        axes.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=width * thin, alpha=0.8, zorder=order))
+    few_robots = len(trace.robots) <= MANY
+    if pairs := edges(net.receiver, net.sender):
+        lines = [ends[[i, j]] for i, j in pairs]
+        links = Line3DCollection(lines, colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
+        axes.add_collection3d(links)
     few = slice(None, None, max(1, len(place) // 400))
+    size = 3.0 if few_robots else 2.0
+    named = not axes.texts
     for i, line in enumerate(robot_lines(trace)):
-        axes.plot(*place[few, i].T, **{**line, "zorder": 3})
-        axes.plot(*starts[i, :, None], "*", ms=5 * thin, mfc="none", mec=line["color"], mew=0.6, zorder=5)
-        axes.plot(*ends[i, :, None], "*", ms=6 * thin, color=line["color"], mec="none", zorder=6)
-        if len(trace.robots) <= MANY and columns == 1:
+        ink = colour or line["color"]
+        style: Line = {"color": ink, "linewidth": 1.8 if named else 0.7} if colour else line  # seen below the others
+        axes.plot(*place[few, i].T, **{**style, "zorder": 3})
+        axes.plot(*starts[i, :, None], "o", ms=size, mfc="none", mec=ink, mew=0.6, zorder=5)
+        axes.plot(
+            *ends[i, :, None], "o", ms=size + 0.5 + 1.5 * (named and bool(colour)), color=ink, mec="none", zorder=6
+        )
+        if few_robots and named:
             halo = [withStroke(linewidth=1.5, foreground=PAPER)]
-            axes.text(*(ends[i] + [0.0, 0.0, 0.05]), trace.robots[i], fontsize=6, zorder=7, path_effects=halo)
+            above = ends[i] + [0.0, 0.0, 0.05]
+            axes.text(*above, trace.robots[i], fontsize=6, ha="center", va="bottom", zorder=7, path_effects=halo)
+
+
+def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
+    """Limits, arena and labels of the picture of some cases."""
+    place = np.concatenate([trace.true_position.reshape(-1, 3) for trace in traces])
+    known = np.isfinite(place).all(axis=1)
+    experiment = traces[0].experiment
     low, high = place[known].min(axis=0), place[known].max(axis=0)
-    low[:2], high[:2] = scenery.around(trace.experiment, low[:2], high[:2])
+    low[:2], high[:2] = scenery.around(experiment, low[:2], high[:2])
     low[2] = min(0.0, low[2])
     size = np.maximum(high - low, 0.4)
     middle = 0.5 * (low + high)
     ground = bool(low[2] > -0.1)
     low, high = middle - 0.54 * size, middle + 0.54 * size
     if ground:
-        low[2], high[2] = 0.0, max(high[2], scenery.tall(trace.experiment, FLAT * float((high - low)[:2].max())))
-    scenery.in_space(axes, trace.experiment, low, high)
+        low[2], high[2] = 0.0, max(high[2], scenery.tall(experiment, FLAT * float((high - low)[:2].max())))
+    scenery.in_space(axes, experiment, low, high)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     x, y, z = (high - low) / math.dist(high, low)
     wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # from 26° above and 60° aside
     axes.set_box_aspect((x, y, z), zoom=min(0.94 / wide, 0.82 / tall))
     axes.view_init(26, -60)
-    size_pt, pad = (8, -8 if z > FLAT else -5) if columns == 1 else (6.5, -11)
-    axes.set_xlabel("$x$ [m]", labelpad=pad, fontsize=size_pt)
-    axes.set_ylabel("$y$ [m]", labelpad=pad, fontsize=size_pt)
-    axes.set_zlabel("$z$ [m]", labelpad=pad - 1, fontsize=size_pt)
+    pad = -8 if z > FLAT else -5
+    axes.set_xlabel("$x$ [m]", labelpad=pad, fontsize=8)
+    axes.set_ylabel("$y$ [m]", labelpad=pad, fontsize=8)
+    axes.set_zlabel("$z$ [m]", labelpad=pad - 1, fontsize=8)
     for axis, length in zip((axes.xaxis, axes.yaxis, axes.zaxis), (x, y, z), strict=True):
-        axis.set_major_locator(MaxNLocator(max(1, round((5 if columns == 1 else 3) * min(1.0, 2.5 * length)))))
+        axis.set_major_locator(MaxNLocator(max(1, round(5 * min(1.0, 2.5 * length)))))
         axis.pane.fill = False
         axis.pane.set_edgecolor("#9a9a9a")
         axis.pane.set_linewidth(0.4)
         axis._axinfo["grid"].update(linewidth=0.3, color="#c0c0c0")
-    axes.tick_params(pad=-3.5 if columns == 1 else -4.5, labelsize=6.5 if columns == 1 else 5.5)
+    axes.tick_params(pad=-3.5, labelsize=6.5)

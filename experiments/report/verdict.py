@@ -207,7 +207,8 @@ def _worst_link(cases: Sequence[CaseMetrics]) -> Finding:
     mark: Mark = "good" if largest <= cases[0].tolerance else "bad"
     if mark == "bad" and any(case.interrupted for case in cases):
         mark = "plain"  # it may have been on its way
-    return Finding(mark, f"By the end the worst link was off by {_list(words)}.")
+    of = " of all seeds" if len(cases) > len(by_case(cases)) else ""
+    return Finding(mark, f"By the end the worst link{of} was off by {_list(words)}.")
 
 
 def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:

@@ -122,13 +122,18 @@ def _pictures(folder: Path, rows: Sequence[CellRow], *, joined: bool) -> tuple[P
 
 
 def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
-    """The cell with the fewest messages within each level of error."""
+    """The cell with the fewest messages within each level of error; the nearest one if all are worse."""
     found: dict[str, Finding] = {}
+    others = [row for row in rows if not row.reference and row.ratio["iae"].mean is not None]
     for level in LEVELS:
         within = [row for row in front(rows) if not row.reference and (row.ratio["iae"].mean or 0.0) <= level]
         if within:
             text = f"Fewest messages with an IAE ratio of at most {level:g}: {within[0].label}: {_saved(within[0])}"
             found.setdefault(within[0].label, Finding("good" if within[0].acquired == 1.0 else "fair", text))
+    if others and not found:
+        nearest = min(others, key=lambda row: row.ratio["iae"].mean or 0.0)
+        text = f"No cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest: {nearest.label}: {_saved(nearest)}"
+        return [Finding("fair", text)]
     return list(found.values())
 
 

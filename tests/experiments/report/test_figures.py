@@ -9,15 +9,13 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from experiments.metrics.measure import measure
-from experiments.metrics.signals import formation_errors
-from experiments.report import figures
+from experiments.report import figures, style
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
 OF_TRACES = (
-    figures.formation_before,
-    figures.formation_after,
+    figures.formation,
     figures.errors,
     figures.events,
     figures.intervals,
@@ -45,7 +43,8 @@ def test_motions_are_drawn_in_one_column(draw, run):
     figure = draw(run)
     assert figure.get_figwidth() == 3.5
     assert 1.0 < figure.get_figheight() <= 9.3
-    assert len(figure.axes) >= (1 if draw is figures.intervals else len(run))
+    assert len(figure.axes) >= (len(run) if draw in (figures.events, figures.plan_view) else 1)
+    assert draw(run, width=7.16).get_figwidth() == 7.16
     assert "<metadata" not in figures.svg(figure)
 
 
@@ -80,15 +79,66 @@ def test_several_seeds_become_one_bar_with_its_interval():
     assert np.ptp(segments[1][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
 
 
-def test_errors_show_every_robot_and_the_leg():
-    known = park()
-    axes = figures.errors([known]).axes[0]
-    curves = {len(line.get_xdata()): line for line in axes.lines}
-    assert list(axes.lines[-1].get_xdata()) == [21.0, 21.0]
-    assert len(axes.lines) == 8
-    assert max(curves) <= 1500
-    assert max(np.max(line.get_ydata()) for line in axes.lines[:-1]) == pytest.approx(formation_errors(known).max())
+def test_errors_of_all_cases_share_a_logarithmic_axis_with_tolerance_and_acquisition():
+    traces = [park(), park("event", 0.01)]
+    cases = [measure(each) for each in traces]
+    (axes,) = figures.errors(traces, cases).axes
+    assert axes.get_yscale() == "log"
+    thick = [line for line in axes.lines if line.get_linewidth() == 1.3]
+    assert len(thick) == 2
+    assert max(len(line.get_xdata()) for line in axes.lines) <= 1500
+    marks = [line for line in axes.lines if line.get_marker() == "v"]
+    for case, line, mark in zip(cases, thick, marks, strict=True):
+        acquired = [start + at for start, at in zip(case.starts_s, case.acquired_s, strict=True)]
+        assert list(mark.get_xdata()) == pytest.approx(acquired)
+        assert set(mark.get_ydata()) == {case.tolerance}
+        time, worst = line.get_data()
+        first = (time > acquired[0] + 0.1) & (time < case.starts_s[1])
+        assert (worst[first] <= case.tolerance).all()  # what is drawn is what acquisition is judged by
+        assert worst[time < acquired[0] - 0.1][-1] > case.tolerance
     assert axes.get_xlim() == (0.0, 45.0)
+
+
+def test_errors_over_seeds_are_a_band():
+    traces = [park("a", seed=seed, duration=5.0) for seed in (1, 2, 3)]
+    (axes,) = figures.errors(traces).axes
+    assert len([line for line in axes.lines if line.get_linewidth() == 1.3]) == 1
+    assert len(axes.collections) == 1  # no curves of single robots beside it
+    assert not [line for line in axes.lines if line.get_linewidth() == 0.4]
+
+
+def test_a_periodic_case_is_a_line_of_text():
+    text, raster = figures.events([park(), park("event", 0.05)]).axes
+    assert text.get_title(loc="left") == "periodic: every robot throughout, 50 Hz"
+    assert not text.patches
+    assert len(raster.patches) == 7
+
+
+def test_delays_are_shown_where_they_differ():
+    known = park(duration=3.0)
+    assert "delays" not in figures.every([], [known])
+    real = dataclasses.replace(known, clock="real")
+    (axes,) = figures.every([], [real])["delays"].axes
+    assert axes.get_xscale() == "log"
+
+
+def test_cases_and_robots_have_palettes_of_their_own():
+    assert not set(style.CASES[:-1]) & set(style.ROBOTS)
+    assert not set(style.CASES[:-1]) & set(style.KINDS.values())
+
+
+def test_figures_show_themselves_in_notebooks():
+    assert figures.errors([park(duration=3.0)])._repr_svg_().startswith("<?xml")
+
+
+def test_long_legends_stay_inside_the_figure():
+    cases = [measure(crowd(3, f"pentagon-2026-11-22T00-29-2{k} · periodic", duration=1.0)) for k in range(4)]
+    for draw in OF_CASES:
+        figure = draw(cases)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        box = figure.legends[0].get_window_extent(canvas.get_renderer())
+        assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
 
 
 def test_raster_has_one_box_per_separate_transmission():
@@ -107,27 +157,25 @@ def test_intervals_reach_one_at_the_longest():
     assert y[np.searchsorted(x, 0.5, side="right") - 1] == pytest.approx(2.0 / 3.0)
 
 
-def test_every_figure_of_the_first_seed():
+def test_every_figure_and_motions_of_the_first_seed():
     traces = [park("a", seed=seed, duration=22.0) for seed in (2, 1)]
     drawn = figures.every([measure(each) for each in traces], traces)
-    names = ["global_bars", "formation_before", "formation_after", "robot_bars", "errors", "events", "intervals"]
-    assert list(drawn) == [*names, "plan_view"]
-    line = drawn["errors"].axes[0].lines[1].get_ydata()
-    assert line[0] == formation_errors(traces[0])[0, 1]
-    assert len(drawn["errors"].axes) == 1
+    assert list(drawn) == ["plan_view", "formation", "errors", "robot_bars", "events", "intervals"]
+    line = drawn["plan_view"].axes[0].lines[-1].get_xdata()
+    assert line[0] == traces[0].true_position[-1, -1, 0]
     small = crowd(3, duration=1.0)
-    assert "formation_after" not in figures.every([measure(small)], [small])
+    flat = dataclasses.replace(small, true_position=small.true_position * [1.0, 1.0, 0.0])
+    assert "formation" not in figures.every([], [flat])
 
 
-def test_links_go_from_black_to_magenta():
-    known = park()
-    axes = figures.formation_before([known]).axes[0]
-    start, end = axes.collections
-    first, last = (np.array(each._segments3d) for each in (start, end))
-    before = np.searchsorted(known.time, 21.0 - 1e-9) - 1
-    assert first.shape == last.shape == (12, 2, 3)
-    assert np.isin(last.reshape(-1, 3), known.true_position[before]).all()
-    assert np.isin(first.reshape(-1, 3), known.true_position[0]).all()
+def test_cases_are_overlaid_in_space_each_with_the_links_of_its_end():
+    traces = [park(), park("event", 0.01)]
+    (axes,) = figures.formation(traces).axes
+    for known, links in zip(traces, axes.collections, strict=False):
+        last = np.array(links._segments3d)
+        assert last.shape == (12, 2, 3)
+        assert np.isin(last.reshape(-1, 3), known.true_position[-1]).all()
+    assert [text.get_text() for text in axes.texts] == list(traces[0].robots)
 
 
 @pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
@@ -155,7 +203,7 @@ def unknown(known, rows):
     return dataclasses.replace(known, true_position=place, position=place)
 
 
-WITHOUT_SPACE = ["global_bars", "robot_bars", "errors", "events", "intervals"]
+WITHOUT_SPACE = ["errors", "robot_bars", "events", "intervals"]
 
 
 def test_no_trace_gives_no_figure():
@@ -163,22 +211,12 @@ def test_no_trace_gives_no_figure():
 
 
 def test_a_trace_that_ends_before_the_first_leg():
-    known = cut(park(), 8.0)
-    assert drawn([known]) == [*WITHOUT_SPACE[:1], "formation_before", *WITHOUT_SPACE[1:], "plan_view"]
+    assert drawn([cut(park(), 8.0)]) == ["plan_view", "formation", *WITHOUT_SPACE]
 
 
-def test_a_robot_less_span_is_left_out():
-    names = drawn([unknown(park(duration=23.0), np.s_[300:])])
-    assert "formation_before" in names
-    assert "formation_after" not in names
-    names = drawn([unknown(park(duration=23.0), np.s_[:1100])])
-    assert "formation_before" not in names
-    assert "formation_after" in names
-
-
-def test_one_case_of_two_that_is_unknown_after_the_leg():
-    names = drawn([park("a", duration=23.0), unknown(park("b", duration=23.0), np.s_[300:])])
-    assert "formation_after" in names
+def test_one_case_of_two_that_is_unknown():
+    names = drawn([park("a", duration=23.0), unknown(park("b", duration=23.0), np.s_[:])])
+    assert {"formation", "global_bars"} <= set(names)
 
 
 @pytest.mark.parametrize("samples", [2, 1])
@@ -186,7 +224,7 @@ def test_nothing_known_and_hardly_any_time(samples):
     known = cut(park(), 0.02 * (samples - 1))
     assert len(known.time) == samples
     assert "plan_view" in drawn([known])
-    assert drawn([unknown(known, np.s_[:])]) == (WITHOUT_SPACE if samples > 1 else WITHOUT_SPACE[2:])
+    assert drawn([unknown(known, np.s_[:])]) == [name for name in WITHOUT_SPACE if samples > 1 or name != "robot_bars"]
 
 
 def test_no_sample_gives_no_picture():

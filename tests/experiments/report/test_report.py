@@ -16,7 +16,7 @@ from experiments.metrics.statistics import spread
 from experiments.report import report
 from experiments.report.metrics_files import write_csv
 from experiments.report.page import date_of, inline, interval, number
-from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table
+from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table, whole_tables
 from experiments.report.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
 
@@ -89,7 +89,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
     )
     page = checked(path.read_text(encoding="utf-8"))
     assert path == tmp_path / "new" / "run" / "report.html"
-    assert page.ids.count("f1-figure_1") == page.ids.count("f8-figure_1") == 1
+    assert page.ids.count("f1-figure_1") == page.ids.count("f7-figure_1") == 1
     for words in (
         "Robotic Park: six robots hold a rigid formation behind a leader",
         "Nobody, Nowhere 2020",
@@ -98,7 +98,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
         "zenpark run <this> --seed 1",
         "TB01 leads and is left out of the means.",
         "Nothing was lost: 17\u202f",
-        "Figure 8.",
+        "Figure 7.",
         "all robots are ready",
         "ITAE",
     ):
@@ -135,12 +135,12 @@ def test_report_is_the_same_every_time(tmp_path, run):
     assert texts[0] == texts[1]
 
 
-def test_report_without_legs_leaves_out_the_figure_after_the_leg(tmp_path):
+def test_report_of_one_case_leaves_out_the_figure_of_ratios(tmp_path):
     page = checked(
         report.write(tmp_path, [crowd(3, duration=3.0)], text="[file]\nx = '<b>'").read_text(encoding="utf-8")
     )
-    assert "Figure 7." in page.words
-    assert "Figure 8." not in page.words
+    assert "Figure 6." in page.words
+    assert "Figure 7." not in page.words
     assert "x = '<b>'" in page.words
 
 
@@ -260,7 +260,7 @@ def test_without_a_command_nothing_is_kept(tmp_path):
 
 
 def test_what_acquired_means_is_named(broken):
-    for words in ("Acquired, mean over followers [s]", "Acquired by all followers [s]"):
+    for words in ("Acquired, mean over followers [s]", "Acquired by all followers [s] periodic from the start"):
         assert words in broken.words
 
 
@@ -383,6 +383,17 @@ def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
         row = next(csv.DictReader(file))
     assert (row["collisions"], row["impulse"], row["near_to"], row["near_arena_gap"]) == ("1", "0.017", "B", "")
     assert (float(row["shadow_bias_y"]), float(row["intervened_share"])) == (pytest.approx(0.012), 0.1)
+
+
+def test_tables_have_one_unit_and_no_rows_of_what_did_not_occur(run):
+    tables = {table.head[0]: [row.cells[0] for row in table.rows] for table in whole_tables([measure(e) for e in run])}
+    assert tables["Acquired by all followers [s]"] == ["from the start", "after 21 s"]
+    assert tables["Distances [cm]"][:2] == ["Worst link before 21 s", "Worst link at the end"]
+    assert not {"Collisions", "Share of all ticks [%]", "Delay of poses [ms]"} & set(tables)
+    assert not any("[" in row for rows in tables.values() for row in rows)
+    real = measure(dataclasses.replace(run[0], clock="real"))
+    tables = {table.head[0]: [row.cells[0] for row in table.rows] for table in whole_tables([real])}
+    assert tables["Delay of poses [ms]"] == ["mean", "longest"]
 
 
 def test_left_out_of_the_means(run):

@@ -102,7 +102,7 @@ def solids(axes):
 
 
 def test_in_space_obstacles_reach_from_bottom_to_top_as_far_as_is_shown(short):
-    axes = trajectories.formation_before([within(short, FULL)]).axes[0]
+    axes = trajectories.formation([within(short, FULL)]).axes[0]
     low, high = axes.get_zlim()
     assert low == 0.0
     assert len(solids(axes)) == 2 * 3 + 1  # sides and ends of what is closed, the fence; the lamp hangs above it all
@@ -113,21 +113,21 @@ def test_in_space_obstacles_reach_from_bottom_to_top_as_far_as_is_shown(short):
 
 
 def test_space_shows_the_arena_whole_unless_it_is_far_larger(short):
-    near = trajectories.formation_before([within(short, EMPTY)]).axes[0]
+    near = trajectories.formation([within(short, EMPTY)]).axes[0]
     assert near.get_xlim() == pytest.approx((-1.08 * 1.1, 1.08 * 1.1))
-    far = trajectories.formation_before([within(short, Arena(size=(30.0, 30.0, 3.0)))]).axes[0]
+    far = trajectories.formation([within(short, Arena(size=(30.0, 30.0, 3.0)))]).axes[0]
     assert np.ptp(far.get_xlim()) < 3.0
 
 
 def test_space_shows_every_obstacle(short):
     hall = Arena(size=(30.0, 30.0, 3.0), obstacles={"pillar": Obstacle(radius=0.2, at=(-4.0, 3.0))})
-    axes = trajectories.formation_before([within(short, hall)]).axes[0]
+    axes = trajectories.formation([within(short, hall)]).axes[0]
     assert axes.get_xlim()[0] < -4.2
     assert axes.get_ylim()[1] > 3.2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", [trajectories.formation_before, trajectories.formation_after, trajectories.plan_view])
+@pytest.mark.parametrize("draw", [trajectories.formation, trajectories.plan_view])
 def test_pictures_of_full_arenas_are_drawn(draw, short):
     figure = draw([within(short, FULL), within(short, EMPTY)])
     assert figure.get_figwidth() == 3.5
@@ -138,5 +138,5 @@ def test_pictures_of_full_arenas_are_drawn(draw, short):
 def test_robots_on_the_floor_stand_on_it(short):
     flat = dataclasses.replace(short, true_position=short.true_position * [1.0, 1.0, 0.0])
     for arena, top in ((EMPTY, 0.216), (FULL, 0.15 * 1.08 * 3.0)):
-        low, high = trajectories.formation_before([within(flat, arena)]).axes[0].get_zlim()
+        low, high = trajectories.formation([within(flat, arena)]).axes[0].get_zlim()
         assert (low, high) == pytest.approx((0.0, top))

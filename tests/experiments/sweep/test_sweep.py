@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -9,7 +10,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.metrics.measure import measure
-from experiments.metrics.statistics import student_95
+from experiments.metrics.statistics import spread, student_95
 from experiments.run import simulate
 from experiments.sweep import page as sweep_page
 from experiments.sweep import sweep as sweeps
@@ -223,6 +224,14 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     }
     assert typed(done.folder, AXIS, "seeds=3", as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
+
+
+def test_without_a_cell_within_the_levels_the_nearest_is_named(done):
+    far = [msgspec.structs.replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])}) if not row.reference else row
+           for k, row in enumerate(done.rows)]  # fmt: skip
+    (finding,) = sweep_page._fewest(far)
+    nearest = next(row for row in far if not row.reference)
+    assert finding.text.startswith(f"No cell has an IAE ratio of at most 1.05; the nearest: {nearest.label}: ")
 
 
 def test_the_page_says_who_needs_fewest_messages(done):
