@@ -17,11 +17,11 @@ from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.recording.cdr import Codec, Undecodable, codec
 from experiments.recording.clocks import Correction
 from experiments.recording.losses import STATUS_S, count_dropped, count_lost, counter_growth
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
+from experiments.recording.ros2.cdr import Codec, Undecodable, codec
 from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
 from experiments.recording.trace import (
     ROUNDING_S,

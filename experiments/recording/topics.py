@@ -1,7 +1,9 @@
 """Topics of a recording: each kind of message with its key on the network, its topic and its type in the file.
 
-The recorder subscribes by this table, the writer and the playback look topics up in it. Beside them stands
-`/<robot>/true_pose` (geometry_msgs/PoseStamped), the place of a robot in a type that every viewer draws.
+The recorder subscribes by this table, the writer and the playback look topics up in it. Beside them stand topics in
+types that every viewer draws: `/<robot>/true_pose` (geometry_msgs/PoseStamped), `/tf` (tf2_msgs/TFMessage, from the
+frame `map` to a frame of each robot's name) and `/scene` (visualization_msgs/MarkerArray: arena, obstacles, robots,
+links in the colours of their errors).
 
 Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
 the metadata record `zenpark` has case, seed, clock, and the code, versions and machine that made it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final, Literal, Self, cast
@@ -13,11 +14,13 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
-from agents.network.messages import Event, State
+from agents.network.messages import Event, State, Vector
 from experiments.definition.experiment import Experiment
 from experiments.recording import version
-from experiments.recording.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
 from experiments.recording.reader import RecordingError
+from experiments.recording.ros2 import viewers
+from experiments.recording.ros2.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
+from experiments.recording.ros2.viewers import Draw
 from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
@@ -41,6 +44,7 @@ class ChunkIndices:
     def __init__(self, folder: Path) -> None:
         """The file without a name is in `folder`, and gone with the process."""
         self._kept = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
+        self.end = 0  # [ns] latest log time in the chunks so far
 
     def stand_in(self, writer: Writer) -> None:
         """Takes the place of a new writer's list.
@@ -58,6 +62,7 @@ class ChunkIndices:
         Raises:
             OSError: If the disk takes no more.
         """
+        self.end = max(self.end, index.message_end_time)
         record = RecordBuilder()
         index.write(record)
         self._kept.write(record.end())  # type: ignore[no-untyped-call]
@@ -72,8 +77,13 @@ class ChunkIndices:
         self._kept.close()
 
 
-FRAME: Final = "park"
 DRAWN: Final = "/{robot}/true_pose"
+FRAMES: Final = "/tf"
+SCENE: Final = "/scene"
+FRAMES_S: Final = 0.04  # between two transforms of a robot [s]
+SCENE_S: Final = 0.2  # between two drawings of the scene [s]
+LATE_S: Final = 2.0  # a message that came later than so long after its stamp has a clock that is wrong [s]
+ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 
@@ -90,6 +100,8 @@ class Recording:
         seed: int,
         clock: Literal["real", "virtual"],
         started: float | None = None,
+        draw: Draw | None = None,
+        utc: Callable[[], float] | None = None,
     ) -> None:
         """Creates the file.
 
@@ -101,6 +113,8 @@ class Recording:
             seed: Seed of this run.
             clock: Which clock the stamps come from.
             started: UTC time of the common start [s], if it is known already; the event `start` says it as well.
+            draw: Draws the scene for viewers.
+            utc: Clock of the recorder [s]: nothing is logged later than it came. Without one, messages come in order.
 
         Raises:
             RecordingError: If the file exists or cannot be written.
@@ -110,12 +124,20 @@ class Recording:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._latest = 0  # [ns]
+        self._utc, self._draw = utc, draw
+        self._places: dict[str, Vector] = {}  # [m] of each robot, the last known
+        self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
+        self._scene_at = -inf  # [s, UTC]
         self._topics = {
             topic.message: (topic.recorded, _Written(topic.name, made.name, made.schema, made.encode))
             for topic in TOPICS
             for made in [codec(topic.recorded)]
         }
         self._drawn = _Written(DRAWN, POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
+        self._frames = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA, viewers.transform)
+        self._scene = _Written(
+            SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA, lambda drawn: viewers.markers(self._scene_at, drawn)
+        )
         self._over = ""  # why nothing more can be written
         try:
             self._file = _Unbuffered(path)
@@ -141,7 +163,7 @@ class Recording:
     def write(self, message: Message, received: float | None = None, size: int = 0) -> None:
         """Records a message. An event brings everything so far to the disk: events are few, and explain the rest.
 
-        With a state, its place goes to the viewers' topic if it is known: the truth of a twin, else as measured.
+        With a state, its place goes to the viewers' topics if it is known: the truth of a twin, else as measured.
 
         Args:
             message: As it was sent.
@@ -156,12 +178,30 @@ class Recording:
         if received is not None:
             entry = recorded(*msgspec.structs.astuple(message), received, size)
         logged = message.stamp if received is None else received
+        if self._utc is not None and received is None:
+            now = self._utc()
+            logged = min(now, max(now - LATE_S, logged))
         written = self._record(topic, message, entry, logged)
         if isinstance(message, State):
-            if written and (message.true_position or message.position) is not None:
-                self._record(self._drawn, message, message, logged)
+            if written:
+                self._show(message, logged)
         elif isinstance(message, Event):
             self.flush()
+
+    def _show(self, state: State, logged: float) -> None:
+        """Writes a state for viewers: pose, transform, and now and then the scene."""
+        place = state.position if state.true_position is None else state.true_position
+        if place is None:
+            return
+        self._record(self._drawn, state, state, logged)
+        self._places[state.robot] = place
+        if not -FRAMES_S < logged - self._framed.get(state.robot, -inf) < FRAMES_S - ROUNDING_S:
+            self._framed[state.robot] = logged
+            self._record(self._frames, state, state, logged)
+        if self._draw is not None and not -SCENE_S < logged - self._scene_at < SCENE_S - ROUNDING_S:
+            self._scene_at = logged
+            drawn = self._draw(logged, self._places)
+            self._record(self._scene, state, drawn, logged)
 
     def flush(self) -> None:
         """Brings everything so far to the disk.
@@ -200,7 +240,7 @@ class Recording:
         self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))
         self._writer.add_metadata(METADATA, about)
 
-    def _record(self, topic: _Written, message: Message, entry: msgspec.Struct, logged: float) -> bool:
+    def _record(self, topic: _Written, message: Message, entry: object, logged: float) -> bool:
         """Write a message; False if it could not be encoded."""
         try:
             data = topic.encode(entry)
@@ -209,7 +249,8 @@ class Recording:
             return False
         name = topic.name.format(robot=getattr(message, "robot", ""))
         channel = self._channels.get(name) or self._register(topic, name)
-        times = self._nanoseconds(logged), self._nanoseconds(message.stamp)
+        # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
+        times = max(self._index.end, self._nanoseconds(logged)), self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
         self._guarded(self._writer.add_message, channel, times[0], data, times[1], number)
         return True
@@ -253,7 +294,7 @@ class _Written:
 
 def _drawing() -> Callable[[State], bytes]:
     """Encoder from a state to the pose that a viewer draws."""
-    encode = pose_stamped(FRAME)
+    encode = pose_stamped(viewers.FRAME)
 
     def drawn(state: State) -> bytes:
         place = state.position if state.true_position is None else state.true_position

@@ -22,10 +22,10 @@ from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
-from experiments.recording.cdr import Undecodable, codec
 from experiments.recording.clocks import Correction
 from experiments.recording.playback import NotStarted, common_start
 from experiments.recording.reader import PAYLOAD, RecordingError, Records
+from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import JSON, METADATA, TOPICS, SentPose
 from experiments.recording.trace import ROUNDING_S
 

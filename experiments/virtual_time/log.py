@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +22,7 @@ from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.recording.topics import Message
 from experiments.recording.trace import (
     EPOCH,
     ROUNDING_S,
@@ -33,6 +36,7 @@ from experiments.recording.trace import (
     sent_in_run,
 )
 from experiments.recording.writer import Recording
+from experiments.scene import markers
 from experiments.virtual_time.network import CentreLog
 from experiments.virtual_time.simulation import OPTIONAL, Log
 
@@ -187,29 +191,27 @@ class Logbook:
             seed=self._seed,
             clock="virtual",
             started=EPOCH,
+            draw=markers.drawing(self._experiment),
         ) as recording:
-            for t, kind, source, text in self._events():
-                recording.write(messages.Event(EPOCH + t, kind, source, text))
-            assert self._sent.bytes is not None
-            sent = zip(self._sent.stamp.tolist(), self._poses(), self._sent.bytes.tolist(), strict=True)
-            pending = next(sent, None)
-            for t, states in self._states():
-                while pending is not None and pending[0] <= t + ROUNDING_S:
-                    _, pose, size = pending
-                    recording.write(pose, pose.stamp, size)
-                    pending = next(sent, None)
-                for state in states:
-                    recording.write(state)
-            if self._log.centre is not None and self._goals is not None:
-                for t, goal in goal_messages(self._log.centre, self._log.names, self._mine.start):
-                    recording.write(goal, EPOCH + t, len(messages.encode(goal, self._encoding)))
-                recording.write(centre_report(self._goals, self._log.names, self._experiment.duration_s))
-            for status in self._statuses():
-                recording.write(status)
-            for report in self._world():
-                recording.write(report)
-            for contact in self._contacts():
-                recording.write(contact)
+            for logged, message, size in heapq.merge(*self._messages(), key=itemgetter(0)):
+                if size is None:
+                    recording.write(message)
+                else:
+                    recording.write(message, logged, size)
+
+    def _messages(self) -> Iterator[Iterable[tuple[float, Message, int | None]]]:
+        """All messages, those of a kind in order of time: when each is logged [s, UTC], and its size if it was sent."""
+        assert self._sent.bytes is not None
+        yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
+        yield ((pose.stamp, pose, size) for pose, size in zip(self._poses(), self._sent.bytes.tolist(), strict=True))
+        yield ((state.stamp, state, None) for _, states in self._states() for state in states)
+        if self._log.centre is not None and self._goals is not None:
+            goals = goal_messages(self._log.centre, self._log.names, self._mine.start)
+            yield ((EPOCH + t, goal, len(messages.encode(goal, self._encoding))) for t, goal in goals)
+            report = centre_report(self._goals, self._log.names, self._experiment.duration_s)
+            yield [(report.stamp, report, None)]
+        for rare in (self._statuses(), self._world(), self._contacts()):
+            yield sorted(((each.stamp, each, None) for each in rare), key=itemgetter(0))
 
     @property
     def _encoding(self) -> messages.Encoding:

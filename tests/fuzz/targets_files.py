@@ -261,7 +261,7 @@ def forged() -> Iterator[Target]:
 
 def cdr() -> Iterator[Target]:
     """Every recorded struct: name and CDR with a zero byte between them; what is decoded can be encoded."""
-    from experiments.recording.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
+    from experiments.recording.ros2.cdr import Undecodable, Unencodable, codec  # noqa: PLC0415
     from experiments.recording.topics import SentGoal, SentPose  # noqa: PLC0415
 
     said = good("KH01")

@@ -29,6 +29,7 @@ from experiments.real_time.processes.joining import Launch, joined
 from experiments.recording.reader import RecordingError
 from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
+from experiments.scene import markers
 
 EXPLAINED: Final = (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError)
 POLL_S: Final = 0.02
@@ -183,7 +184,16 @@ def record(launch: RecorderLaunch) -> int:
     target, seed = Path(launch.target), experiment.seed
     with (
         joined(experiment, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
-        Recording(target, experiment, text, case=launch.name, seed=seed, clock="real") as recording,
+        Recording(
+            target,
+            experiment,
+            text,
+            case=launch.name,
+            seed=seed,
+            clock="real",
+            draw=markers.drawing(experiment),
+            utc=Clock().utc,
+        ) as recording,
     ):
         recorder = Recorder(joint.session, joint.keys, recording)
         joint.declared.append(recorder)

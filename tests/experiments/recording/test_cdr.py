@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agents.network.messages import Event, Pose, PoseReceipt, State, Status
-from experiments.recording.cdr import (
+from experiments.recording.ros2.cdr import (
     POSE_STAMPED,
     POSE_STAMPED_SCHEMA,
     Codec,

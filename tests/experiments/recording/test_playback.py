@@ -34,7 +34,7 @@ def test_a_run_is_read_back(path):
     playback = read(path)
     trace = playback.trace
     assert playback.complete
-    assert playback.messages == 1 + 4 + 22 * 2 + 11
+    assert playback.messages == 1 + 4 + 22 * 3 + 11
     assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
     assert trace.experiment == PAIR
     np.testing.assert_allclose(trace.time, np.arange(11) / 10, rtol=0, atol=1e-12)

@@ -66,7 +66,7 @@ def test_recovery_keeps_everything(path, tmp_path):
     write(path, *whole_run())
     path.write_bytes(path.read_bytes()[:-1])
     target = tmp_path / "whole.mcap"
-    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=False)
+    assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=False)
     with target.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "zenpark")
@@ -76,20 +76,21 @@ def test_recovery_keeps_everything(path, tmp_path):
         assert {channel.topic for channel in summary.channels.values()} == {
             "/events",
             *(f"/{robot}/{what}" for robot in ("TB01", "CF01") for what in ("state", "true_pose", "status")),
+            "/tf",
             "/TB01/pose",
         }
         assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
-        assert summary.statistics.message_count == 60
+        assert summary.statistics.message_count == 82
     with AnyReader([target]) as reader:
-        assert len(list(reader.messages())) == 60
+        assert len(list(reader.messages())) == 82
 
 
 def test_a_whole_file_needs_no_recovery(path, tmp_path, capsys):
     write(path, *whole_run())
     target = tmp_path / "whole.mcap"
-    assert recover(path, target) == Recovered(60, ("TB01", "CF01"), complete=True)
+    assert recover(path, target) == Recovered(82, ("TB01", "CF01"), complete=True)
     commands.recover(str(path), None)
-    assert capsys.readouterr().out == f"{path} is whole already: 60 messages of TB01, CF01\n"
+    assert capsys.readouterr().out == f"{path} is whole already: 82 messages of TB01, CF01\n"
     assert sorted(tmp_path.iterdir()) == [path]
 
 
@@ -98,7 +99,7 @@ def test_the_command_writes_beside_the_source(path, capsys):
     path.write_bytes(path.read_bytes()[:-1])
     commands.recover(str(path), None)
     target = path.with_name("run-recovered.mcap")
-    assert capsys.readouterr().out == f"{target}: 60 messages of TB01, CF01\n"
+    assert capsys.readouterr().out == f"{target}: 82 messages of TB01, CF01\n"
     assert read(target).complete
 
 
@@ -160,7 +161,7 @@ def test_a_file_cut_anywhere(path, tmp_path, recorded):
         found.append(survives(path, tmp_path / "target.mcap") or 0)
     assert found == sorted(found)
     assert found[0] == 0
-    assert found[-1] == 60
+    assert found[-1] == 82
 
 
 @settings(max_examples=60)

@@ -1,5 +1,6 @@
 """Others read a recording; nothing is written over, and a full disk or a mistake leaves a file that can be read."""
 
+import itertools
 import math
 import resource
 
@@ -10,10 +11,14 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from agents.network.messages import Event
+from bridges import ros2 as bridge
 from experiments.definition.experiment import Experiment
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, recover
+from experiments.recording.ros2 import viewers
 from experiments.recording.writer import Recording
+from experiments.scene import markers
 from tests.experiments.recordings import (
     DOCUMENT,
     PAIR,
@@ -51,7 +56,7 @@ def test_others_read_it(path):
     assert math.isnan(states[5].true_yaw)
     drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"]
     assert drawn[3][0] == round((START + 0.3) * 1e9)
-    assert (drawn[3][1].header.frame_id, drawn[3][1].pose.position.z) == ("park", 0.01)
+    assert (drawn[3][1].header.frame_id, drawn[3][1].pose.position.z) == ("map", 0.01)
     measured = [message for topic, _, message in seen if topic == "/CF01/true_pose"]
     assert measured[3].pose.position.x == -0.3
 
@@ -149,3 +154,59 @@ def test_a_disk_too_full_to_recover_onto(path, tmp_path):
     with pytest.raises(RecordingError, match=r"run\.mcap: cannot be written"):
         recover(big, path)
     assert not path.exists()
+
+
+def drawn_scene(path):
+    """The pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
+    clock = [START]
+    recording = Recording(
+        path, PAIR, case="only", seed=4, clock="real", draw=markers.drawing(PAIR), utc=lambda: clock[0]
+    )
+    with recording:
+        recording.write(Event(START + 5.0, "start", "conductor", "common start"))
+        for k in range(300):
+            clock[0] = START + 0.05 * k + 0.2
+            for robot, late in (("TB01", 0.0), ("CF01", 0.15)):
+                recording.write(state(robot, seq=k + 1, at=0.05 * k + 0.2 - late, x=0.01 * k))
+            if k % 20 == 7:
+                recording.write(Event(clock[0] - 0.5, "robot", "CF01", "said late"))
+
+
+def test_viewers_find_frames_and_a_scene_in_standard_types(path):
+    drawn_scene(path)
+    with AnyReader([path]) as reader:
+        types = {c.topic: c.msgtype for c in reader.connections}
+        seen = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+    assert (types["/tf"], types["/scene"]) == ("tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray")
+    frames = [message.transforms[0] for topic, message in seen if topic == "/tf"]
+    last = [each for each in frames if each.child_frame_id == "TB01"][-1]
+    assert last.header.frame_id == viewers.FRAME == bridge.FRAME
+    assert (last.transform.translation.x, last.transform.rotation.w) == (2.99, 1.0)
+    assert last.header.stamp.sec + 1e-9 * last.header.stamp.nanosec == pytest.approx(START + 15.15, abs=1e-6)
+    scenes = [message.markers for topic, message in seen if topic == "/scene"]
+    assert 60 <= len(scenes) <= 76, "five a second"
+    groups = {marker.ns: marker for marker in scenes[-1]}
+    assert {"arena", "robots", "names", "links"} <= groups.keys()
+    assert {m.header.frame_id for m in scenes[-1] if m.ns == "robots"} == {"TB01", "CF01"}
+    links = groups["links"]
+    assert (links.type, links.header.frame_id, len(links.colors)) == (5, "map", len(links.points))
+    assert links.points[0].x == pytest.approx(2.99, abs=0.05)
+
+    with path.open("rb") as file:
+        found = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/tf", "/scene"]))
+    assert len(found) == len(frames) + len(scenes)
+    assert [len(one.decoded_message.markers) for one in found if one.channel.topic == "/scene"] == [
+        len(each) for each in scenes
+    ]
+
+
+def test_chunks_are_in_order_of_time(path):
+    drawn_scene(path)
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+        events = [m for *_, m in make_reader(file).iter_messages(["/events"])]
+    assert len(chunks) > 10
+    for before, after in itertools.pairwise(chunks):
+        assert before.message_end_time <= after.message_start_time
+    assert events[0].log_time == round(START * 1e9), "logged when it came"
+    assert events[0].publish_time == round((START + 5.0) * 1e9)
