@@ -41,6 +41,29 @@ def test_the_command_line_knows_every_command_of_a_page(page):
             parse(words)
 
 
+def _leaves(command, path=()):
+    """Visible commands without commands of their own, by their words."""
+    below = getattr(command, "commands", {})
+    if not below:
+        yield path, command
+    for name, each in below.items():
+        if not each.hidden:
+            yield from _leaves(each, (*path, name))
+
+
+@pytest.mark.parametrize(
+    ("path", "command"), [pytest.param(*each, id=" ".join(each[0])) for each in _leaves(COMMAND_LINE)]
+)
+def test_the_help_of_every_command_ends_with_examples_that_it_takes(path, command):
+    lines = [line.strip() for line in (command.epilog or "").splitlines() if "./zenpark" in line]
+    assert lines
+    for line in lines:
+        words = shlex.split(line.partition(" > ")[0])
+        assert (words[0], tuple(words[1 : 1 + len(path)])) == ("./zenpark", path)
+        if "--help" not in words:
+            parse(words[1:])
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_experiments_of_a_page_are_sound(page):
     for text in BLOCK.findall(page.read_text("utf-8")):

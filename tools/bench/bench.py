@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, print_json
+from tools.commands.options import AsJson, example, print_json
 
 app: Final = typer.Typer()
 
@@ -24,7 +24,7 @@ BENCHMARKS: Final = {  # module, which has a function of the benchmark's name
 }
 
 
-@app.command()
+@app.command(epilog=example("bench", "bench process --json"))
 def bench(
     names: Annotated[
         list[str] | None,

@@ -10,7 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, AsJson, Bodies, Cases, File, Here, Lab, Out, Settings, check_bodies, print_json
+from tools.commands.options import (
+    As,
+    AsJson,
+    Bodies,
+    Cases,
+    File,
+    Here,
+    Lab,
+    Out,
+    Settings,
+    check_bodies,
+    example,
+    print_json,
+)
 
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
@@ -24,7 +37,7 @@ WIDEST: Final = 110  # columns of print
 CHECKED: Final = {"ok": "✓", "warn": "!", "bad": "✗", "unknown": "·"}
 
 
-@app.command()
+@app.command(epilog=example("check triangle.toml", "check triangle.toml --fix --plot triangle.svg"))
 def check(
     file: File,
     *,
@@ -92,7 +105,7 @@ def _draw(analysed: Mapping[str, Analysis], file: Path) -> None:
     print(f"\n{file}: target shape, links and expected ways")
 
 
-@app.command()
+@app.command(epilog=example("preflight lab.toml", "preflight lab.toml --hop --case event"))
 def preflight(
     file: File,
     *,
@@ -261,7 +274,7 @@ def _spared(spare: int | None, vital: int) -> str:
     return "-" if spare is None else f"{spare} of {spare + vital}"
 
 
-@app.command()
+@app.command(epilog=example("explain disturbance.hover_jitter", "explain safety"))
 def explain(
     key: Annotated[str, typer.Argument(help="such as disturbance.hover_jitter, trigger.threshold, safety")],
     as_json: AsJson = False,
@@ -295,7 +308,7 @@ def explain(
     return 0
 
 
-@app.command()
+@app.command(epilog=example("new triangle mine.toml", "new --hemisphere 40 swarm.toml"))
 def new(
     name: Annotated[
         str | None,
@@ -338,7 +351,7 @@ def new(
     print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
 
 
-@app.command(name="import")
+@app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
 def import_(
     file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
@@ -363,7 +376,7 @@ def import_(
             print(textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    "))
 
 
-@app.command(name="list")
+@app.command(name="list", epilog=example("list", "list --json"))
 def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
@@ -391,7 +404,7 @@ def list_(as_json: AsJson = False) -> None:
         print(f"{title}: {', '.join(registry.names(group))}")
 
 
-@app.command()
+@app.command(epilog=example("schema > zenpark.schema.json"))
 def schema() -> None:
     """Print the JSON schema of the experiment file."""
     import json

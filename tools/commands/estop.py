@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import CONNECT, AsJson, Lab, print_json, routers
+from tools.commands.options import CONNECT, AsJson, Lab, example, print_json, routers
 
 if TYPE_CHECKING:
     from experiments.real_time.conductor.orders import EmergencyStop
@@ -21,7 +21,7 @@ app: Final = typer.Typer()
 IDENTITY: Final = "operator"
 
 
-@app.command()
+@app.command(epilog=example("estop", "estop --connect @runs/first/network.txt"))
 def estop(
     *,
     connect: Annotated[
@@ -131,7 +131,7 @@ Words = Annotated[
 Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Where to look for runs. [runs]")]
 
 
-@app.command()
+@app.command(epilog=example("runs", "runs --past paper --json"))
 def runs(
     words: Words = None,
     *,
@@ -199,7 +199,7 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB")
 
 
-@app.command()
+@app.command(epilog=example("clean --older 30", "clean --older 30 --recordings --yes"))
 def clean(
     words: Words = None,
     *,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Lab, Settings, group, print_json
+from tools.commands.options import AsJson, File, Lab, Settings, example, group, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment, Host
@@ -71,7 +71,7 @@ class Row:
         return not any(cell.startswith(NO) for cell in self.cells)
 
 
-@app.command()
+@app.command(epilog=example("hosts watchdog ubuntu@192.168.0.31 --namespace tb3_0"))
 def watchdog(
     robot: Annotated[
         str | None, typer.Argument(metavar="[USER@ROBOT]", help="TurtleBot3 that ssh reaches; none: print the file.")
@@ -101,7 +101,7 @@ def watchdog(
         print(f"{robot}: {line}")
 
 
-@app.command()
+@app.command(epilog=example("hosts check lab.toml", "hosts check lab.toml --on lab2 --json"))
 def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None, as_json: AsJson = False) -> int:
     """Say whether each host can take part: version, clock, devices, certificates, router."""
     from experiments.definition import endpoints
@@ -125,7 +125,7 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None,
     return 0 if all(row.well for row in rows) else 1
 
 
-@app.command()
+@app.command(epilog=example("hosts install lab.toml"))
 def install(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
     """Put this zenpark on every host that has another or none, and in a lab the certificates of its robots."""
     from experiments.definition import endpoints

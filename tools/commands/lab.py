@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, group, print_json
+from tools.commands.options import AsJson, example, group, print_json
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
@@ -26,7 +26,7 @@ Hosts = Annotated[
 SOON_DAYS: Final = 14.0
 
 
-@app.command()
+@app.command(epilog=example("cert init lab robotic-park --host 192.168.0.10"))
 def init(
     folder: Folder,
     given: Annotated[
@@ -52,7 +52,7 @@ def init(
     )
 
 
-@app.command()
+@app.command(epilog=example("cert issue lab ana --role operator"))
 def issue(
     folder: Folder,
     names: Names,
@@ -72,7 +72,7 @@ def issue(
     _print(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
 
 
-@app.command()
+@app.command(epilog=example("cert renew lab", "cert renew lab router --host 192.168.0.10"))
 def renew(
     folder: Folder,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
@@ -89,7 +89,7 @@ def renew(
     _print(Path(folder), known, names or list(known.identities))
 
 
-@app.command()
+@app.command(epilog=example("cert revoke lab KH01"))
 def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
     """Take all rights from certificates that are lost or stolen, and make new ones."""
     from tools.commands.authority import revoke as made
@@ -103,7 +103,7 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
     )
 
 
-@app.command()
+@app.command(epilog=example("cert show lab"))
 def show(folder: Folder, as_json: AsJson = False) -> int:
     """Show the members of a lab and the ends of their certificates; exit code 1 if a certificate has ended."""
     from agents.network.lab import register

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, print_json, session
+from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
 
 if TYPE_CHECKING:
     import zenoh
@@ -117,7 +117,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
                 continue  # not of this project
 
 
-@app.command()
+@app.command(epilog=example("keys", "keys --connect tcp/192.168.0.10:7447 --json"))
 def keys(
     connect: Connect = None,
     as_json: AsJson = False,
@@ -165,7 +165,7 @@ def readable(payload: bytes, mime: str) -> str:
         return f"<{len(payload)} bytes, {printable(mime)}>"
 
 
-@app.command()
+@app.command(epilog=example("echo 'park/*/pose'", "echo park/world/report -n 1"))
 def echo(
     key: KeyExpression,
     *,
@@ -259,7 +259,7 @@ class Cadence:
         return rates
 
 
-@app.command()
+@app.command(epilog=example("hz 'park/*/state' --seconds 5"))
 def hz(
     key: KeyExpression,
     *,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, routers
+from tools.commands.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers
 from tools.commands.orders import world_app
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 
-@app.command()
+@app.command(epilog=example("agent triangle KH01"))
 def agent(
     file: File,
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="The robots of this process.")],
@@ -66,7 +66,7 @@ def station() -> int:
     return serve()
 
 
-@app.command()
+@app.command(epilog=example("router", "router lab.toml --lab lab --listen tls/192.168.0.10:7447"))
 def router(
     file: Annotated[
         str | None, typer.Argument(metavar="[FILE]", help="The experiment whose rights it enforces, in a lab.")
@@ -150,7 +150,7 @@ def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Pat
     return access_rights.rights(cases), reach.lab_folder(read.experiment, read.path, lab)
 
 
-@app.command()
+@app.command(epilog=example("centre architectures --case centralised"))
 def centre(
     file: File,
     *,
@@ -166,7 +166,7 @@ def centre(
     return serve(Launch(file=file, case=case, connect=connect or [], lifeline=lifeline, lab=lab))
 
 
-@world_app.command(name="serve")
+@world_app.command(name="serve", epilog=example("world serve obstacle-course"))
 def world(
     file: File,
     *,
@@ -185,7 +185,7 @@ def world(
     return serve(launch)
 
 
-@app.command()
+@app.command(epilog=example("twin crazyflie --count 2", "twin tello --faults '{\"loss\": 0.05}'"))
 def twin(
     kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
     *,
@@ -210,7 +210,10 @@ def twin(
     return by_hand(kind, count, faults=faults, device=device, tables=table or [], connect=endpoints, identity=identity)
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
+    epilog=example("bridge vicon --help", "bridge ros2 --help"),
+)
 def bridge(
     context: typer.Context,
     what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`zenpark bridge vicon --help` says more.")],

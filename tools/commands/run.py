@@ -26,6 +26,7 @@ from tools.commands.options import (
     Report,
     Settings,
     check_bodies,
+    example,
     print_json,
 )
 
@@ -41,7 +42,7 @@ STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
 FAILED: Final = 1  # and of one in which a robot did not do its part
 
 
-@app.command()
+@app.command(epilog=example("run robotic-park --virtual --seed 1", "run triangle --case event --tag paper"))
 def run(
     file: File,
     *,
@@ -342,7 +343,7 @@ def sound(read: Document, *, seeds: int, as_json: bool) -> bool:
     return well
 
 
-@app.command()
+@app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
 def report(
     runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
@@ -376,7 +377,7 @@ def report(
     return 0
 
 
-@app.command()
+@app.command(epilog=example("compare runs/first runs/second --json"))
 def compare(
     folders: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or folders full of them.")],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Write a page with figures as well.")] = None,
@@ -417,7 +418,7 @@ def _ratio(value: float | None, reference: float | None) -> str:
     return f" ({value / reference:.3g}×)" if value is not None and reference else ""
 
 
-@app.command()
+@app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
 def export(
     folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
     target: Annotated[
@@ -457,7 +458,7 @@ def export(
         print(f"{file}: {', '.join(found.traces)}")
 
 
-@app.command()
+@app.command(epilog=example("recover runs/first/event.mcap"))
 def recover(
     file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, print_json
+from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, example, print_json
 
 if TYPE_CHECKING:
     from experiments.sweep.optimise import TuningResult
@@ -22,7 +22,12 @@ app: Final = typer.Typer()
 INTERRUPTED: Final = 130  # exit code
 
 
-@app.command()
+@app.command(
+    epilog=example(
+        "sweep robotic-park trigger.threshold=0.002:0.05:log12 seeds=50",
+        "sweep triangle trigger.threshold=0.002:0.05 --optimize 'messages, iae<=1.01'",
+    )
+)
 def sweep(
     file: File,
     given: Annotated[

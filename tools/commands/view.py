@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
-from tools.commands.options import As, Connect, Lab, Realm, Seconds, routers
+from tools.commands.options import As, Connect, Lab, Realm, Seconds, example, routers
 
 if TYPE_CHECKING:
     import zenoh
@@ -35,7 +35,7 @@ class ViewError(RuntimeError):
     """A view that cannot be opened, with the remedy."""
 
 
-@app.command()
+@app.command(epilog=example("view", "view runs/first --open"))
 def view(
     run: Annotated[
         str | None, typer.Argument(metavar="[RUN]", help="Folder of a run. [the run that is up on this machine]")
@@ -74,7 +74,7 @@ def view(
     return 0
 
 
-@app.command()
+@app.command(epilog=example("top"))
 def top(
     *,
     connect: Connect = None,

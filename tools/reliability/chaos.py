@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Out, Settings, print_json
+from tools.commands.options import AsJson, File, Out, Settings, example, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
@@ -65,7 +65,7 @@ BODIES: Final = "world"
 SCRIPT: Final = "script.json"
 
 
-@app.command()
+@app.command(epilog=example("chaos triangle --faults 20 --seed 1", "chaos triangle --kinds kill,freeze"))
 def chaos(
     file: File,
     *,

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, Bodies, Case, Out, Settings, print_json
+from tools.commands.options import AsJson, Bodies, Case, Out, Settings, example, print_json
 
 app: Final = typer.Typer()
 
@@ -92,7 +92,7 @@ def text(count: int, duration_s: float) -> str:
     )
 
 
-@app.command()
+@app.command(epilog=example("soak --minutes 60 --robots 20", "soak triangle --minutes 10"))
 def soak(
     file: Annotated[
         str | None, typer.Argument(metavar="[FILE]", help="Experiment file. [robots that move for ever]")
