@@ -233,7 +233,7 @@ class ExternalBody:
         return found
 
     def _source_name(self, row: int) -> str:
-        return "`zenpark world serve` with this experiment" if self._addresses[row] == WORLD else "the simulator"
+        return "`./zenpark world serve` with this experiment" if self._addresses[row] == WORLD else "the simulator"
 
     def _velocity(self) -> Array:
         """Velocities (n, 3) [m/s]; a robot on wheels without positions stands some time after a halt."""

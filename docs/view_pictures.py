@@ -89,7 +89,7 @@ def _live(browser: object, target: Path, folder: Path) -> None:
 
 
 class _viewing:  # noqa: N801 - a context
-    """`zenpark view`, at an address."""
+    """`./zenpark view`, at an address."""
 
     def __init__(self, *arguments: str, folder: Path = ROOT) -> None:
         port = free_endpoint(preferred_port=0).rpartition(":")[2]

@@ -98,7 +98,7 @@ class Run:
         return figures.every(list(self.metrics.values()), traces, width) | figures.shadow_figures(traces, width)
 
     def summary(self) -> dict[str, Any]:
-        """The figures for scripts, as `zenpark run --json` prints them."""
+        """The figures for scripts, as `./zenpark run --json` prints them."""
         return metrics_files.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
 
 
@@ -160,7 +160,7 @@ def _refuse_too_much(experiment: Experiment, seeds: int) -> None:
     if samples > MOST_SAMPLES:
         message = f"a run in virtual time of {samples:.2g} samples; {MOST_SAMPLES:.0e} fit into memory"
         hint = (
-            "take fewer --seeds (`zenpark sweep` runs any number, cell by cell), a lower rates.state_hz or duration_s"
+            "take fewer --seeds (`./zenpark sweep` runs any number, cell by cell), a lower rates.state_hz or duration_s"
         )
         raise DocumentError([Problem("--seeds" if seeds > 1 else "duration_s", 0, 0, message, hint)])
 
@@ -176,7 +176,7 @@ def reopen(folder: Path) -> Run:
         RecordingError: If there is no recording, or one cannot be read.
     """
     if not folder.is_dir():
-        raise RecordingError(f"{folder}: is no folder of a run; `zenpark run` prints the folder that it makes")
+        raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
@@ -200,7 +200,7 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
         traces[played.trace.case] = played.trace
         made.append(played.started if played.trace.clock == "real" else file.stat().st_mtime)
         if not played.complete:
-            remarks.append(f"{case}: the recording was cut off; `zenpark recover {file}` mends it")
+            remarks.append(f"{case}: the recording was cut off; `./zenpark recover {file}` mends it")
     source = folder / SOURCE
     arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
     text = document.join_texts([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""

@@ -1,4 +1,4 @@
-"""Live table of the robots of a run, cut to the terminal: for the run's own process and for `zenpark top`.
+"""Live table of the robots of a run, cut to the terminal: for the run's own process and for `./zenpark top`.
 
 Rows that need attention come first; where rows do not fit, a line of totals stands for all of them. Columns drop from
 the right, names are never cut.

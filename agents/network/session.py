@@ -138,7 +138,7 @@ class Polled(Protocol[T_co]):
 def open_session(
     endpoints: Sequence[str],  # routers, best first; or members of a mesh
     *,
-    name: str,  # as `zenpark keys` shows it
+    name: str,  # as `./zenpark keys` shows it
     wait_s: float = 10.0,  # limit for an answer [s]
     stop: threading.Event | None = None,  # ends the wait when it is set
     lease_s: float = LEASE_S,  # see `agents.network.zenoh_config`
@@ -205,9 +205,9 @@ def _silence(endpoints: Sequence[str], identity: str) -> str:
     refused = (
         ""
         if folder is None
-        else f", or it refuses the certificate of {identity} (`zenpark cert show {folder}` says until when it is valid)"
+        else f", or it refuses the certificate of {identity} (`./zenpark cert show {folder}` says how long it is valid)"
     )
-    remedy = "`zenpark router` starts one, --connect names another"
+    remedy = "`./zenpark router` starts one, --connect names another"
     if topology.is_mesh(endpoints):
         remedy = "a mesh lasts as long as its run, --connect names another"
     elif folder is None:

@@ -49,7 +49,7 @@ def settings(
     *,
     connect: Sequence[str] = (),  # routers: a client uses the first that answers, a router is linked with each
     listen: Sequence[str] = (),  # loopback endpoints; a client needs none
-    name: str | None = None,  # shown by `zenpark keys`
+    name: str | None = None,  # shown by `./zenpark keys`
     lease_s: float = LEASE_S,  # silence after which the others consider this session dead [s]
     identity: str | None = None,  # name in the certificate, in a lab; `name` if left out
     rights: access_control.Rights | None = None,  # of all identities; a router of a lab needs them
@@ -92,7 +92,7 @@ def settings(
         "transport/unicast/accept_timeout": round(OPEN_S * 1000),
         "transport/shared_memory/enabled": False,
         "queries_default_timeout": round(ASK_S * 1000),
-        "adminspace/enabled": True,  # read-only; the source of `zenpark keys`
+        "adminspace/enabled": True,  # read-only; the source of `./zenpark keys`
     }
     if name is not None:
         made["metadata"] = {"name": name}
@@ -115,8 +115,8 @@ def _of_lab(
         known = lab.register(folder)
         if identity in known.identities and not known.identities[identity].hosts:
             raise lab.LabError(
-                f"{identity} has a certificate for clients only, but in a mesh all listen: `zenpark cert init` "
-                f"with the file of the mesh makes such, or `zenpark cert issue {folder} NAME --host ADDRESS`"
+                f"{identity} has a certificate for clients only, but in a mesh all listen: `./zenpark cert init` "
+                f"with the file of the mesh makes such, or `./zenpark cert issue {folder} NAME --host ADDRESS`"
             )
         settings["access_control"] = access_control.rules(rights, known)
         settings["low_pass_filter"] = access_control.sizes(rights)
@@ -149,7 +149,7 @@ def check_loopback(endpoint: str) -> None:
     if not loopback:
         raise EndpointError(
             f"will not listen on {endpoint}: any program there could command the robots. Make certificates with "
-            "`zenpark cert init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
+            "`./zenpark cert init LAB FILE`, then listen on tls/... with --lab LAB; or listen on "
             f"{DEFAULT_ENDPOINT} and let other machines in through an SSH tunnel (ssh -R 7447:127.0.0.1:7447 HOST)"
         )
 

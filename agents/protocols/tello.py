@@ -32,7 +32,9 @@ class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     silence_s: float = 1.0  # [s] without a state line after which the drone counts as lost; it comes at 10 Hz
     rc_hz: float = 20.0  # [1/s] stick positions sent
     low_battery: float = 0.10  # below this charge it does not take off, and lands
-    stick_speed: float = STICK_SPEED  # [m/s] at full deflection of the sticks; `zenpark preflight --sticks` measures it
+    stick_speed: float = (
+        STICK_SPEED  # [m/s] at full deflection of the sticks; `./zenpark preflight --sticks` measures it
+    )
     stick_test: bool = False  # after the take-off it flies the stick test instead of setpoints
     twin_stick_speed: float = STICK_SPEED  # for the twin only: [m/s] that its sticks really give
 

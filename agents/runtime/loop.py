@@ -192,7 +192,7 @@ class Runtime:
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._whose(taken)}: a robot of this name is on the network already; end it first "
-                "(`zenpark keys` shows who is there), or choose another router with --connect"
+                "(`./zenpark keys` shows who is there), or choose another router with --connect"
             ) from None
 
     def _whose(self, taken: NameTaken) -> str:

@@ -1,6 +1,6 @@
 """Watchdog of a TurtleBot3: a ROS 2 node that stops the robot when nobody commands it; it runs on the robot.
 
-turtlebot3_node drives on with the last cmd_vel for ever. This file is copied to the robot as it is (`zenpark hosts
+turtlebot3_node drives on with the last cmd_vel for ever. This file is copied to the robot as it is (`./zenpark hosts
 watchdog`), and needs Python 3.10 and the rclpy of ROS 2 Humble or later there, nothing of zenpark.
 
     python3 watchdog.py [--silence 0.5] [--topic cmd_vel] [--type auto|twist|stamped] [--ros-args -r __ns:=/tb3_0]

@@ -1,4 +1,4 @@
-"""`zenpark check`: findings on an experiment before anything moves.
+"""`./zenpark check`: findings on an experiment before anything moves.
 
 `experiments.file.document` reads the file; here each case is compared with theory (`theory`) and with an ideal run
 (`motion`).

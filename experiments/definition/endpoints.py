@@ -57,6 +57,6 @@ def read_endpoints(given: Iterable[str]) -> list[str]:
             found += Path(each[1:]).read_text("utf-8").split("\n")
         except (OSError, UnicodeDecodeError) as error:
             raise EndpointError(
-                f"{each[1:]}: cannot be read ({error}); `zenpark run` writes one, network.txt"
+                f"{each[1:]}: cannot be read ({error}); `./zenpark run` writes one, network.txt"
             ) from None
     return [each for each in found if each]

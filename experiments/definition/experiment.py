@@ -93,7 +93,7 @@ class Robot(Part, frozen=True):
         bool, Meta(description="whether it keeps clear of others where the experiment has an avoidance")
     ] = True
     standby: Annotated[
-        bool, Meta(description="not started and not waited for until `zenpark robot add` lets it join the run")
+        bool, Meta(description="not started and not waited for until `./zenpark robot add` lets it join the run")
     ] = False
 
 
@@ -314,7 +314,7 @@ class Network(Part, frozen=True):
     encoding: Annotated[Literal["json", "msgpack"], Meta(description="of the payloads")] = "json"
     lab: Annotated[
         str | None,
-        Meta(description="folder of certificates (`zenpark cert init`), beside this file; left out: loopback only"),
+        Meta(description="folder of certificates (`./zenpark cert init`), beside this file; left out: loopback only"),
     ] = None
 
 
@@ -335,7 +335,7 @@ class Host(Part, frozen=True):
         str, Meta(description="folder there for the certificates of its robots, in a lab; counts from the home folder")
     ] = "zenpark-lab"
     robots: Annotated[list[Name], Meta(description="robots there; those that no host names run here")] = []
-    tags: Annotated[list[Name], Meta(description="by which `zenpark hosts` chooses among hosts")] = []
+    tags: Annotated[list[Name], Meta(description="by which `./zenpark hosts` chooses among hosts")] = []
 
 
 class World(Part, frozen=True):

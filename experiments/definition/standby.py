@@ -1,4 +1,4 @@
-"""Reserves: robots on standby, which `zenpark robot add` lets join a run, and robots without an address."""
+"""Reserves: robots on standby, which `./zenpark robot add` lets join a run, and robots without an address."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def without_standby(experiment: Experiment) -> Experiment:
-    """Remove the robots on standby: no robot is added in virtual time, or before `zenpark robot add`."""
+    """Remove the robots on standby: no robot is added in virtual time, or before `./zenpark robot add`."""
     robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
     if len(robots) == len(experiment.robots):
         return experiment

@@ -87,7 +87,9 @@ def _entry(name: str) -> Path:
 def no_entry(name: str) -> Problem:
     """Problem of a name that is neither a file nor an entry."""
     hint = did_you_mean(name, index.names())
-    return Problem(name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (zenpark new copies one)")
+    return Problem(
+        name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (./zenpark new copies one)"
+    )
 
 
 def find_file(name: str | Path) -> Path:

@@ -87,7 +87,7 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
         yield Fault(("network", "addresses"), "`addresses` are where robots listen in a mesh", hint, on_key=True)
     if network.routers > 1 and network.connect is not None:
         message = "`routers` is the number that zenpark starts, and with `connect` it starts none"
-        hint = "leave routers out; link the routers that you start: zenpark router --connect OTHER"
+        hint = "leave routers out; link the routers that you start: ./zenpark router --connect OTHER"
         yield Fault(("network", "routers"), message, hint, on_key=True)
     if network.listen and len(network.listen) % network.routers:
         message = f"{network.routers} routers cannot share {len(network.listen)} endpoints"

@@ -1,7 +1,7 @@
 """Reference of the experiment file: each key with its text, unit, default, limits and an example.
 
-Read off the JSON schema, that is, off the fields of the structs, plug-ins included. `zenpark explain` and the reference
-pages print the same entries.
+Read off the JSON schema, that is, off the fields of the structs, plug-ins included. `./zenpark explain` and the
+reference pages print the same entries.
 """
 
 from __future__ import annotations

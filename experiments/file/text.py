@@ -12,7 +12,7 @@ import msgspec
 from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 
 LARGEST: Final = 4_000_000  # bytes; a hundred robots take ten thousand
-BEGIN: Final = "zenpark new copies an experiment to begin with"
+BEGIN: Final = "./zenpark new copies an experiment to begin with"
 _AT: Final = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 _REMEDIES: Final = (
     ("Invalid value", 'text stands in quotes, as in kind = "crazyflie"; numbers have a point, not a comma'),

@@ -37,7 +37,7 @@ A run of zenpark, {date}, with all that is needed to repeat it:
 
 does what was done, from {source} with what `run.json` says ({version}). From this archive:
 
-    zenpark run {name}
+    ./zenpark run {name}
 
 In virtual time the results are the same to the last bit, if code and versions are; zenpark says whether they are.
 
@@ -107,7 +107,7 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
             archive.extractall(into)  # names with .. or / at the front are made harmless by the library
         sums = (into / "SHA256SUMS").read_text("utf-8")
     except DAMAGED as error:
-        raise RecordingError(f"{bundle}: is no bundle of `zenpark export RUN --bundle`: {error}") from None
+        raise RecordingError(f"{bundle}: is no bundle of `./zenpark export RUN --bundle`: {error}") from None
     for line in sums.splitlines():
         wanted, _, name = line.partition("  ")
         file = into / name

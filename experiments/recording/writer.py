@@ -270,13 +270,13 @@ class Recording:
         """Writes. No writer survives an error or interrupt in the middle: the file then stays unfinished."""
         if self._over:
             raise RecordingError(self._over)
-        self._over = f"{self.path}: the recorder was interrupted while it wrote; run `zenpark recover` on the file"
+        self._over = f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
         try:
             write(*what)
         except OSError as error:
             self._over = (
                 f"{self.path}: cannot be written: {error.strerror}; what was recorded so far is kept: "
-                "make room, then run `zenpark recover` on it"
+                "make room, then run `./zenpark recover` on it"
             )
             raise RecordingError(self._over) from error
         self._over = ""

@@ -1,4 +1,4 @@
-"""The figures of a run as files and for scripts: metrics.csv, metrics.json, and what `zenpark run --json` prints."""
+"""The figures of a run as files and for scripts: metrics.csv, metrics.json, and what `./zenpark run --json` prints."""
 
 from __future__ import annotations
 

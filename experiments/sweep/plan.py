@@ -1,6 +1,6 @@
 """Plan of a sweep: axes and seeds of the command line, and the cells that they span.
 
-    zenpark sweep robotic-park trigger.threshold=0.002:0.05:log12 seeds=50
+    ./zenpark sweep robotic-park trigger.threshold=0.002:0.05:log12 seeds=50
 
 A cell is one case with one value of each parameter that the case has. A case without a parameter (a periodic trigger
 has no threshold) is one cell, however many values the others run through.

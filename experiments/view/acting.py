@@ -32,7 +32,7 @@ SLIDERS: Final = 6
 NOTE_S: Final = 8.0
 LEADERS: Final = 5  # most that are dragged
 HELD_S: Final = 1.5  # until the goal that a leader reports is the one that it was sent to
-LAST: Final = "Repeat it with `zenpark estop`, or cut the power."
+LAST: Final = "Repeat it with `./zenpark estop`, or cut the power."
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ def test_without_a_world_it_says_what_to_start(router: RouterProcess, monkeypatc
     with pytest.raises(BodyError) as caught:
         open_external(asked).open()
     assert str(caught.value) == (
-        "CF01: nothing is published on park/CF01/position: is `zenpark world serve` with this experiment running and "
+        "CF01: nothing is published on park/CF01/position: is `./zenpark world serve` with this experiment running and "
         f"connected to {router.endpoint}?"
     )
 

@@ -10,10 +10,10 @@ import typer.main
 
 from experiments.check.check import check
 from experiments.file import document
-from tests.docs.test_references import PAGES, ROOT
+from tests.docs.test_references import PAGES, ROOT, TOPS
 from tools.main import app
 
-COMMAND = re.compile(r"^ {4,}(?:\./)?zenpark (?P<words>[^#\n]*)", re.MULTILINE)
+COMMAND = re.compile(r"^ {4,}\./zenpark (?P<words>[^#\n]*)", re.MULTILINE)
 BLOCK = re.compile(r"^```toml\n(title = .*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = typer.main.get_command(app)
 
@@ -39,6 +39,15 @@ def test_the_command_line_knows_every_command_of_a_page(page):
         words = shlex.split(text)
         if words and "--help" not in words:
             parse(words)
+
+
+SOURCES = [path for top in (*TOPS, "docs") for path in (ROOT / top).rglob("*") if path.suffix in {".py", ".md"}]
+BARE = re.compile(rf"(?:^ +|`)zenpark (?:{'|'.join(COMMAND_LINE.commands)})\b.*", re.MULTILINE)
+
+
+def test_commands_are_written_as_they_can_be_copied():
+    texts = {path: path.read_text("utf-8") for path in [*SOURCES, ROOT / "README.md"]}
+    assert [f"{path}: {found[0]}" for path, text in texts.items() for found in BARE.finditer(text)] == []
 
 
 def _leaves(command, path=()):

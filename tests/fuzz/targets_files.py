@@ -230,7 +230,7 @@ def resealed(data: bytes) -> bytes:
 
 
 def recording_of(*, plain: bool) -> Iterator[Target]:
-    """A recording is read, analysed as `zenpark report` begins, and recovered."""
+    """A recording is read, analysed as `./zenpark report` begins, and recovered."""
     from experiments.recording import playback  # noqa: PLC0415
     from experiments.recording.reader import recover  # noqa: PLC0415
 

@@ -1,6 +1,6 @@
 """Nothing that arrives from outside escapes as a traceback: a few hundred spoilt inputs each, and those that once did.
 
-`zenpark test --all` tries a million; what it finds is added to the folder `once`.
+`./zenpark test --all` tries a million; what it finds is added to the folder `once`.
 """
 
 from __future__ import annotations

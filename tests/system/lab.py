@@ -151,7 +151,7 @@ class Started:
 
 
 class RobotProcess(Started):
-    """`zenpark agent`."""
+    """`./zenpark agent`."""
 
     def __init__(self, endpoint: str, file: str | Path, *names: str, lifeline: bool = False) -> None:
         more = ["--lifeline"] if lifeline else []
@@ -159,7 +159,7 @@ class RobotProcess(Started):
 
 
 class WorldProcess(Started):
-    """`zenpark world serve`, whose first line is `ready`."""
+    """`./zenpark world serve`, whose first line is `ready`."""
 
     patience_s = 40.0
 
@@ -170,7 +170,7 @@ class WorldProcess(Started):
 
 
 class Flight:
-    """`zenpark run` in a process of its own."""
+    """`./zenpark run` in a process of its own."""
 
     def __init__(self, folder: Path, file: str, *arguments: str) -> None:
         self.folder = folder

@@ -191,7 +191,7 @@ def test_robots_of_one_process_come_together(lab: Lab) -> None:
     watcher.until(lambda: "KH01" in watcher.status["CF01"].missing, "its neighbours know")
     assert lab.running("KH02", "CF01")
     reply = lab.change("add", "KH01")
-    assert "`zenpark robot restart KH01 KH02`" in reply.refused["KH01"], reply
+    assert "`./zenpark robot restart KH01 KH02`" in reply.refused["KH01"], reply
     assert "shares its process" in lab.change("replace", "KH02", body="twin").refused["KH02"]
     assert set(lab.change("restart", "KH01", "KH02").done) == {"KH01", "KH02"}
     watcher.until(lambda: watcher.status["KH01"].pid != pid and lab.running("KH01", "KH02"), "both run")

@@ -56,7 +56,7 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
     lab = tmp_path / "lab"
     authority.create(lab, {"router": "router", "operator": "operator", "recorder": "recorder", "KH01": "robot"})
     for arguments, said in (
-        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`zenpark cert issue {lab} KH02 CF01`"),
+        (("run", "triangle", "--lab", lab, "--out", tmp_path / "a"), f"`./zenpark cert issue {lab} KH02 CF01`"),
         (("run", "triangle", "--lab", tmp_path / "no", "--out", tmp_path / "b"), "zenpark cert init"),
         (("router", "--listen", "tls/0.0.0.0:0"), "zenpark cert init LAB FILE"),
         (("router", "--listen", "tcp/0.0.0.0:0"), "zenpark cert init LAB FILE"),

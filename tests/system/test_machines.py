@@ -230,7 +230,7 @@ def test_what_is_wrong_with_a_machine_is_told_with_a_remedy(lab: Machines, tmp_p
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(tmp_path / "run"), "--anyway")
     out, _ = flight.communicate(timeout=60)
     assert flight.returncode == 2
-    assert "lab1: there is no zenpark at 'nowhere/zenpark'; `zenpark hosts install FILE` puts it there" in out
+    assert "lab1: there is no zenpark at 'nowhere/zenpark'; `./zenpark hosts install FILE` puts it there" in out
     assert "lab2: it cannot be reached; is it on" in out
     assert "lab3: none of our keys lets us in; ssh-copy-id" in out
     assert "Traceback" not in out

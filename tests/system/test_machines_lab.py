@@ -87,10 +87,10 @@ def test_each_machine_gets_its_own_keys_and_all_fly_through_ssh(lab: Machines, t
     made = Laboratory(lab, tmp_path)
     code, out = made.zenpark("hosts", "check")
     assert code == 1, out
-    assert "lab1: has no certificates of KH01, CF01; `zenpark hosts install FILE`" in out
+    assert "lab1: has no certificates of KH01, CF01; `./zenpark hosts install FILE`" in out
     code, out = made.fly()
     assert code == 2, out
-    assert "lab2: has no certificates of KH02; `zenpark hosts install FILE`" in out
+    assert "lab2: has no certificates of KH02; `./zenpark hosts install FILE`" in out
     shutil.rmtree(made.out)
     with contextlib.suppress(FileNotFoundError):
         made.there["lab1"].mkdir(parents=True)
@@ -124,7 +124,7 @@ def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tm
     assert code == 2, out
     here = lab["desk"].address
     assert f"lab1: reaches the router at {here}, which stands in no router's certificate" in out
-    assert f"`zenpark cert renew {made.keys} router --host {here}`" in out
+    assert f"`./zenpark cert renew {made.keys} router --host {here}`" in out
     shutil.rmtree(made.out)
     authority.renew(made.keys, ["router"], hosts=[here])
     made.flew()
@@ -141,7 +141,7 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
         shutil.copy(foreign / name, made.there["lab2"])
     for code, out in (made.zenpark("hosts", "check"), made.fly()):
         assert code != 0
-        assert "lab1: the certificate of KH01 there has been revoked since; `zenpark hosts install FILE`" in out
+        assert "lab1: the certificate of KH01 there has been revoked since; `./zenpark hosts install FILE`" in out
         assert "lab1: the certificate of CF01 there has been renewed since" in out
         assert "lab2: its certificates are of another lab" in out
         assert "Traceback" not in out
@@ -152,7 +152,7 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
     until(lambda: register(made.keys), "a moment passes")
     code, out = made.zenpark("hosts", "install")
     assert code == 1
-    assert f"`zenpark cert renew {made.keys} KH02`" in out
+    assert f"`./zenpark cert renew {made.keys} KH02`" in out
     code, out = made.zenpark("hosts", "check")
     assert "the certificate of KH02" in out
 

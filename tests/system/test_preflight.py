@@ -1,4 +1,4 @@
-"""`zenpark preflight`: robots checked one by one, by the processes of a run."""
+"""`./zenpark preflight`: robots checked one by one, by the processes of a run."""
 
 from __future__ import annotations
 

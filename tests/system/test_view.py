@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.system, needs_chromium]
 
 
 class ViewProcess(Started):
-    """`zenpark view`."""
+    """`./zenpark view`."""
 
     def __init__(self, *arguments: object) -> None:
         self.port = int(free_endpoint(preferred_port=0).rpartition(":")[2])

@@ -293,7 +293,7 @@ def test_who_comes_and_goes(world: WorldProcess, desk: Desk) -> None:
     told = [event.text for event in desk.events if "CF01 gets commands" in event.text]
     assert told == [
         "CF01 gets commands, but is not in this world: start the world with the experiment that has it, or add it with "
-        "`zenpark world spawn CF01`"
+        "`./zenpark world spawn CF01`"
     ]
     assert desk.give("spawn", name="CF01").ok
     desk.until(lambda: desk.world and "CF01" in desk.world.robots, "it is back")

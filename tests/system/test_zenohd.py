@@ -1,4 +1,4 @@
-"""A router that is not ours, with the configuration that `zenpark router --print-config` prints, or with none.
+"""A router that is not ours, with the configuration that `./zenpark router --print-config` prints, or with none.
 
 `tests/system/zenohd.py` builds a zenohd; where there is none, these tests are skipped and say why.
 """

@@ -216,7 +216,7 @@ def test_no_router_is_explained(command):
     done = zenpark(*command, "--connect", endpoint)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
-        f"zenpark: no router answers at {endpoint}: `zenpark router` starts one, --connect names another; "
+        f"zenpark: no router answers at {endpoint}: `./zenpark router` starts one, --connect names another; "
         "in a lab it needs --lab\n"
     )
 

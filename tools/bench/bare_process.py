@@ -1,5 +1,6 @@
-"""A bare Zenoh process for `zenpark bench process`: `python -m tools.bench.bare_process NAME HZ NEIGHBOUR ... --connect
-E`.
+"""A bare Zenoh process for `./zenpark bench process`.
+
+    python -m tools.bench.bare_process NAME HZ NEIGHBOUR ... --connect E
 
 The least that a robot can do: a session with the settings of every robot, its own pose sent at the same rate, the poses
 of the same neighbours received, JSON encoded and decoded. No body, no law, no safety.

@@ -1,4 +1,4 @@
-"""`zenpark bench`: speed of this machine; each figure with a ratio to a baseline that was measured in the same run.
+"""`./zenpark bench`: speed of this machine; each figure with a ratio to a baseline that was measured in the same run.
 
 Machines are noisy and differ: a figure alone says little. CPU times are medians.
 """

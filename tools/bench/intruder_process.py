@@ -1,7 +1,7 @@
 """An intruder as a process: `python -m tools.bench.intruder_process KIND ENDPOINT IDENTITY KEY`, until
 SIGTERM.
 
-For `zenpark bench intruders`. At the end it prints its rate per second. It yields the processor to all other
+For `./zenpark bench intruders`. At the end it prints its rate per second. It yields the processor to all other
 processes: a real intruder has a machine of its own.
 """
 

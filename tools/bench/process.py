@@ -1,4 +1,4 @@
-"""`zenpark bench process`: CPU and memory of a robot's process, beside a bare Zenoh process with the same messages.
+"""`./zenpark bench process`: CPU and memory of a robot's process, beside a bare Zenoh process with the same messages.
 
 Each robot of the reference experiment has a bare process of its own name, which sends as many poses and receives those
 of the same neighbours, in the same seconds through the same router. The ratio of the CPU times of each pair holds on a

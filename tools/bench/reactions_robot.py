@@ -1,4 +1,4 @@
-"""A robot's process for `zenpark bench safety`: `python -m tools.bench.reactions_robot STAMPS FILE NAME ...`.
+"""A robot's process for `./zenpark bench safety`: `python -m tools.bench.reactions_robot STAMPS FILE NAME ...`.
 
 The usual robot process with the usual twin; the moment of the twin's motors-off is written down by the monotonic clock
 of the machine.

@@ -286,7 +286,7 @@ def explain(
     found = reference.matching(key)
     if not found:
         known = {".".join(entry.words): None for entry in reference.entries()}
-        hint = did_you_mean(key, known) or "`zenpark explain safety` shows the keys of a table"
+        hint = did_you_mean(key, known) or "`./zenpark explain safety` shows the keys of a table"
         print(f"zenpark: no key of the experiment file is named {key!r}; {hint}", file=sys.stderr)
         return 2
     if as_json:
@@ -312,7 +312,7 @@ def explain(
 def new(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="NAME", help="A ready-made experiment (`zenpark list`); TARGET behind a formation."),
+        typer.Argument(metavar="NAME", help="A ready-made experiment (`./zenpark list`); TARGET behind a formation."),
     ] = None,
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
     *,
@@ -339,16 +339,16 @@ def new(
     formations = [(what, str(size)) for what, size in asked.items() if size is not None]
     if not formations:
         if name is None:
-            raise typer.BadParameter("give a NAME (`zenpark list`), or a formation such as --hemisphere 40")
+            raise typer.BadParameter("give a NAME (`./zenpark list`), or a formation such as --hemisphere 40")
         path = catalogue.copy_entry(name, Path(target) if target else Path(f"{name}.toml"))
-        print(f"{path}: a copy of {name}; change it, then `zenpark check {path}` and `zenpark run {path}`")
+        print(f"{path}: a copy of {name}; change it, then `./zenpark check {path}` and `./zenpark run {path}`")
         return
     if len(formations) > 1 or target is not None:
         what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
         raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
     wanted = LayoutOptions(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
     path, made = generate(*formations[0], name, wanted, jumps)
-    print(f"{path}: {made.title}, {len(made.pairs)} links; `zenpark check {path}`, `zenpark run {path} --virtual`")
+    print(f"{path}: {made.title}, {len(made.pairs)} links; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
 
 
 @app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
@@ -369,7 +369,7 @@ def import_(
     if as_json:
         print_json({"file": path, "notes": notes})
         return
-    print(f"{path}: from {file}; `zenpark check {path}`, `zenpark run {path} --virtual`")
+    print(f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
     if notes:
         print("Not carried over, or not as it was:")
         for note in notes:
@@ -397,7 +397,7 @@ def list_(as_json: AsJson = False) -> None:
         print_json({"experiments": [{"name": name, "title": title} for name, title in catalogue.names()], **found})
         return
     width = max(len(name) for name, _ in catalogue.names())
-    print("Experiments (zenpark run NAME, zenpark new NAME):")
+    print("Experiments (./zenpark run NAME, ./zenpark new NAME):")
     for name, title in catalogue.names():
         print(f"  {name:<{width}}  {title}")
     for title, group in plugins.items():

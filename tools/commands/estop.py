@@ -1,4 +1,4 @@
-"""`zenpark estop`: cut the motors of every robot. `zenpark runs`, `clean`: the runs of this machine, up and past."""
+"""`estop`: cut the motors of every robot. `runs`, `clean`: the runs of this machine, up and past."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _stop_all(stops: Sequence[EmergencyStop], reason: str, *, as_json: bool) -> 
     where = "; ".join(f"in the realm '{stop.realm}' {stop.where}" for stop in stops if stop.failure is None)
     print(
         f"NOTHING WAS STOPPED: no robot is seen {where}. Name the router of the run: "
-        "--connect, which `zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
+        "--connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
         file=sys.stderr,
     )
     return 1

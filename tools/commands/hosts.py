@@ -1,4 +1,4 @@
-"""`zenpark hosts`: check whether the other machines of an experiment can take part, and install this zenpark there."""
+"""`./zenpark hosts`: check whether other machines of an experiment can take part, and install this zenpark there."""
 
 from __future__ import annotations
 
@@ -264,7 +264,9 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
         row.cells.append(f"{YES} {here}")
     else:
         row.cells.append(f"{NO} {there.hello.zenpark[: version.SHOWN]}, here {here}")
-        row.trouble.append(f"{there.name}: another zenpark is there; `zenpark hosts install FILE` puts this one there")
+        row.trouble.append(
+            f"{there.name}: another zenpark is there; `./zenpark hosts install FILE` puts this one there"
+        )
     row.cells.append(f"{YES} {there.hello.python}")
     clock = there.measure()
     vague = clock.uncertainty > VAGUE_S
@@ -302,9 +304,9 @@ def _mended(there: Station, router: Found, experiment: Experiment) -> str:
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
-        return f"ssh carries it, so look at the certificates: `zenpark cert show {there.lab}`"
+        return f"ssh carries it, so look at the certificates: `./zenpark cert show {there.lab}`"
     if experiment.network.connect is not None:
-        return "is it on (`zenpark router` starts one)? Else mend connect in [network]"
+        return "is it on (`./zenpark router` starts one)? Else mend connect in [network]"
     if experiment.network.listen is not None:
         return "mend address or listen in [network], or leave both out: then ssh carries it; is there a firewall here?"
     return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
@@ -323,7 +325,7 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
     row.cells.append(f"{mark} {len(holds.held)}, {left:.0f} days left" if not wrong else mark)
     row.trouble += [*wrong, *strays]
     if soon:
-        remedy = f"`zenpark cert renew {folder} {' '.join(there.host.robots)}`, then `zenpark hosts install FILE`"
+        remedy = f"`./zenpark cert renew {folder} {' '.join(there.host.robots)}`, then `./zenpark hosts install FILE`"
         row.trouble.append(f"{there.name}: its certificates end in {left:.0f} days; {remedy}")
     return not wrong
 

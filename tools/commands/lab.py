@@ -1,4 +1,4 @@
-"""`zenpark cert`: the certificates of a lab."""
+"""`./zenpark cert`: the certificates of a lab."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def init(
     _print(place, known, list(known.identities))
     typer.echo(
         f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
-        f" a router's ca.pem, lab.json and router.*\nNow: zenpark run FILE --lab {place}, or [network] lab in the file"
+        f" a router's ca.pem, lab.json, router.*\nNow: ./zenpark run FILE --lab {place}, or [network] lab in the file"
     )
 
 
@@ -96,9 +96,9 @@ def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
 
     _print(Path(folder), made(Path(folder), names, days=days), names)
     typer.echo(
-        "The old keys have no rights at a `zenpark router` that reads this lab.json: one that runs notices it in a "
+        "The old keys have no rights at a `./zenpark router` that reads this lab.json: one that runs notices it in a "
         "second; copy the file to routers elsewhere. Poses of their owners are not received any more: give them new "
-        "files. A zenohd notices nothing, and the old keys go on working: print its file again (zenpark router FILE "
+        "files. A zenohd notices nothing, and the old keys go on working: print its file again (./zenpark router FILE "
         "--lab LAB --print-config) and restart it"
     )
 

@@ -60,7 +60,7 @@ Connect = Annotated[
         help="A router; may be repeated. @FILE: those of a running run. [tcp/127.0.0.1:7447]",
     ),
 ]
-Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`zenpark cert init`).")]
+Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of a lab (`./zenpark cert init`).")]
 As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,

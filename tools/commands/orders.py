@@ -1,4 +1,4 @@
-"""Orders to the robots of a run or to those started by hand (`zenpark robot`), and to a world (`zenpark world`)."""
+"""Orders to the robots of a run or to those started by hand (`./zenpark robot`), and to a world (`./zenpark world`)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _give(
 
     receivers = robots or _alive(opened, keys)
     if not receivers:
-        return _refuse(f"no robot in the realm '{keys.realm}'; `zenpark keys` shows the members", as_json=as_json)
+        return _refuse(f"no robot in the realm '{keys.realm}'; `./zenpark keys` shows the members", as_json=as_json)
     at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
     replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
     done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
@@ -166,7 +166,7 @@ def stop(
     identity: As = "operator",
     as_json: AsJson = False,
 ) -> int:
-    """Cut the motors of robots: a drone falls. `zenpark estop` cuts those of all."""
+    """Cut the motors of robots: a drone falls. `./zenpark estop` cuts those of all."""
     from agents.network.keys import Keys
 
     with session("robot", connect, lab, identity, WAIT_S) as opened:

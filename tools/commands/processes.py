@@ -60,7 +60,7 @@ def agent(
 
 @app.command(hidden=True)
 def station() -> int:
-    """Answer the launcher of another machine; `zenpark run` starts it where robots of the experiment are."""
+    """Answer the launcher of another machine; `./zenpark run` starts it where robots of the experiment are."""
     from experiments.real_time.hosts.station import serve
 
     return serve()
@@ -95,7 +95,7 @@ def router(
     from agents.runtime.run_registry import own_entry, registered
 
     if file is None and lab is not None:
-        raise LabError(f"name the experiment too, from which the rights follow: zenpark router FILE --lab {lab}")
+        raise LabError(f"name the experiment too, from which the rights follow: ./zenpark router FILE --lab {lab}")
     rights, folder = (None, None) if file is None else _rights(file, lab, bodies)
     if folder is None:
         endpoints, linked, rights = listen or [DEFAULT_ENDPOINT], connect or [], None
@@ -216,7 +216,7 @@ def twin(
 )
 def bridge(
     context: typer.Context,
-    what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`zenpark bridge vicon --help` says more.")],
+    what: Annotated[str, typer.Argument(metavar="vicon|ros2", help="`./zenpark bridge vicon --help` says more.")],
 ) -> int:
     """Bring motion capture in (vicon), or show the robots to ROS 2 (ros2)."""
     from importlib import import_module

@@ -1,4 +1,4 @@
-"""Commands that run an experiment (`zenpark run`) and read its results (report, export, recover)."""
+"""Commands that run an experiment (`./zenpark run`) and read its results (report, export, recover)."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def run(
     report: Report = True,
     open_report: OpenReport = False,
     tag: Annotated[
-        list[str] | None, typer.Option("--tag", metavar="WORD", help="By which `zenpark runs --past` finds it again.")
+        list[str] | None, typer.Option("--tag", metavar="WORD", help="By which `./zenpark runs --past` finds it again.")
     ] = None,
     lab: Lab = None,
     identity: As = "operator",
@@ -123,7 +123,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
     chosen(read, options.cases)
     if not sound(read, seeds=origin.seeds, as_json=show.as_json and not origin.anyway) and not origin.anyway:
-        print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
+        print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, show.out)
     try:
@@ -196,7 +196,7 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
             _warn([f"{asked.file}: {each}" for each in provenance().differences(origin.made_by)])
         again = msgspec.structs.replace(
             origin,
-            command=f"zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
+            command=f"./zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
             virtual=origin.virtual or asked.virtual,
             tags=asked.tags,
             ended=None,
@@ -284,7 +284,7 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
             )
             runs = [read_back(folder, *flown)]
         except KeyboardInterrupt:
-            print(f"\nended at once; `zenpark report {folder}` shows what was recorded", file=sys.stderr)
+            print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
     return runs, emergency.words, STOPPED if emergency else 130 if interrupted.asked else 0
 
@@ -392,7 +392,9 @@ def compare(
     found = [run for folder in folders for run in past_runs([Path(folder)])]
     found = list({run.folder: run for run in found}.values())
     if len(found) < 2:
-        raise RecordingError(f"{', '.join(folders)}: {len(found)} runs there; name two or more (`zenpark runs --past`)")
+        raise RecordingError(
+            f"{', '.join(folders)}: {len(found)} runs there; name two or more (`./zenpark runs --past`)"
+        )
     first = found[0]
     differ = {run.folder: differences(first, run) for run in found[1:]}
     if as_json:
@@ -430,7 +432,7 @@ def export(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a run for MATLAB, its trajectories as one table, or all of it as a bundle that `zenpark run` repeats."""
+    """Write a run for MATLAB, its trajectories as one table, or all of it as a bundle that `./zenpark run` repeats."""
     from experiments.recording import bundle
     from experiments.report.export import ExportError, require_savemat, write_csv, write_mat
     from experiments.run import reopen
@@ -486,7 +488,7 @@ def recover(
 
 def _command(origin: RunOrigin, options: RunOptions) -> str:
     """The command that repeats the run."""
-    parts = ["zenpark", "run", origin.file, *(["--virtual"] if origin.virtual else [])]
+    parts = ["./zenpark", "run", origin.file, *(["--virtual"] if origin.virtual else [])]
     parts += [part for case in origin.cases for part in ("--case", case)]
     parts += [part for change in origin.changes for part in ("--set", f"'{change}'")]
     parts += ["--seeds", str(origin.seeds)] if origin.seeds > 1 else []

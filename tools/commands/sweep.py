@@ -1,4 +1,4 @@
-"""`zenpark sweep`: cases x values x seeds in virtual time, or a search for the best values."""
+"""`./zenpark sweep`: cases x values x seeds in virtual time, or a search for the best values."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def sweep(
 
     changes = settings or []
     if not sound(load(file, *changes), seeds=2, as_json=as_json and not anyway) and not anyway:
-        print("zenpark: not run; mend the file (`zenpark check` says more), or run it --anyway", file=sys.stderr)
+        print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimize is None:
@@ -87,7 +87,7 @@ def sweep(
     if report and found.rows:
         from experiments.sweep import page as pages  # matplotlib takes 0.6 s
 
-        words = ["zenpark", "sweep", file, *(given or [])]
+        words = ["./zenpark", "sweep", file, *(given or [])]
         words += [part for name in case or [] for part in ("--case", name)]
         words += [part for setting in changes for part in ("--set", setting)]
         page = pages.write(found, shlex.join([*words, *(["--optimize", optimize] if optimize else [])]))

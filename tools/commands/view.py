@@ -1,4 +1,4 @@
-"""`zenpark view`: a run in the browser, live or from its recording. `zenpark top`: its table in any terminal."""
+"""`./zenpark view`: a run in the browser, live or from its recording. `./zenpark top`: its table in any terminal."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
     up = [run for run in run_registry.runs() if run.what == "run" and run.alive]
     if not up:
         raise ViewError(
-            "no run is up on this machine: start one (`zenpark run robotic-park`), name its router (--connect), or "
+            "no run is up on this machine: start one (`./zenpark run robotic-park`), name its router (--connect), or "
             "the folder of a recording"
         )
     if len(up) > 1:

@@ -1,4 +1,4 @@
-"""`zenpark chaos`: draws a script of faults, runs it, and reports what did not hold."""
+"""`./zenpark chaos`: draws a script of faults, runs it, and reports what did not hold."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def chaos(
     with Interrupts() as interrupted:
         outcomes, ends = run(setting, rounds, interrupted=interrupted, say=say)
     result = ChaosResult(read.experiment.title, seed, rounds, outcomes, ends)
-    words = ["zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
+    words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
     if as_json:

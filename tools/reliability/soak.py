@@ -1,4 +1,4 @@
-"""`zenpark soak`: an experiment in real time for hours, and whether anything grows, is lost, slows down or dies.
+"""`./zenpark soak`: an experiment in real time for hours, and whether anything grows, is lost, slows down or dies.
 
 Sampled from outside, by a process that takes no part in the run: memory, threads, descriptors and CPU of each process,
 what the robots count, and how long their poses take. Everything is written down as it comes.
@@ -134,7 +134,7 @@ def soak(
         )
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)
-    words = ["zenpark", "soak", *([file] if file is not None else [])]
+    words = ["./zenpark", "soak", *([file] if file is not None else [])]
     page = soak_verdict.write(folder, soaked, findings, " ".join([*words, "--minutes", f"{minutes:g}"]))
     if as_json:
         found = [{"mark": finding.mark, "text": finding.text} for finding in findings]

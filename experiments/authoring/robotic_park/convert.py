@@ -1,4 +1,4 @@
-"""`zenpark import FILE.yaml`: experiment files of Robotic Park's authors become experiment files of zenpark.
+"""`./zenpark import FILE.yaml`: experiment files of Robotic Park's authors become experiment files of zenpark.
 
 What they say is carried over as far as zenpark has the same thing; the rest is listed, in the new file and on
 standard output. `docs/import.md` says what becomes of what.

@@ -1,1 +1,1 @@
-"""`zenpark run`: starts a case, walks its phases, changes robots, lands."""
+"""`./zenpark run`: starts a case, walks its phases, changes robots, lands."""

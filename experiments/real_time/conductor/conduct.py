@@ -234,7 +234,7 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
             mesh_file = f"--connect @{other.folder}/{mesh.ENDPOINTS}"
             stop = lab_options(other.endpoints[0]) if len(other.endpoints) == 1 else mesh_file
             what = f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}"
-            hint = f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `zenpark estop {stop}`"
+            hint = f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `./zenpark estop {stop}`"
             raise DocumentError([Problem(file, 0, 0, what, hint)])
         if same := sorted(me.robots.keys() & other.robots.keys()):
             notes.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")

@@ -323,7 +323,7 @@ class Conductor:
         if name in self._changes.under_way:
             return
         view.left_because = ""
-        joins = "" if view.reached("running") else f"; `zenpark robot add {name}` lets it join the run"
+        joins = "" if view.reached("running") else f"; `./zenpark robot add {name}` lets it join the run"
         self._view.report("back", name, f"alive again{joins}")
         if not self._processes.runs(name):
             self._processes.adopted.add(name)

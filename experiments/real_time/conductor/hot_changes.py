@@ -251,7 +251,7 @@ class HotChanges:
         asked = time.monotonic()
         by_hand = all(robots[name].alive and not processes.runs(name) for name in names)
         if order.order == "add" and any(robots[name].reached("airborne") and not robots[name].gone for name in names):
-            raise Refused("takes part already; `zenpark robot restart` starts it anew")
+            raise Refused("takes part already; `./zenpark robot restart` starts it anew")
         if by_hand and not any(robots[name].reached("airborne") for name in names):
             processes.adopted |= {*names}
             yield from self._join(names)
@@ -259,7 +259,7 @@ class HotChanges:
         if foreign := [name for name in names if name in processes.adopted or name in processes.away]:
             raise Refused(
                 f"{', '.join(foreign)} was not started from here: end its process and start it again where it runs, "
-                f"then `zenpark robot add {' '.join(foreign)}`"
+                f"then `./zenpark robot add {' '.join(foreign)}`"
             )
         self._require_whole(names)
         automatic = order.who == "on_loss"
@@ -338,7 +338,7 @@ class HotChanges:
         if others := [name for name in together if name not in names]:
             raise Refused(
                 f"{', '.join(names)} shares a process with {', '.join(others)}: name them all, "
-                f"`zenpark robot restart {' '.join(together)}`"
+                f"`./zenpark robot restart {' '.join(together)}`"
             )
 
     # ------------------------------------------------------------------ room

@@ -57,7 +57,7 @@ def send_world_order(
     """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
     asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
     reply, why = _read(asked, messages.WorldReply)
-    nobody = "no world answers: is `zenpark world serve` running in this realm?"
+    nobody = "no world answers: is `./zenpark world serve` running in this realm?"
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
 
@@ -68,7 +68,7 @@ def send_run_order(
     asked = session.get(keys.run_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
     reply, why = _read(asked, messages.RunReply)
     nobody = (
-        "no conductor answers: is `zenpark run` running in this realm, at this router (--connect), and is this an "
+        "no conductor answers: is `./zenpark run` running in this realm, at this router (--connect), and is this an "
         "operator (--as)?"
     )
     return reply or messages.RunReply(reason=why or nobody)

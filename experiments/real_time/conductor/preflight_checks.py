@@ -187,7 +187,7 @@ def _position(each: Observed, safety: Safety) -> Check:
     positions = each.positions()
     source = "motion capture" if each.robot.position == "external" else "its positioning system"
     if not len(positions):
-        return _bad("position", "none", f"does {source} see it where it stands? `zenpark echo 'park/*/position'`")
+        return _bad("position", "none", f"does {source} see it where it stands? `./zenpark echo 'park/*/position'`")
     spread = float(positions.std(axis=0).max())
     ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
     oldest = max(ages, default=0.0)

@@ -133,7 +133,7 @@ class NetworkView:
             network_file = f"--connect @{context.folder / mesh.ENDPOINTS}"
             options = lab.options(endpoints[0]) if len(endpoints) == 1 else network_file
             where = "a mesh" if topology.is_mesh(endpoints) else ", ".join(lab.bare(endpoints))
-            self.report("router", "conductor", f"{where}: look with `zenpark keys {options}`")
+            self.report("router", "conductor", f"{where}: look with `./zenpark keys {options}`")
         self._clock = pubsub.publisher(session, keys.clock, messages.JSON)
         self._experiment = pubsub.pose_publisher(session, keys.experiment, messages.JSON)
         self._experiment.put(document.case_document(experiment))

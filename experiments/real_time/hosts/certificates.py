@@ -1,7 +1,7 @@
 """A lab's certificates on other machines: what one holds, what is the matter with it, and what is to be done.
 
 A station says what its folder holds; only certificates leave it, which are public. Whoever starts the run compares
-them with the register of the lab. Private keys go one way, over ssh, with `zenpark hosts install`.
+them with the register of the lab. Private keys go one way, over ssh, with `./zenpark hosts install`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from experiments.definition.experiment import Host
 
-INSTALL: Final = "`zenpark hosts install FILE` puts the right ones there"
+INSTALL: Final = "`./zenpark hosts install FILE` puts the right ones there"
 SHOWN: Final = 12  # digits of a fingerprint, for people
 
 
@@ -93,9 +93,9 @@ def ended(folder: Path, names: Sequence[str]) -> Iterator[str]:
     known = register(folder).identities
     for name in names:
         if name not in known:
-            yield f"{name} is not in the lab {folder}; `zenpark cert issue {folder} {name}` adds it"
+            yield f"{name} is not in the lab {folder}; `./zenpark cert issue {folder} {name}` adds it"
         elif (until := datetime.fromisoformat(known[name].until)) < datetime.now(UTC):
-            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `zenpark cert renew {folder} {name}`"
+            yield f"the certificate of {name} ended at {until:%Y-%m-%d %H:%M}; `./zenpark cert renew {folder} {name}`"
         else:
             try:
                 files(folder, name)
@@ -137,7 +137,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
     known = register(folder).identities
     for each in found.held:
         if each.name not in known:
-            yield f"{each.name} is not in the lab {folder}; `zenpark cert issue {folder} {each.name}`, then {INSTALL}"
+            yield f"{each.name} is not in the lab {folder}; `./zenpark cert issue {folder} {each.name}`, then {INSTALL}"
             continue
         if each.wrong:
             yield f"{each.wrong}; {INSTALL}"
@@ -154,7 +154,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
         elif certificate.not_valid_after_utc < datetime.now(UTC):
             yield (
                 f"the certificate of {each.name} ended at {certificate.not_valid_after_utc:%Y-%m-%d %H:%M}; "
-                f"`zenpark cert renew {folder} {each.name}`, then {INSTALL}"
+                f"`./zenpark cert renew {folder} {each.name}`, then {INSTALL}"
             )
         elif not certificate.not_valid_before_utc.timestamp() < there < certificate.not_valid_after_utc.timestamp():
             now = datetime.fromtimestamp(there, UTC)
@@ -173,7 +173,7 @@ def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
         if reached not in named:
             yield (
                 f"reaches the router at {reached}, which stands in no router's certificate; "
-                f"`zenpark cert renew {folder} router --host {reached}` adds it"
+                f"`./zenpark cert renew {folder} router --host {reached}` adds it"
             )
 
 
@@ -181,7 +181,7 @@ def strays(found: Holding, host: str) -> Iterator[str]:
     """Keys that do not belong to a machine, with the remedy."""
     if found.others:
         keys = ", ".join(f"{name}.key" for name in found.others)
-        yield f"holds {keys}, which do not belong on {host}; `zenpark hosts install FILE` removes them"
+        yield f"holds {keys}, which do not belong on {host}; `./zenpark hosts install FILE` removes them"
 
 
 def _common_name(certificate: x509.Certificate) -> str:

@@ -1,6 +1,6 @@
 """The other machines of an experiment, reached through the system's `ssh` with the user's own configuration and keys.
 
-Each host has one connection to a `zenpark station`, which tells its version and its clock, and carries the hosts' way
+Each host has one connection to a `./zenpark station`, which tells its version and its clock, and carries the hosts' way
 to a router that listens on loopback only. Each robot's process has a connection of its own: what it prints, its exit
 code and its lifeline are those of the `ssh` here.
 """
@@ -309,5 +309,5 @@ class Hosts:
 
 def _other_version(station: Station) -> str:
     there, here = station.hello.zenpark[: version.SHOWN], version.digest()[: version.SHOWN]
-    remedy = "`zenpark hosts install FILE` puts this one there"
+    remedy = "`./zenpark hosts install FILE` puts this one there"
     return f"{station.name}: another zenpark is there ({there}, here {here}); {remedy}"

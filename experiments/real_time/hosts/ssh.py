@@ -39,13 +39,13 @@ _TROUBLE: Final = (
     (r"remote port forwarding failed", "its sshd forwards no ports",
      "allow it there (AllowTcpForwarding yes), or let the router listen where hosts find it: listen in [network]"),
     (r"no such command '(station|agent)'", "the zenpark there is too old for this one",
-     "`zenpark hosts install FILE` puts this one there"),
+     "`./zenpark hosts install FILE` puts this one there"),
     (r"permission denied$|cannot execute", "'{zenpark}' may not be started there",
-     "chmod +x {zenpark} there, or `zenpark hosts install FILE`"),
+     "chmod +x {zenpark} there, or `./zenpark hosts install FILE`"),
     (r"python3\W*: (no such|not found)|env: .*python3", "there is no Python there",
      "install one, 3.11 or newer (Debian, Ubuntu: apt install python3 python3-pip)"),
     (r"not found|no such file", "there is no zenpark at '{zenpark}'",
-     "`zenpark hosts install FILE` puts it there; or say where it is: zenpark = \"...\""),
+     "`./zenpark hosts install FILE` puts it there; or say where it is: zenpark = \"...\""),
 )  # fmt: skip
 
 

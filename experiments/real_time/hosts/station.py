@@ -1,8 +1,8 @@
 """Station of a host: answers the launcher's questions over ssh, and leaves no process of the run behind.
 
-`zenpark station`: questions come in on standard input, a line of JSON each, answers go out on standard output. Standard
-input is the lifeline as well. When it is lost, the station waits until the robots of its run are down and gone, and
-kills those that are late: a frozen process obeys nothing else.
+`./zenpark station`: questions come in on standard input, a line of JSON each, answers go out on standard output.
+Standard input is the lifeline as well. When it is lost, the station waits until the robots of its run are down and
+gone, and kills those that are late: a frozen process obeys nothing else.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ def by_hand(
     tables: Sequence[str] = (),
     identity: str = "twin",
 ) -> int:
-    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment: `zenpark twin`.
+    """Runs `count` protocol twins of a kind of robot, in a row on the floor, without an experiment: `./zenpark twin`.
 
     `faults` and the settings of the `device` are JSON. `connect` are routers for true poses, and for twins that are
     reached by Zenoh; may be none. `tables` are the setting of this name, `identity` is the name in the certificate, in

@@ -165,7 +165,7 @@ def with_truth(state: messages.State, truths: Sequence[messages.Position]) -> me
 
 
 class RecorderLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
-    """Records one case of an experiment, from its file as `zenpark run` resolved it."""
+    """Records one case of an experiment, from its file as `./zenpark run` resolved it."""
 
     target: Annotated[str, msgspec.Meta(description="the recording")]
     name: Annotated[str, msgspec.Meta(description="of the case, for the recording")] = ""

@@ -1,6 +1,6 @@
 """The process of robots: `python -m experiments.real_time.processes.robot FILE NAME ...`; light to start.
 
-`zenpark agent` is the same for people; launchers start this, which imports no typer.
+`./zenpark agent` is the same for people; launchers start this, which imports no typer.
 """
 
 from __future__ import annotations

@@ -217,7 +217,7 @@ def serve(launch: WorldLaunch) -> int:
     experiment, endpoints = launch.read()
     robots = experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
-        hint = 'give robots `body = "world"` (or start it all with `zenpark run FILE --bodies world`)'
+        hint = 'give robots `body = "world"` (or start it all with `./zenpark run FILE --bodies world`)'
         raise DocumentError([Problem(launch.file, 0, 0, "no robot of this experiment lives in a world", hint)])
     if launch.engine is not None:
         changed = msgspec.structs.replace(experiment.world, engine=launch.engine)

@@ -268,7 +268,7 @@ class Exchange:
                 "refused",
                 "world",
                 f"{name} gets commands, but is not in this world: start the world with the experiment that has "
-                f"it, or add it with `zenpark world spawn {name}`",
+                f"it, or add it with `./zenpark world spawn {name}`",
             )
 
     def _update_poses(self, t: float) -> None:

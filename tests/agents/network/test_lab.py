@@ -77,13 +77,13 @@ def test_a_router_of_a_lab_must_know_who_may_do_what(folder):
 
 
 def test_what_is_missing_is_named_with_its_remedy(folder, tmp_path):
-    with pytest.raises(LabError, match=r"CF09\.pem is missing: .*`zenpark cert issue .* CF09`"):
+    with pytest.raises(LabError, match=r"CF09\.pem is missing: .*`./zenpark cert issue .* CF09`"):
         files(folder, "CF09")
-    with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `zenpark cert issue .* CF08 CF09`"):
+    with pytest.raises(LabError, match=r"no certificates of CF08, CF09: `./zenpark cert issue .* CF08 CF09`"):
         require(folder, ["CF01", "CF08", "CF09"])
     with pytest.raises(EndpointError, match=r"CF09\.pem is missing"):
         config(settings("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF09"))
-    with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `zenpark cert init"):
+    with pytest.raises(LabError, match=r"is no lab, lab\.json is missing: `./zenpark cert init"):
         register(tmp_path)
     (tmp_path / lab.REGISTER).write_text("{")
     with pytest.raises(LabError, match="put it back"):

@@ -108,7 +108,7 @@ def test_free_endpoint_avoids_a_taken_port():
 
 def test_unreachable_names_endpoints_and_remedy():
     endpoint = free_endpoint(preferred_port=0)
-    with pytest.raises(Unreachable, match=rf"{endpoint}.*`zenpark router`"):
+    with pytest.raises(Unreachable, match=rf"{endpoint}.*`./zenpark router`"):
         open_session([endpoint], name="test", wait_s=0.0)
 
 

@@ -1,4 +1,4 @@
-"""`zenpark check`: the reference experiment, its neighbours, and experiments that cannot work, each with its code."""
+"""`./zenpark check`: the reference experiment, its neighbours, and experiments that cannot work, each with its code."""
 
 from __future__ import annotations
 

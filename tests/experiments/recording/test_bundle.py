@@ -49,7 +49,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_says_how_where_and_with_what_it_was_made(flown: Path) -> None:
     origin = run_folder.read_origin(flown / "run")
     assert origin is not None
-    assert origin.command.startswith(f"zenpark run {flown / 'short.toml'} --virtual --case event --set 'safety.margin")
+    assert origin.command.startswith(
+        f"./zenpark run {flown / 'short.toml'} --virtual --case event --set 'safety.margin"
+    )
     assert (origin.seeds, origin.cases, origin.tags) == (2, ["event"], ["demo"])
     assert origin.ended is not None
     assert origin.ended >= origin.begun
@@ -72,7 +74,7 @@ def test_a_bundle_repeats_its_run_to_the_last_bit(flown: Path, tmp_path: Path) -
     assert (tmp_path / "again" / "metrics.json").read_bytes() == (flown / "run" / "metrics.json").read_bytes()
     origin = run_folder.read_origin(tmp_path / "again")
     assert origin is not None
-    assert (origin.command, origin.file) == (f"zenpark run {flown / 'run.zip'}", "short.toml")
+    assert (origin.command, origin.file) == (f"./zenpark run {flown / 'run.zip'}", "short.toml")
 
 
 def test_the_same_run_makes_the_same_archive(flown: Path, tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert (table["reference"], table["seeds"], len(table["cells"])) == ("periodic", [1, 2, 3], 3)
     assert table["cells"][2]["ratio"]["iae"]["mean"] == done.rows[2].ratio["iae"].mean
     page = (done.folder / "sweep.html").read_text()
-    assert "zenpark sweep triangle trigger.threshold=0.005,0.02 seeds=3 --set duration_s=4.0" in page
+    assert "./zenpark sweep triangle trigger.threshold=0.005,0.02 seeds=3 --set duration_s=4.0" in page
     assert page.count("<svg") == 2
     assert {file.name for file in (done.folder / "figures").iterdir()} == {
         f"pareto_{index}.{kind}" for index in ("iae", "itae") for kind in ("svg", "pdf")

@@ -12,7 +12,7 @@ from tools.bench.encounters import ANGLES, Outcome, encounter, meet, random_pair
 pytestmark = pytest.mark.slow
 
 BARRIER = {"kind": "barrier", "hears": "all"}
-SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))  # `zenpark bench encounters` has them all
+SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))  # `./zenpark bench encounters` has them all
 FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
 
 

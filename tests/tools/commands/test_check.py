@@ -1,4 +1,4 @@
-"""`zenpark check`: exit codes, the nearest links that fit together, and a picture."""
+"""`./zenpark check`: exit codes, the nearest links that fit together, and a picture."""
 
 import re
 import tomllib

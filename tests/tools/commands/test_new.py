@@ -1,4 +1,4 @@
-"""`zenpark new` with a formation, and `zenpark import`, as they are typed."""
+"""`./zenpark new` with a formation, and `./zenpark import`, as they are typed."""
 
 import pytest
 from typer.testing import CliRunner

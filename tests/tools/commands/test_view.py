@@ -1,4 +1,4 @@
-"""`zenpark view` and `zenpark run --view`: what cannot be viewed is refused before anything starts."""
+"""`./zenpark view` and `./zenpark run --view`: what cannot be viewed is refused before anything starts."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_hardware_that_another_run_has_is_refused(
     (problem,) = caught.value.problems
     (name, body), *_ = mine.items()
     assert problem.message == f"{name} ({body}) is in another run, there, /runs/other, at tcp/127.0.0.1:7448"
-    assert problem.hint.endswith("or `zenpark estop --connect tcp/127.0.0.1:7448`")
+    assert problem.hint.endswith("or `./zenpark estop --connect tcp/127.0.0.1:7448`")
 
 
 def test_a_run_that_has_died_has_nothing() -> None:

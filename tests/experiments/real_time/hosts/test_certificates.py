@@ -52,13 +52,15 @@ def test_nothing_is_said_of_what_counts(lab, there):
 
 
 def test_each_fault_has_its_remedy(lab, there, tmp_path):
-    assert said(tmp_path / "nowhere", lab)[0].startswith("has no certificates of KH01, CF01; `zenpark hosts install")
+    assert said(tmp_path / "nowhere", lab)[0].startswith("has no certificates of KH01, CF01; `./zenpark hosts install")
     (there / "KH01.key").chmod(0o644)
-    assert said(there, lab)[0].startswith("others can read KH01.key; revoke it if somebody has; `zenpark hosts install")
+    assert said(there, lab)[0].startswith(
+        "others can read KH01.key; revoke it if somebody has; `./zenpark hosts install"
+    )
     (there / "KH01.key").unlink()
-    assert said(there, lab)[0].startswith("KH01.key is missing; `zenpark hosts install")
+    assert said(there, lab)[0].startswith("KH01.key is missing; `./zenpark hosts install")
     shutil.copy(lab / "CF01.key", there / "KH01.key")
-    assert said(there, lab)[0].startswith("KH01.key is not the key of KH01.pem; `zenpark hosts install")
+    assert said(there, lab)[0].startswith("KH01.key is not the key of KH01.pem; `./zenpark hosts install")
     shutil.copy(lab / "KH01.key", there)
     (there / "CF01.pem").write_text("nonsense")
     assert said(there, lab)[0].startswith("CF01.key is not the key of CF01.pem")
@@ -68,8 +70,8 @@ def test_what_no_longer_counts_is_told_apart(lab, there, tmp_path):
     authority.renew(lab, ["KH01"])
     authority.revoke(lab, ["CF01"])
     first, second = said(there, lab)
-    assert first.startswith("the certificate of KH01 there has been renewed since; `zenpark hosts install")
-    assert second.startswith("the certificate of CF01 there has been revoked since; `zenpark hosts install")
+    assert first.startswith("the certificate of KH01 there has been renewed since; `./zenpark hosts install")
+    assert second.startswith("the certificate of CF01 there has been revoked since; `./zenpark hosts install")
     before = fingerprint((lab / "ca.pem").read_text())
     authority.renew(lab, authority=True)
     now = fingerprint((lab / "ca.pem").read_text())
@@ -90,8 +92,8 @@ def test_what_has_ended_and_clocks_for_which_it_has(lab, there):
         shutil.copy(lab / f"KH01.{end}", there)
     (only,) = said(there, lab)
     assert only.startswith("the certificate of KH01 ended at ")
-    assert f"`zenpark cert renew {lab} KH01`, then `zenpark hosts install FILE`" in only
-    assert f"`zenpark cert renew {lab} KH01`" in next(ended(lab, ROBOTS))
+    assert f"`./zenpark cert renew {lab} KH01`, then `./zenpark hosts install FILE`" in only
+    assert f"`./zenpark cert renew {lab} KH01`" in next(ended(lab, ROBOTS))
     authority.renew(lab, ["KH01"])
     for end in ("pem", "key"):
         shutil.copy(lab / f"KH01.{end}", there)
@@ -102,7 +104,7 @@ def test_what_has_ended_and_clocks_for_which_it_has(lab, there):
 
 def test_who_is_not_in_the_lab_cannot_be_sent(lab, there):
     found = Holding(held(there, ROBOTS).authority, held(there, ["TB01"]).held)
-    assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `zenpark cert issue")
+    assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark cert issue")
     assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
     (lab / "CF01.key").unlink()
     assert "CF01.key is missing" in next(ended(lab, ["CF01"]))
@@ -113,13 +115,15 @@ def test_keys_of_others_do_not_belong_there(lab, there):
     for name in ("KH02.key", "ca.key"):
         shutil.copy(lab / name, there)
     (only,) = strays(held(there, ROBOTS), "lab1")
-    assert only.startswith("holds KH02.key, ca.key, which do not belong on lab1; `zenpark hosts install FILE` removes")
+    assert only.startswith(
+        "holds KH02.key, ca.key, which do not belong on lab1; `./zenpark hosts install FILE` removes"
+    )
 
 
 def test_a_router_is_believed_under_the_names_in_its_certificate(lab):
     assert list(unnamed(["tls/127.0.0.1:7447", "quic/localhost:1"], lab)) == []
     (only,) = unnamed(["tls/192.0.2.7:7447", "quic/192.0.2.7:7448"], lab)
-    assert f"`zenpark cert renew {lab} router --host 192.0.2.7`" in only
+    assert f"`./zenpark cert renew {lab} router --host 192.0.2.7`" in only
     authority.renew(lab, ["router"], hosts=["192.0.2.7"])
     assert list(unnamed(["tls/192.0.2.7:7447"], lab)) == []
 
