@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     import viser
 
 LABELS: Final = 24  # names of more robots are shown only where something is wrong, and of leaders
-LABEL_ROUNDS: Final = 3  # of more robots than that, labels move at every third round
+LABEL_ROUNDS: Final = (2, 3)  # names of few robots, and of more, move at each second and third round
+GOAL_ROUNDS: Final = 3
+TURNS: Final = 3  # digits of quaternions: a tenth of a degree, so that what stands is not drawn anew for its noise
 COARSE: Final = 5  # of more robots than that, trails have each fifth point
 SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
 TALL: Final = 1.2  # [m] walls and obstacles are drawn no higher
@@ -208,10 +210,19 @@ class SceneDrawing:
 
     # ------------------------------------------------------------------ what moves
 
-    def draw(self, moment: Moment, *, trails: bool = True, scans: Mapping[str, Ranges] | None = None) -> None:
-        """Draws a moment; `trails`: they have changed since the last one. `scans`: last range readings by robot."""
+    def draw(
+        self, moment: Moment, *, trails: bool = True, still: bool = False, scans: Mapping[str, Ranges] | None = None
+    ) -> None:
+        """Draws a moment.
+
+        Args:
+            moment: Of the case.
+            trails: Whether they have changed since the last one.
+            still: Nothing follows soon: what is else drawn at some rounds only is drawn now.
+            scans: Last range readings by robot.
+        """
         self._round += 1
-        self._draw_robots(moment)
+        self._draw_robots(moment, still=still)
         self._draw_links(moment)
         for handle, pose in zip(self._obstacles, moment.obstacles, strict=True):
             if not _same(handle, pose):
@@ -220,22 +231,23 @@ class SceneDrawing:
             self._draw_trails(moment)
         self._draw_margins(moment)
         self._draw_ranges(moment, scans or {})
-        if self._few or self._round % LABEL_ROUNDS == 1:
+        if still or self._round % LABEL_ROUNDS[not self._few] == 1:
             self._draw_labels(moment)
 
-    def _draw_robots(self, moment: Moment) -> None:
+    def _draw_robots(self, moment: Moment, *, still: bool) -> None:
         place, turned = appearance.shown(moment.position), appearance.orientation(moment)
         goals = appearance.shown(moment.goal)
         accents = appearance.accents(self.stage, moment)
         for kind in self._kinds:
             rows = kind.rows
             for part in kind.parts:
-                part.batched_positions, part.batched_wxyzs = place[rows], turned[rows]
+                _update(part, "batched_positions", place[rows])
+                _update(part, "batched_wxyzs", np.round(turned[rows], TURNS))
             _update(kind.parts[1], "batched_colors", accents[rows])
             _show(kind.ghosts, shown=self.shown.goals)
-            if self.shown.goals:
+            if self.shown.goals and (still or self._round % GOAL_ROUNDS == 1):  # goals are decided at 10 Hz
                 _update(kind.ghosts, "batched_positions", goals[rows])
-                kind.ghosts.batched_wxyzs = turned[rows]
+                _update(kind.ghosts, "batched_wxyzs", np.round(turned[rows], TURNS))
             if kind.shadows is not None and moment.shadow is not None:
                 kind.shadows.batched_positions = appearance.shown(moment.shadow[kind.shadow_rows])
                 if moment.shadow_yaw is not None:

@@ -130,7 +130,7 @@ class PacedView:
         assert self._drawing is not None
         moment = self._moment(instant)
         with self._server.atomic():
-            self._drawing.draw(moment)
+            self._drawing.draw(moment, still=not self.clock.playing)
         errors = self._tracker.of_robots(moment.error)
         history = self._panel.history
         if not history.time or instant.now - history.time[-1] >= PLOT_S:

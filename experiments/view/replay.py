@@ -250,12 +250,12 @@ class ReplayView:
         """Draws the present time, if it is not drawn already."""
         t = self.clock.t
         shown = tuple(vars(self._show.shown).values())
-        if (t, shown) == self._drawn:
+        if (t, shown, self.clock.playing) == self._drawn:
             return
-        self._drawn = (t, shown)
+        self._drawn = (t, shown, self.clock.playing)
         with self._server.atomic():
             for film, drawing in zip(self._films, self._drawings, strict=True):
-                drawing.draw(film.moment(min(t, film.tracks.end)))
+                drawing.draw(film.moment(min(t, film.tracks.end)), still=not self.clock.playing)
         now = time.monotonic()
         if not self.clock.playing or now - self._tabled >= TABLE_S:
             self._tabled = now
