@@ -41,7 +41,7 @@ experiments.report experiments.real_time.conductor
 experiments.run
 experiments.sweep experiments.view
 tools.live_table
-tools.progress
+tools.progress tools.completion
 tools.commands
 tools.reliability tools.bench
 tools.main

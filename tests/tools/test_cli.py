@@ -1,5 +1,7 @@
 import importlib
 import json
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -90,9 +92,7 @@ def test_every_command_has_help(command):
     assert said.stdout.startswith(f"Usage: zenpark {command} ")
 
 
-def loaded(*words):
-    """What a command prints, and the modules that it has imported when it ends."""
-    program = """
+LOADED = """
 import sys
 sys.argv[0] = "zenpark"
 from tools.guard import main
@@ -101,8 +101,17 @@ try:
 finally:
     print(*sys.modules, file=sys.stderr)
 """
+
+
+def loaded(*words, cwd=ROOT, **environment):
+    """What a command prints, and the modules that it has imported when it ends."""
     done = subprocess.run(
-        [sys.executable, "-c", program, *words], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-c", LOADED, *words],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return done.stdout, set(done.stderr.split())
 
@@ -266,3 +275,25 @@ def test_endpoints_come_from_the_file_of_a_run(tmp_path):
     assert (done.returncode, endpoint in done.stderr) == (2, True)
     done = zenpark("keys", "--connect", "@nowhere")
     assert (done.returncode, done.stderr[:30]) == (2, "zenpark: nowhere: cannot be re")
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("run tri", ["triangle"]),
+        ("run robotic-park --case pe", ["periodic"]),
+        ("run triangle --set dur", ["duration_s="]),
+        ("run triangle --set robots.KH01.ki", ["robots.KH01.kind="]),
+        ("agent triangle CF", ["CF01"]),
+        ("report runs/f", ["runs/first"]),
+        ("bench saf", ["safety"]),
+        ("new mix", ["mixed-reality"]),
+        ("robot ho", ["hold"]),
+    ],
+)
+def test_completion_is_right_and_light(typed, offered, tmp_path):
+    (tmp_path / "runs" / "first").mkdir(parents=True)
+    (tmp_path / "runs" / "first" / "run.json").write_text("{}")
+    said, modules = loaded(cwd=tmp_path, _ZENPARK_COMPLETE="complete_zsh", _TYPER_COMPLETE_ARGS=f"zenpark {typed}")
+    assert not {"numpy", "zenoh", "experiments.file.json_schema"} & modules
+    assert re.findall(r'"([^"]+?)(?:":".*?)?"', said) == offered

@@ -28,7 +28,9 @@ BENCHMARKS: Final = {  # module, which has a function of the benchmark's name
 def bench(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME...]", help=f"Of: {', '.join(BENCHMARKS)}. [all]"),
+        typer.Argument(
+            metavar="[NAME...]", help=f"Of: {', '.join(BENCHMARKS)}. [all]", autocompletion=lambda: list(BENCHMARKS)
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> int:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from experiments.catalogue import index
 from tools.commands.options import (
     As,
     AsJson,
@@ -312,7 +313,11 @@ def explain(
 def new(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="NAME", help="A ready-made experiment (`./zenpark list`); TARGET behind a formation."),
+        typer.Argument(
+            metavar="NAME",
+            help="A ready-made experiment (`./zenpark list`); TARGET behind a formation.",
+            autocompletion=index.names,
+        ),
     ] = None,
     target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
     *,

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
+from tools import completion
+
 if TYPE_CHECKING:
     import zenoh
 
@@ -51,7 +53,14 @@ def example(*lines: str) -> str:
     return "\b\n" + "\n".join([f"{title}:", *(f"  ./zenpark {line}" for line in lines)])
 
 
-File = Annotated[str, typer.Argument(metavar="FILE", help="Experiment file, or the name of a ready-made one.")]
+File = Annotated[
+    str,
+    typer.Argument(
+        metavar="FILE",
+        help="Experiment file, or the name of a ready-made one.",
+        autocompletion=completion.experiments,
+    ),
+]
 Connect = Annotated[
     list[str] | None,
     typer.Option(
@@ -64,14 +73,25 @@ Lab = Annotated[str | None, typer.Option(metavar="FOLDER", help="Certificates of
 As = Annotated[str, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab.")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="PATH=VALUE", help="Changes a value of the file; may be repeated."),
+    typer.Option(
+        "--set",
+        metavar="PATH=VALUE",
+        help="Changes a value of the file; may be repeated.",
+        autocompletion=completion.paths,
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 KeyExpression = Annotated[str, typer.Argument(metavar="KEY", help="Key expression, such as park/*/pose.")]
 Seconds = Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")]
 Realm = Annotated[str, typer.Option(metavar="NAME", help="First chunk of the keys.")]
-Case = Annotated[str | None, typer.Option(metavar="NAME", help="A case of the file. [the first]")]
-Cases = Annotated[list[str] | None, typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.")]
+Case = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="A case of the file. [the first]", autocompletion=completion.cases),
+]
+Cases = Annotated[
+    list[str] | None,
+    typer.Option("--case", metavar="NAME", help="Only this case; may be repeated.", autocompletion=completion.cases),
+]
 Lifeline = Annotated[bool, typer.Option("--lifeline", help="End when standard input ends or falls silent.")]
 Out = Annotated[str | None, typer.Option(metavar="FOLDER", help="Where the results go. [runs/...]")]
 Bodies = Annotated[

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from tools import completion
 from tools.commands.options import As, AsJson, Connect, Lab, Realm, example, group, print_json, session
 
 if TYPE_CHECKING:
@@ -21,8 +22,22 @@ robot_app: Final = group("Give orders to robots: those of a run that is under wa
 world_app: Final = group("Run a world by hand, and give orders to the one that is running.")
 
 Place = tuple[float, float]
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots.")]
-NamesOrAll = Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="Robots. [all]")]
+Names = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME...",
+        help="Robots.",
+        autocompletion=completion.robots,
+    ),
+]
+NamesOrAll = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[NAME...]",
+        help="Robots. [all]",
+        autocompletion=completion.robots,
+    ),
+]
 
 WAIT_S: Final = 2.0  # for a router
 # orders to the robots themselves, in a run or by hand; without names to all of them
@@ -179,7 +194,14 @@ for _what, _help in CHANGES.items():
 
 @robot_app.command(epilog=example("robot replace CF02 --with S1", "robot replace KH01 --body twin --at 0.5 -0.2"))
 def replace(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="A robot of the run.",
+            autocompletion=completion.robots,
+        ),
+    ],
     *,
     spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
     body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from tools import completion
 from tools.commands.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers
 from tools.commands.orders import world_app
 
@@ -23,7 +24,14 @@ app: Final = typer.Typer()
 @app.command(epilog=example("agent triangle KH01"))
 def agent(
     file: File,
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="The robots of this process.")],
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME...",
+            help="The robots of this process.",
+            autocompletion=completion.members,
+        ),
+    ],
     *,
     case: Case = None,
     connect: Connect = None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from tools import completion
 from tools.commands import view as viewing
 from tools.commands.options import (
     Anyway,
@@ -345,7 +346,14 @@ def sound(read: Document, *, seeds: int, as_json: bool) -> bool:
 
 @app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
 def report(
-    runs: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders of runs.",
+            autocompletion=completion.folders,
+        ),
+    ],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
     as_json: AsJson = False,
 ) -> int:
@@ -379,7 +387,12 @@ def report(
 
 @app.command(epilog=example("compare runs/first runs/second --json"))
 def compare(
-    folders: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or folders full of them.")],
+    folders: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...", help="Folders of runs, or folders full of them.", autocompletion=completion.folders
+        ),
+    ],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Write a page with figures as well.")] = None,
     as_json: AsJson = False,
 ) -> int:
@@ -422,7 +435,14 @@ def _ratio(value: float | None, reference: float | None) -> str:
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
 def export(
-    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    folder: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN",
+            help="Folder of a run.",
+            autocompletion=completion.folders,
+        ),
+    ],
     target: Annotated[
         str | None, typer.Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in the run's folder]")
     ] = None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
+from tools import completion
 from tools.commands.options import As, Connect, Lab, Realm, Seconds, example, routers
 
 if TYPE_CHECKING:
@@ -38,7 +39,12 @@ class ViewError(RuntimeError):
 @app.command(epilog=example("view", "view runs/first --open"))
 def view(
     run: Annotated[
-        str | None, typer.Argument(metavar="[RUN]", help="Folder of a run. [the run that is up on this machine]")
+        str | None,
+        typer.Argument(
+            metavar="[RUN]",
+            help="Folder of a run. [the run that is up on this machine]",
+            autocompletion=completion.folders,
+        ),
     ] = None,
     *,
     connect: Connect = None,
