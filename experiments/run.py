@@ -6,6 +6,7 @@ show(run.figures()["errors"], "figures/errors")     # the last line of a cell: s
 
 from __future__ import annotations
 
+import importlib
 import math
 import sys
 import time
@@ -77,7 +78,16 @@ def folder(default: str) -> Path:
 MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
-@dataclass(frozen=True)
+class Figures(dict[str, "Figure"]):
+    """Figures by name, which a notebook shows one below the other."""
+
+    def _repr_html_(self) -> str:
+        from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
+
+        return "".join(f"<p>{name}</p>{style.svg(figure)}" for name, figure in self.items())
+
+
+@dataclass(frozen=True, repr=False)
 class Run:
     """Results of a run."""
 
@@ -90,12 +100,41 @@ class Run:
     notes: tuple[str, ...] = ()  # robots lost, a damaged recording, a case that never began
     made: float = field(default_factory=time.time)  # [s] UTC
 
-    def figures(self, width: float = 3.5) -> dict[str, Figure]:
+    def figures(self, width: float = 3.5) -> Figures:
         """The figures of the report by name, `width` [in] wide: 3.5 for one column, 7.16 for a whole page."""
         from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
         traces = list(self.traces.values())
-        return figures.every(list(self.metrics.values()), traces, width) | figures.shadow_figures(traces, width)
+        drawn = figures.every(list(self.metrics.values()), traces, width)
+        return Figures(drawn | figures.shadow_figures(traces, width))
+
+    def __repr__(self) -> str:
+        where = f" in {self.folder}" if self.folder else ""
+        return f"<Run of {self.title!r}, seed {self.seed}, cases {', '.join(self.traces) or 'none'}{where}>"
+
+    def _repr_html_(self) -> str:
+        """Verdict and table of the report, at the end of a cell."""
+        from experiments.report import page, tables, verdict  # noqa: PLC0415 - for people alone
+
+        cases = list(self.metrics.values())
+        found = [*verdict.findings(cases), *(page.Finding("fair", note) for note in self.notes)] if cases else []
+        return page.fragment(self.title, found, [tables.summary_table(cases)] if cases else [])
+
+    def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars
+        """Metrics as a data frame of pandas, or of polars where only that is installed: a row per case and robot.
+
+        Columns are those of `metrics.csv`.
+
+        Raises:
+            ImportError: If neither is installed.
+        """
+        rows = list(metrics_files.rows(list(self.metrics.values())))
+        for library in ("pandas", "polars"):
+            try:
+                return importlib.import_module(library).DataFrame(rows)
+            except ModuleNotFoundError:
+                continue
+        raise ImportError("neither pandas nor polars is installed; `./zenpark install pandas` installs one of them")
 
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `./zenpark run --json` prints them."""
@@ -106,7 +145,9 @@ Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds i
 Watch = Callable[[str, Experiment], Callable[[simulation.Instant], object]]  # of a case
 
 
-def simulate(read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: Path | None = None) -> Run:
+def simulate(
+    read: Document, *, cases: Sequence[str] = (), seed: int | None = None, folder: str | Path | None = None
+) -> Run:
     """Runs an experiment in virtual time.
 
     Args:
@@ -127,7 +168,7 @@ def simulate_seeds(
     seeds: Sequence[int],
     *,
     cases: Sequence[str] = (),
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     progress: Progress = lambda *_: None,
     watch: Watch = lambda *_: lambda _: None,
 ) -> list[Run]:
@@ -136,6 +177,7 @@ def simulate_seeds(
     `progress` is called repeatedly. `watch` gives for each case what its simulation calls, see `simulation.simulate`.
     """
     _refuse_too_much(read.experiment, len(seeds))
+    folder = None if folder is None else Path(folder)
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = standby.without_standby(experiment)  # noqa: PLW2901
@@ -169,12 +211,13 @@ def _pass_progress(progress: Progress, case: str, duration_s: float, elapsed: fl
     progress(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
 
 
-def reopen(folder: Path) -> Run:
+def reopen(folder: str | Path) -> Run:
     """The run in a folder, read back from its recordings; without traces if no case had begun.
 
     Raises:
         RecordingError: If there is no recording, or one cannot be read.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
 from experiments.metrics.results import INDICES, Approach, CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
+
+_NESTED: Final = ("phases", "near", "near_arena", "shadow")
 
 
 def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[str, Any]:
@@ -40,25 +42,42 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
 
 def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
     """Rows per case and robot, and a row `mean` per case; empty where a value is unknown."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, _columns(cases), restval="")
+        table.writeheader()
+        for case in cases:
+            table.writerows(_robot_rows(case))
+            table.writerow({"seed": case.seed, "case": case.case, "robot": "mean", **case.mean})
+
+
+def rows(cases: Sequence[CaseMetrics]) -> Iterator[dict[str, object]]:
+    """A row per case and robot with all columns of `metrics.csv`; None where a value is unknown."""
+    columns = _columns(cases)
+    for case in cases:
+        for row in _robot_rows(case):
+            yield {column: row.get(column) for column in columns}
+
+
+def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     later = max((len(case.starts_s) for case in cases), default=1)
-    parts = ("phases", "near", "near_arena", "shadow")
-    plain = [field for field in RobotMetrics.__struct_fields__ if field not in parts]
     near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
     shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, ["seed", "case", "in_mean", *plain, *phases, *near, *shadows], restval="")
-        table.writeheader()
-        for case in cases:
-            out = {*case.leaders, *case.died}
-            for robot in case.robots:
-                row = {field: getattr(robot, field) for field in plain}
-                for k, phase in enumerate(robot.phases, start=2):
-                    row |= {f"phase{k}_{what}": getattr(phase, what) for what in ("acquired_s", "residual", "worst")}
-                row |= _flat_approach("near", robot.near) | _flat_approach("near_arena", robot.near_arena)
-                row |= _flat_shadow(robot.shadow) if shadows else {}
-                table.writerow({"seed": case.seed, "case": case.case, "in_mean": int(robot.robot not in out), **row})
-            table.writerow({"seed": case.seed, "case": case.case, "robot": "mean", **case.mean})
+    return ["seed", "case", "in_mean", *_PLAIN, *phases, *near, *shadows]
+
+
+_PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
+
+
+def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
+    out = {*case.leaders, *case.died}
+    for robot in case.robots:
+        row: dict[str, object] = {field: getattr(robot, field) for field in _PLAIN}
+        for k, phase in enumerate(robot.phases, start=2):
+            row |= {f"phase{k}_{what}": getattr(phase, what) for what in ("acquired_s", "residual", "worst")}
+        row |= _flat_approach("near", robot.near) | _flat_approach("near_arena", robot.near_arena)
+        row |= _flat_shadow(robot.shadow) if robot.shadow else {}
+        yield {"seed": case.seed, "case": case.case, "in_mean": int(robot.robot not in out), **row}
 
 
 def _flat_approach(what: str, near: Approach | None) -> dict[str, float | str]:

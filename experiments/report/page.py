@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -146,6 +147,25 @@ def render(
     )
     target.write_text(page, encoding="utf-8")
     return target
+
+
+MARKS: Final[dict[Mark, str]] = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
+
+
+def fragment(title: str, verdict: Sequence[Finding], tables: Sequence[Table]) -> str:
+    """Verdict and tables as HTML without a page around it, for the end of a notebook's cell."""
+
+    def cell(value: Cell) -> str:
+        return escape(value) if isinstance(value, str) else f"{escape(value[0])} <small>{escape(value[1])}</small>"
+
+    parts = [f"<b>{escape(title)}</b>"]
+    parts += [f"<div>{MARKS[finding.mark]} {escape(finding.text)}</div>" for finding in verdict]
+    for table in tables:
+        head = "".join(f"<th>{escape(each)}</th>" for each in table.head)
+        rows = "".join(f"<tr>{''.join(f'<td>{cell(each)}</td>' for each in row.cells)}</tr>" for row in table.rows)
+        parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>")
+        parts.append(f"<small>{escape(table.note)}</small>")
+    return "".join(parts)
 
 
 def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[PageFigure, ...]:

@@ -17,7 +17,7 @@ from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, rea
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
 from experiments.report import figures, scenery
-from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
+from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
     architecture_table,
@@ -62,6 +62,9 @@ ARCHITECTURE: Final = (
 NETWORK: Final = (
     "The effects that the file asks of the network, on top of the real network's own: dropped poses did arrive, and "
     "were discarded. Delays are from the stamp of a pose to its arrival, whatever caused them."
+)
+DIFFERENCES: Final = (
+    "Experiment file, options, seeds, code and versions. What follows is to be read with these in mind."
 )
 GAPS: Final = "Between two transmissions within the run; silence before the first and after the last is not counted."
 BELIEF: Final = "Distance of the last pose received on each link, carried on by the prediction, from the true one."
@@ -150,6 +153,20 @@ def write(
     )
 
 
+def labelled(runs: Sequence[tuple[str, Sequence[Trace]]]) -> list[CaseMetrics]:
+    """Metrics of all cases of several runs, by names that tell the runs apart."""
+    return [
+        msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
+        for name, (_, traces) in zip(_distinct([name for name, _ in runs]), runs, strict=True)
+        for trace in traces
+    ]
+
+
+def result_tables(cases: Sequence[CaseMetrics]) -> list[Table]:
+    """The tables of the section "Results", and those of each robot."""
+    return [summary_table(cases), *whole_tables(cases), *robot_tables(cases)]
+
+
 def compare(
     target: Path,
     runs: Sequence[tuple[str, Sequence[Trace]]],
@@ -157,6 +174,7 @@ def compare(
     title: str = "Comparison of runs",
     command: str = "",
     date: str = "",
+    differences: Sequence[tuple[str, str, Sequence[str]]] = (),
 ) -> Path:
     """Writes several runs side by side: a column for each case of each run, the first one as the reference.
 
@@ -167,16 +185,13 @@ def compare(
         title: Of the page.
         command: How to do it again.
         date: Now if left out.
+        differences: Name and folder of each run, and how its file, seeds and versions differ from the first one's;
+            shown before anything else.
 
     Raises:
         ValueError: If there is no trace, or one of less than two samples.
     """
-    names = _distinct([name for name, _ in runs])
-    cases = [
-        msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
-        for name, (_, traces) in zip(names, runs, strict=True)
-        for trace in traces
-    ]
+    names, cases = _distinct([name for name, _ in runs]), labelled(runs)
     if not cases:
         raise ValueError("there is no run to compare")
     drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
@@ -187,7 +202,13 @@ def compare(
         ("Reference", cases[0].case),
     ]
     experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
+    how = [
+        Row((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
+        for k, (name, folder, found) in enumerate(differences)
+    ]
+    differ = Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
     sections = [
+        *_tables("Differences", DIFFERENCES, [differ], folded=False),
         Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
         *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
@@ -204,9 +225,20 @@ def compare(
         source=source,
         facts=facts,
         command=command,
-        verdict=findings(cases),
+        verdict=[*_noted(differences), *findings(cases)],
         sections=sections,
     )
+
+
+def _noted(differences: Sequence[tuple[str, str, Sequence[str]]]) -> list[Finding]:
+    """Which runs differ from the first one, and in how much."""
+    found = []
+    for name, _, how in differences[1:]:
+        more = f" and {len(how) - 2} more" if len(how) > 2 else ""
+        same = "has the same file, seeds and versions as the reference"
+        text = f"{name} differs in {'; '.join(how[:2])}{more}." if how else f"{name} {same}."
+        found.append(Finding("fair" if how else "plain", text))
+    return found
 
 
 def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: bool = True) -> list[Section]:

@@ -355,25 +355,41 @@ def report(
         ),
     ],
     out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+    *,
+    label: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Of each run of a comparison, in order. [A, B, ...]")
+    ] = None,
+    width: Annotated[
+        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of the files in figures/: 3.5 or 7.16.")
+    ] = 3.5,
+    as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs) instead.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     as_json: AsJson = False,
 ) -> int:
     """Write the report of one run, or compare several."""
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
+    from experiments.report import typeset
     from experiments.run import reopen
 
-    read = [reopen(Path(folder)) for folder in runs]
+    labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
+    _refuse_labels(labels, runs)
+    read = [reopen(folder) for folder in runs]
     for folder, run in zip(runs, read, strict=True):
         if not run.traces:
             raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
+    named = [(name, list(run.traces.values())) for name, run in zip(labels, read, strict=True)]
+    if as_latex or as_markdown:
+        cases = pages.labelled(named) if len(read) > 1 else list(read[0].metrics.values())
+        print((typeset.latex if as_latex else typeset.markdown)(pages.result_tables(cases)))
+        return 0
     target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
     try:
         if len(read) == 1:
             _write_figures_of_merit(read, target)
-            page = _write_report(read, target)
+            page = _write_report(read, target, width)
         else:
-            named = [(Path(f).name, list(r.traces.values())) for f, r in zip(runs, read, strict=True)]
-            page = pages.compare(target, named)
+            page = pages.compare(target, named, differences=_differences(labels, runs))
     except OSError as error:
         raise RecordingError(
             f"{target}: cannot be written: {error.strerror}; choose another place with --out"
@@ -383,6 +399,25 @@ def report(
     else:
         print(page)
     return 0
+
+
+def _refuse_labels(labels: Sequence[str], runs: Sequence[str]) -> None:
+    """Raise DocumentError unless each run has a label."""
+    from experiments.file.problems import DocumentError, Problem
+
+    if len(labels) != len(runs):
+        message = f"{len(labels)} labels for {len(runs)} runs"
+        raise DocumentError([Problem("--label", 0, 0, message, "give one for each run, in their order")])
+
+
+def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:
+    """Label and folder of each run, and how it differs from the first one; of those that keep their file."""
+    from experiments.recording.run_folder import differences, past_runs
+
+    past = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
+    known = [(name, past[str(Path(folder))]) for name, folder in zip(labels, folders, strict=True)
+             if str(Path(folder)) in past]  # fmt: skip
+    return [(name, run.folder, differences(known[0][1], run)) for name, run in known]
 
 
 @app.command(epilog=example("compare runs/first runs/second --json"))
@@ -529,7 +564,7 @@ def _write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
     metrics_files.write_json(folder / "metrics.json", every)
 
 
-def _write_report(runs: Sequence[Run], folder: Path) -> Path:
+def _write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     """Write figures and report of a run into its folder; return the report."""
     from experiments.report import report as pages
     from experiments.report import style as figures
@@ -537,7 +572,7 @@ def _write_report(runs: Sequence[Run], folder: Path) -> Path:
 
     every = [case for each in runs for case in each.metrics.values()]
     traces = [trace for each in runs for trace in each.traces.values()]
-    for name, figure in runs[0].figures().items():
+    for name, figure in runs[0].figures(width).items():
         figures.save(figure, folder / "figures", name)
     return pages.write(
         folder,

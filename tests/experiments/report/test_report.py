@@ -189,6 +189,16 @@ def test_comparison_has_a_column_per_run_and_case(tmp_path, run):
         assert words in page.words
 
 
+def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
+    differ = [("A", "runs/a", []), ("B", "runs/b", ["duration_s 45 → 44", "seeds: 1 → 2", "x 1 → 2"])]
+    path = report.compare(tmp_path / "c.html", [("A", run[:1]), ("B", run[1:])], differences=differ)
+    html = path.read_text(encoding="utf-8")
+    said = checked(html).words.split("</style>")[-1]
+    assert "! B differs in duration_s 45 → 44; seeds: 1 → 2 and 1 more." in said
+    assert html.index('id="differences"') < html.index('id="results"')
+    assert "A runs/a the reference B runs/b duration_s 45 → 44; seeds: 1 → 2; x 1 → 2" in said
+
+
 def test_the_same_run_twice_is_two_columns(tmp_path, run):
     page = checked(report.compare(tmp_path / "c.html", [("a", run[:1]), ("a", run[:1]), ("a", run)]).read_text())
     for words in ("a, a (2), a (3)", "relative to a.", "a (3) · event"):
