@@ -77,6 +77,7 @@ EXPLAINED: Final = (
     ("experiments.sweep.workers", "SweepError"),
     ("experiments.real_time.conductor.support", "StandInError"),
     ("tools.commands.network", "KeyExpressionError"),
+    ("experiments.view.broadcast", "Occupied"),
     ("tools.commands.view", "ViewError"),
 )
 

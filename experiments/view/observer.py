@@ -190,8 +190,15 @@ class Observer:
     @property
     def elapsed(self) -> float | None:
         """Time since the common start [s]; None before it is known."""
-        starts = [r.status.started for r in self.robots.values() if r.status is not None and r.status.started > 0.0]
-        return self._clock.utc() - min(starts) if starts else None
+        started = [r.status.started for r in self.robots.values() if r.status is not None and r.status.started > 0.0]
+        return self.now() - min(started) if started else None
+
+    def now(self) -> float:
+        """Time [s, UTC] by the stamps of the statuses: that of a recording, where one is played."""
+        heard = max(self.robots.values(), key=lambda report: report.heard_at, default=None)
+        if heard is None or heard.status is None:
+            return self._clock.utc()
+        return heard.status.stamp + time.monotonic() - heard.heard_at
 
     def moment(self) -> Moment:
         """The case as it is now."""

@@ -1,10 +1,11 @@
-"""A run as it is watched from another shell: its table, attached to a router."""
+"""A run as it is watched from another shell: its table, attached to a router; its recording, played onto a network."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -13,8 +14,10 @@ import zenoh
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
+from experiments.file.document import load
+from experiments.run import simulate
 from tests.conftest import RouterProcess
-from tests.system.lab import Watcher, zenpark
+from tests.system.lab import Watcher, typed, zenpark
 from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
@@ -59,3 +62,32 @@ def test_top_shows_robots_of_a_router_the_worst_first(router: RouterProcess, wat
     assert first.split()[:2] == ["gamma", "held"]
     assert "50 %" in first
     assert [line.split()[0] for line in others[:2]] == ["alpha", "beta"]
+
+
+@pytest.mark.mechanism("recording played onto a network")
+def test_a_recording_is_played_with_keys_and_payloads_as_flown(
+    router: RouterProcess, watcher: Watcher, tmp_path: Path
+) -> None:
+    simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
+    seen: dict[str, list[bytes]] = {}
+
+    def keep(sample: zenoh.Sample) -> None:
+        seen.setdefault(str(sample.key_expr), []).append(sample.payload.to_bytes())
+
+    listening = watcher.session.declare_subscriber("park/**", keep)
+    done = zenpark("replay", tmp_path, "--rate", "8", "--connect", router.endpoint)
+    assert done.returncode == 0, done.stderr
+    sent = [messages.decode(each, messages.JSON, messages.Pose) for each in seen["park/CF01/pose"]]
+    assert [(p.seq, p.stamp, p.position) for p in sent] == [
+        (p.seq, p.stamp, tuple(p.position)) for p in typed(tmp_path / "event.mcap", "/CF01/pose")
+    ]
+    assert {"park/run/event", "park/run/experiment", "park/CF01/state", "park/CF01/status"} <= seen.keys()
+    for robot in ("park/KH01/state", "park/KH02/state"):
+        assert len(seen[robot]) == len(typed(tmp_path / "event.mcap", robot.removeprefix("park")))
+    seen.clear()
+    token = pubsub.alive_token(watcher.session, Keys().conductor)
+    refused = zenpark("replay", tmp_path, "--connect", router.endpoint)
+    assert (refused.returncode, seen) == (2, {})
+    assert "a run is up (park/run/conductor)" in refused.stderr
+    token.undeclare()  # type: ignore[no-untyped-call]
+    listening.undeclare()  # type: ignore[no-untyped-call]

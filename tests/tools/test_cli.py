@@ -54,6 +54,7 @@ def test_commands():
                 "import",
                 "view",
                 "top",
+                "replay",
                 "keys",
                 "echo",
                 "hz",

@@ -1,4 +1,4 @@
-"""`./zenpark view`: a run in the browser, live or from its recording. `./zenpark top`: its table in any terminal."""
+"""`./zenpark view`: a run in the browser, live or from its recording. `top`: its table; `replay`: its recording played."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from tools import completion
-from tools.commands.options import As, Connect, Lab, Realm, Seconds, example, routers
+from tools.commands.options import As, Case, Connect, Lab, Realm, Seconds, example, routers
 
 if TYPE_CHECKING:
     import zenoh
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from agents.runtime.run_registry import Run
     from experiments.run import Watch
     from experiments.view.acting import Watched
+    from experiments.view.replay import Clock
     from tools.live_table import Row
 
 app: Final = typer.Typer()
@@ -149,11 +150,10 @@ class _Top:
         )
 
     def _rows(self) -> list[Row]:
-        from agents.clock import Clock
         from agents.decision.lifecycle import Phase
         from agents.network.messages import EMERGENCY
 
-        observer, now, rows = self._observer, Clock().utc(), []
+        observer, now, rows = self._observer, self._observer.now(), []
         stage = observer.stage
         linked = {stage.names[row] for row in stage.links.receiver.tolist()}
         for name in [*stage.names, *sorted(observer.robots.keys() - {*stage.names})]:
@@ -179,6 +179,69 @@ class _Top:
         duration = None if stage.experiment is None else stage.experiment.duration_s
         title = heading(common_phase([row.phase for row in rows]), self._observer.elapsed, duration, title)
         return lines(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
+
+
+@app.command(epilog=example("replay runs/first", "replay runs/first --case event --rate 5 --loop"))
+def replay(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run, or a recording (.mcap).")],
+    *,
+    case: Case = None,
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as flown.")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begins again at the end.")] = False,
+    connect: Connect = None,
+    realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    lab: Lab = None,
+    identity: As = "operator",
+    seconds: Seconds = None,
+) -> None:
+    """Play a recording onto the network, for view, top, echo and other tools; in a terminal Enter pauses it."""
+    from agents.network.endpoints import DEFAULT_ENDPOINT
+    from agents.network.session import open_session
+    from agents.network.shutdown import held
+    from agents.runtime.command_line import on_termination
+    from experiments.view.broadcast import Broadcast
+    from experiments.view.replay import Clock
+
+    file = _recordings(Path(run), case)[0]
+    ended = threading.Event()
+    with on_termination(ended.set):
+        opened = open_session(routers(connect, lab) or [DEFAULT_ENDPOINT], name="replay", wait_s=5.0, identity=identity)
+        with held(opened) as (session, declared):
+            played = Broadcast(session, file, realm)
+            declared.append(played)
+            clock = Clock(0.0, played.end - played.begin)
+            clock.playing, clock.speed, clock.loop = True, rate, loop
+            if sys.stdin.isatty():
+                threading.Thread(target=_pause_on_enter, args=(clock,), daemon=True).start()
+            if seconds is not None:
+                threading.Timer(seconds, ended.set).start()
+            print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)
+            print(f"messages sent: {played.run(ended, clock)}")
+
+
+def _pause_on_enter(clock: Clock) -> None:
+    for _ in sys.stdin:
+        clock.playing = not clock.playing
+        print("plays" if clock.playing else f"paused at {clock.t:.1f} s", flush=True)
+
+
+def _recordings(folder: Path, case: str | None = None) -> list[Path]:
+    """Recordings of a run, the oldest first.
+
+    Raises:
+        RecordingError: If there is none, or none of that case.
+    """
+    from experiments.recording.reader import RecordingError
+
+    if folder.suffix == ".mcap":
+        return [folder]
+    files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
+    if not files:
+        raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
+    found = [file for file in files if case in (None, file.stem)]
+    if not found:
+        raise RecordingError(f"{folder}: no case '{case}'; there are: {', '.join(file.stem for file in files)}")
+    return found
 
 
 def require_viser() -> None:
@@ -242,19 +305,14 @@ def _of_run(run: Run, identity: str | None) -> Watched:
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
-    from experiments.recording.reader import RecordingError
     from experiments.scene import tracks
-    from experiments.view import live, replay
+    from experiments.view import live
+    from experiments.view import replay as replaying
 
-    if folder.suffix == ".mcap":
-        files = [folder]
-    else:
-        files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
-    if not files:
-        raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
-    films = [replay.Film(tracks.read(file)) for file in files]
+    files = _recordings(folder)
+    films = [replaying.Film(tracks.read(file)) for file in files]
     server = live.open_server(port, "zenpark", dark=dark)
-    page = replay.ReplayView(server, films, str(folder), dark=dark)
+    page = replaying.ReplayView(server, films, str(folder), dark=dark)
     _tell(server.get_port(), str(folder), open_page=open_page)
     try:
         page.run(ended.is_set)

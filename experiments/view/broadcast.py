@@ -1,0 +1,140 @@
+"""A recording played onto the network: keys and payloads as flown, for every tool that looks at a run."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import zenoh
+
+from agents.network import messages, pubsub
+from agents.network.keys import Keys
+from experiments.definition.experiment import Experiment
+from experiments.file import document
+from experiments.recording.reader import RecordingError, Records
+from experiments.recording.ros2.cdr import Codec, Undecodable, codec
+from experiments.recording.topics import JSON, TOPICS, Topic
+from experiments.view.replay import Clock
+
+STEP_S: Final = 0.01
+SEEN_S: Final = 1.0  # until the tokens of a run that is up have come
+ENCODED: Final = (
+    messages.State,
+    messages.Status,
+    messages.Pose,
+    messages.Goal,
+)  # the rest is JSON
+
+
+class Occupied(RuntimeError):
+    """A realm in which a run is up, into which nothing is played."""
+
+
+class Broadcast:
+    """The messages of one recording, in order of time, on the network."""
+
+    def __init__(self, session: zenoh.Session, path: Path, realm: str | None = None) -> None:
+        """Reads the recording.
+
+        Args:
+            session: Of this process.
+            path: The recording.
+            realm: First chunk of the keys; None: that of the run.
+
+        Raises:
+            RecordingError: If the file is no recording, or of another version.
+        """
+        records = Records(path)
+        made = {codec(topic.recorded).name: (topic, codec(topic.recorded)) for topic in TOPICS}
+        self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
+        self._known: dict[int, tuple[Topic, Codec[Any]]] = {}
+        for message in records.messages():
+            about = records.channels[message.channel]
+            kind = records.schemas[about.schema_id]
+            if kind.name in made:
+                topic, own = made[kind.name]
+                if kind.data.decode(errors="replace") != own.schema:
+                    raise RecordingError(f"{path}: {about.topic} is of another version; replay it with that version")
+                self._known[message.channel] = topic, own
+                self._sent.append((message.logged, message.channel, message.data))
+        self._sent.sort(key=lambda each: each[0])
+        attached = next((each.data for each in records.attachments if each.name == JSON), b"")
+        try:
+            self.experiment = msgspec.json.decode(attached, type=Experiment)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise RecordingError(f"{path}: holds no experiment that this version can read ({error})") from None
+        if not self._sent:
+            raise RecordingError(f"{path}: holds no message; there is nothing to replay")
+        self._session, self.keys = session, Keys(realm or self.experiment.network.realm)
+        self.begin, self.end = self._sent[0][0] * 1e-9, self._sent[-1][0] * 1e-9  # [s, UTC]
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[object] = []
+
+    def run(self, ended: threading.Event, clock: Clock) -> int:
+        """Plays; returns the number of messages that were sent.
+
+        Args:
+            ended: Ends it when set.
+            clock: From 0 to the length of the recording [s]; its speed, loop and pauses are followed.
+
+        Raises:
+            Occupied: If a run is up in the realm, before or while it plays.
+        """
+        keys, names = self.keys, {self.keys.alive(name) for name in self.experiment.robots}
+        watches = [pubsub.AliveWatch(self._session, key) for key in (keys.conductor, keys.alive("*"), keys.world_alive)]
+        self._declared += watches
+        until, strangers = time.monotonic() + SEEN_S, set[str]()
+        while time.monotonic() < until and not ended.wait(STEP_S):
+            strangers |= {token for watch in watches for token, there in watch.changes() if there}
+        if strangers:
+            raise Occupied(_occupied(keys, strangers))
+        announced = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
+        announced.put(document.case_document(self.experiment))
+        self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in sorted(names))]
+        count = at = 0
+        last, now = clock.t, time.monotonic()
+        while not ended.wait(STEP_S):
+            strangers = {t for watch in watches for t, there in watch.changes() if there and t not in names}
+            if strangers:
+                raise Occupied(_occupied(keys, strangers))
+            now, before = time.monotonic(), now
+            clock.advance(now - before)
+            if clock.t < last:
+                at = 0  # the loop begins again
+            last = clock.t
+            while at < len(self._sent) and self._sent[at][0] * 1e-9 - self.begin <= clock.t:
+                self._send(*self._sent[at][1:])
+                at, count = at + 1, count + 1
+            if at >= len(self._sent) and not clock.loop:
+                break
+        return count
+
+    def _send(self, channel: int, data: bytes) -> None:
+        topic, own = self._known[channel]
+        try:
+            entry = own.decode(data)
+        except Undecodable:
+            return
+        if topic.recorded is not topic.message:  # less what the recorder added
+            entry = topic.message(**{name: getattr(entry, name) for name in topic.message.__struct_fields__})
+        encoding: messages.Encoding = self.experiment.network.encoding if topic.message in ENCODED else "json"
+        key = topic.key(self.keys).replace("*", getattr(entry, "robot", ""))
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            mime, kept = messages.MIME[encoding], pubsub.EVENTS if topic.message is messages.Event else 1
+            publisher = self._publishers[key] = (
+                pubsub.pose_publisher(self._session, key, mime, kept)
+                if topic.repeated
+                else pubsub.publisher(self._session, key, mime)
+            )
+        publisher.put(messages.encode(entry, encoding))
+
+
+def _occupied(keys: Keys, tokens: set[str]) -> str:
+    return (
+        f"in the realm '{keys.realm}' a run is up ({', '.join(sorted(tokens)[:3])}): robots would take the recording "
+        "for their neighbours; name another realm (--realm replay), or wait for its end"
+    )
