@@ -5,6 +5,8 @@ visualization_msgs/MarkerArray: the scene is logged as rerun's own shapes, with 
 """
 
 import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -15,11 +17,14 @@ from mcap_ros2.decoder import DecoderFactory
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5  # types of visualization_msgs/Marker
 
 
-def rgb(colour) -> list[float]:
+EYE = rrb.EyeControls3D(position=(2.2, -2.9, 2.4), look_target=(0.0, 0.0, 0.3), eye_up=(0.0, 0.0, 1.0))
+
+
+def rgb(colour: Any) -> list[float]:  # noqa: ANN401 - of a decoder
     return [colour.r, colour.g, colour.b, colour.a]
 
 
-def line(marker, points) -> rr.LineStrips3D:
+def line(marker: Any, points: np.ndarray) -> rr.LineStrips3D:  # noqa: ANN401
     """Lines of a marker: one strip, or pairs of points."""
     strips = [points] if marker.type == LINE_STRIP else points.reshape(-1, 2, 3)
     colours = [rgb(each) for each in marker.colors[::2]] or [rgb(marker.color)]
@@ -28,14 +33,15 @@ def line(marker, points) -> rr.LineStrips3D:
 
 def main(file: str, save: str | None) -> None:
     rr.init("zenpark", spawn=save is None)
-    scene = rrb.Spatial3DView(origin="/", contents=["/arena/**"], name=file)
+    scene = rrb.Spatial3DView(origin="/", contents=["/arena/**"], name=file, eye_controls=EYE)
     blueprint = rrb.Blueprint(scene, rrb.TimePanel(timeline="time"), collapse_panels=True)
     if save is not None:
         rr.save(save, default_blueprint=blueprint)
     else:
         rr.send_blueprint(blueprint)
     rr.log("/arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    with open(file, "rb") as stream:
+    known: set[int] = set()
+    with Path(file).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         for _, channel, message, decoded in reader.iter_decoded_messages(["/tf", "/scene"]):
             rr.set_time("time", timestamp=1e-9 * message.log_time)
@@ -48,9 +54,13 @@ def main(file: str, save: str | None) -> None:
                     )
                 continue
             for marker in decoded.markers:
+                still = marker.ns in {"arena", "robots", "names"}  # never change, or move with their frames
+                if still and marker.id in known:
+                    continue
+                known.add(marker.id)
                 points = np.array([(p.x, p.y, p.z) for p in marker.points])
                 if marker.type in (LINE_LIST, LINE_STRIP):
-                    rr.log(f"/arena/{marker.ns}/{marker.id}", line(marker, points))
+                    rr.log(f"/arena/{marker.ns}/{marker.id}", line(marker, points), static=still)
                 elif marker.type == CYLINDER:
                     at, robot = marker.pose.position, marker.ns == "robots"
                     shape = rr.Ellipsoids3D if robot else rr.Cylinders3D
@@ -63,7 +73,7 @@ def main(file: str, save: str | None) -> None:
                                    centers=[[at.x, at.y, at.z]])
                     )  # fmt: skip
                     where = f"robots/{marker.header.frame_id}/body" if robot else f"{marker.ns}/{marker.id}"
-                    rr.log(f"/arena/{where}", made)
+                    rr.log(f"/arena/{where}", made, static=still)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`./zenpark view`: a run in the browser, live or from its recording. `top`: its table; `replay`: its recording played."""
+"""`./zenpark view`: a run in the browser, live or from its recording. `top`: its table. `replay`: its recording."""
 
 from __future__ import annotations
 
