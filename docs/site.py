@@ -94,6 +94,9 @@ def commands() -> Iterator[str]:
 
     yield "# Commands\n"
     yield "`./zenpark COMMAND --help` prints the same.\n"
+    yield "`./zenpark --install-completion` completes, in bash, commands, experiments, cases, robots, paths of `--set`"
+    yield "and folders of runs; in zsh and fish where a `zenpark` is on the PATH. `ZENPARK_CONNECT` is the default"
+    yield "of `--connect` (several routers with spaces between them).\n"
     yield from ("| exit code | meaning |", "|---|---|", "| 0 | done |", "| 1 | it ran, and something failed |")
     yield "| 2 | wrong input: the message names the place and the remedy |\n| 130 | ended by Ctrl-C |\n"
     yield from _command(typer.main.get_command(app), "./zenpark", 2)
