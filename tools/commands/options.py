@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
 PANELS: Final = {
     "Experiments": "new check explain run sweep report compare export list schema import recover clean",
-    "Watch": "view top runs keys echo hz",
+    "Watch": "view replay top runs keys echo hz",
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",
     "Lab": "preflight hosts cert",
