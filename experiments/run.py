@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -154,7 +155,7 @@ def simulate(
         read: The experiment.
         cases: Which of its cases; all if none is named.
         seed: Of the noise; the file's if left out.
-        folder: Where recordings go; None: none are made.
+        folder: Where recordings go, made if it does not exist; None: none are made.
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
@@ -178,6 +179,9 @@ def simulate_seeds(
     """
     _refuse_too_much(read.experiment, len(seeds))
     folder = None if folder is None else Path(folder)
+    if folder is not None:
+        with suppress(OSError):  # the recording says so
+            folder.mkdir(parents=True, exist_ok=True)
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = standby.without_standby(experiment)  # noqa: PLW2901

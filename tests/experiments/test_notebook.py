@@ -9,7 +9,7 @@ import pytest
 
 from experiments.metrics.measure import measure
 from experiments.recording.reader import RecordingError
-from experiments.run import Figures, Run, reopen
+from experiments.run import CHECKOUT, Figures, Run, reopen
 from tests.experiments.traces import crowd
 
 
@@ -49,3 +49,27 @@ def test_frames_are_of_the_library_that_is_there(run, monkeypatch, installed):
     rows = run.to_frame()
     assert [row["robot"] for row in rows] == list(next(iter(run.traces.values())).robots)
     assert {"seed", "case", "f_hz", "iae", "near_gap"} <= rows[0].keys()
+
+
+CELLS = (
+    "from experiments.file.document import load\nfrom experiments.run import reopen, simulate\n"
+    'run = simulate(load("triangle", "duration_s=2.0"), folder="kept")\nrun',
+    'run.figures()["errors"]',
+    "run.figures()",
+    'reopen("kept")',
+)
+
+
+@pytest.mark.system
+@pytest.mark.timeout(200)
+def test_jupyter_shows_a_run_its_figures_and_the_run_read_back(tmp_path, monkeypatch):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
+    nbclient.NotebookClient(book, timeout=150, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [cell.outputs[-1].data for cell in book.cells]
+    assert "<table>" in shown[0]["text/html"]
+    assert "<svg" in shown[1]["image/svg+xml"]
+    assert shown[2]["text/html"].count("<svg") >= 4
+    assert shown[3]["text/html"] == shown[0]["text/html"]
+    assert all(len(each["text/plain"]) < 2000 for each in shown)

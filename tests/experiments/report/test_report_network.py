@@ -64,7 +64,7 @@ def test_the_verdict_and_the_tables_say_so(run):
 
 def test_a_report_has_a_section_for_it(tmp_path, run):
     text = report.write(tmp_path, [run.trace()]).read_text(encoding="utf-8")
-    assert "What the modelled network did" in text
+    assert "Network model" in text
     assert "TB01 &gt; KH01" in text
 
 
