@@ -16,7 +16,7 @@ from experiments.metrics.statistics import by_case
 from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
-from experiments.report import figures, scenery
+from experiments.report import figures, replay, scenery
 from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
@@ -150,6 +150,7 @@ def write(
         verdict=[*first_of_all, *(Finding("fair", note) for note in notes), *verdict[len(first_of_all) :]],
         sections=sections,
         foot=() if made.made_by is None else made.made_by.words,  # of an old run it is not known
+        replay=replay.embedded(traces),
     )
 
 

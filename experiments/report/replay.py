@@ -1,0 +1,119 @@
+"""Replay of a run inside its report: a canvas, a script of our own, the positions; no network, no library."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from agents.arrays import Array
+from experiments.definition.formation import errors_over_time
+from experiments.recording.trace import Trace
+from experiments.scene.models import ROUND, circle
+from experiments.scene.stage import FAIR_M, GOOD_M, Stage
+
+CASES: Final = 2  # side by side
+STEP_S: Final = 0.1  # between two samples
+NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
+TALL_M: Final = 1.2  # obstacles are drawn no higher
+QUIET: Final = ("robot", "says", "clock", "router")  # kinds of events that are not on the slider
+SCRIPT: Final = Path(__file__).with_name("replay.js")
+PAGE: Final = """<h2>Replay</h2>
+<style>
+.film canvas {{ width: 100%; height: min(60vh, 26rem); display: block; touch-action: none; cursor: grab; }}
+.film .bar {{ display: flex; gap: .6rem; align-items: center; flex-wrap: wrap; }}
+.film .slide {{ flex: 1; min-width: 12rem; position: relative; }}
+.film input {{ width: 100%; margin: 0; }}
+.film .marks {{ position: relative; height: .6rem; margin: 0 .5rem; }}
+.film .marks i {{ position: absolute; width: .3rem; height: .6rem; background: #d55e00; cursor: pointer; }}
+.film output {{ min-width: 4em; text-align: right; }}
+</style>
+<div class="film" id="film"><canvas tabindex="0" aria-label="{label}"></canvas>
+<div class="bar"><button type="button">Play</button><div class="slide"><div class="marks"></div>
+<input type="range" step="0.01" aria-label="Time"></div><output></output>
+<select aria-label="Speed"><option value="0.25">¼×</option><option value="0.5">½×</option>
+<option value="1" selected>1×</option><option value="2">2×</option><option value="5">5×</option>
+<option value="10">10×</option></select></div>
+<p class="said" aria-live="off"></p>
+<small>Drag to turn, Ctrl and wheel to come closer. Links: green
+within {good:g} cm of their target, amber within {fair:g} cm,
+red beyond.</small></div>
+<script>{script}(document.getElementById("film"), {film});</script>
+"""
+
+
+def embedded(traces: Sequence[Trace]) -> str:
+    """The replay as HTML: the first repetition of the first two cases, side by side; empty without a case."""
+    first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1][:CASES]
+    if not first:
+        return ""
+    film = json.dumps(_film(first), separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
+    label = "Replay of " + ", ".join(trace.case for trace in first)
+    script = SCRIPT.read_text("utf-8").replace("</", "<\\/").strip()
+    return PAGE.format(label=_plain(label), good=100 * GOOD_M, fair=100 * FAIR_M, script=script, film=film)
+
+
+def _plain(text: str) -> str:
+    return "".join(letter for letter in text if letter.isalnum() or letter in " ,-_.")
+
+
+def _film(traces: Sequence[Trace]) -> dict[str, Any]:
+    stage = Stage.of_experiment(traces[0].experiment)
+    scene, end = stage.scene, max(float(trace.time[-1]) for trace in traces)
+    width = 4 * len(stage.names) + len(stage.links) + 3 * len(scene.names)
+    step = max(STEP_S, end * width * len(traces) / NUMBERS)
+    obstacles = []
+    for number in range(len(scene.names)):
+        outline = scene.outline[number]
+        ring = circle(float(scene.radius[number]), ROUND) if outline is None else outline
+        high = min(float(scene.top[number]), float(scene.bottom[number]) + TALL_M)
+        obstacles.append({
+            "ring": np.round(ring, 3).tolist(), "low": round(float(scene.bottom[number]), 3), "high": round(high, 3),
+            "closed": outline is None or bool(scene.closed[number]),
+        })  # fmt: skip
+    events = {(round(event.stamp, 2), event.text) for trace in traces for event in trace.events
+              if event.kind not in QUIET and 0.0 <= event.stamp <= end}  # fmt: skip
+    return {
+        "names": stage.names,
+        "colours": stage.colours.tolist(),
+        "radius": stage.radius.round(4).tolist(),
+        "high": [kind.height for kind in stage.kinds],
+        "links": np.stack([stage.links.sender, stage.links.receiver], axis=1).tolist() if len(stage.links) else [],
+        "arena": [np.nan_to_num(edge[:2]).round(3).tolist() for edge in (scene.low, scene.high)],
+        "obstacles": obstacles,
+        "begin": 0.0,
+        "end": end,
+        "still": round(0.6 * end, 2),
+        "events": sorted(events),
+        "cases": [_case(trace, step) for trace in traces],
+    }
+
+
+def _case(trace: Trace, step: float) -> dict[str, Any]:
+    """Samples of one case: x, y, z and yaw of each robot [mm, mrad], the level of each link's error, the obstacles."""
+    stage = Stage.of_experiment(trace.experiment)
+    grid = np.arange(0.0, float(trace.time[-1]) + 1e-9, step)
+    at = np.clip(np.searchsorted(trace.time, grid - 1e-9), 0, len(trace.time) - 1)
+    place = trace.true_position[at]
+    rows = np.concatenate([place, np.nan_to_num(trace.yaw[at])[..., None]], axis=2)
+    level = np.full((len(grid), len(stage.links)), -1)
+    if stage.plan is not None and len(stage.links):
+        error = errors_over_time(stage.plan.law, stage.plan.formation, grid, place)
+        level = np.where(np.isnan(error), -1, (error > GOOD_M).astype(int) + (error > FAIR_M))
+    poses = np.stack([stage.scene.at(float(t)) for t in grid]).reshape(len(grid), -1)
+    return {
+        "name": trace.case,
+        "begin": 0.0,
+        "step": step,
+        "p": [_whole(row.ravel()) for row in rows],
+        "e": level.tolist(),
+        "o": [_whole(row) for row in poses],
+    }
+
+
+def _whole(values: Array) -> list[int | None]:
+    """Thousandths; None for what is unknown."""
+    return [None if np.isnan(value) else round(1e3 * value) for value in values.tolist()]

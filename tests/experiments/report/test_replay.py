@@ -1,0 +1,66 @@
+"""The replay inside a report: it stands alone, is small, moves robots to where they were."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from experiments.file.document import load
+from experiments.report import replay
+from experiments.run import simulate
+from tests.system.browser import CHROMIUM, needs_chromium
+
+CASES = ["periodic", "event"]
+
+
+@pytest.fixture(scope="module")
+def traces():
+    run = simulate(load("robotic-park", "duration_s=3.0", "timeline=[]"), cases=CASES)
+    return [run.traces[case] for case in CASES]
+
+
+def film_of(page):
+    return json.loads(re.search(r'getElementById\("film"\), (\{.*\})\);', page)[1])
+
+
+def test_positions_are_those_of_the_run_within_a_millimetre(traces):
+    page = replay.embedded(traces)
+    film = film_of(page)
+    assert [case["name"] for case in film["cases"]] == CASES
+    assert film["names"] == list(traces[0].robots)
+    assert len(page) < 3e6
+    for trace, case in zip(traces, film["cases"], strict=True):
+        for k, sample in enumerate(case["p"]):
+            at = int(np.argmin(np.abs(trace.time - k * case["step"])))
+            assert np.array(sample).reshape(-1, 4)[:, :3] / 1e3 == pytest.approx(trace.true_position[at], abs=1e-3)
+
+
+def test_it_asks_no_other_machine_and_no_text_ends_its_script(traces):
+    page = replay.embedded(traces)
+    assert "http" not in page
+    assert page.count("</script>") == 1
+    assert replay.embedded([]) == ""
+
+
+@needs_chromium
+@pytest.mark.system
+def test_the_slider_moves_robots(traces, tmp_path):
+    api = pytest.importorskip("playwright.sync_api")
+    file = tmp_path / "page.html"
+    file.write_text(f"<!doctype html><meta charset=utf-8>{replay.embedded(traces)}", "utf-8")
+    with api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        page, faults, asked = browser.new_page(), [], []
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(file.as_uri())
+        page.locator("#film input").fill("2")
+        places = page.evaluate("document.getElementById('film').replay.places()")
+        browser.close()
+    assert (faults, asked) == ([], [file.as_uri()])
+    for trace, robots in zip(traces, places, strict=True):
+        at = int(np.argmin(np.abs(trace.time - 2.0)))
+        assert np.array(robots)[:, :3] == pytest.approx(trace.true_position[at], abs=1e-3)
