@@ -46,8 +46,10 @@ def file(tmp_path):
 def test_it_runs_and_reports_without_links(file, tmp_path, capsys):
     assert commands.run(
         str(file), virtual=True, out=str(tmp_path / "run")
-    ) == 0  # fmt: skip
-    said = capsys.readouterr().out
+    ) == 1  # fmt: skip
+    printed = capsys.readouterr()
+    said = printed.out
+    assert "TB01 at 7.5 s: it is told to move and does not" in printed.err + said  # they push each other
     assert "no link was measured" in said
     assert "One collision in default: TB01–TB02" in said
     page = re.sub(r"<[^>]+>", " ", (tmp_path / "run" / "report.html").read_text("utf-8"))

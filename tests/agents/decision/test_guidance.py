@@ -36,6 +36,7 @@ class Bench:
         self.agent = Agent(Plan(experiment).assignment(names))
         self.agent.neighbours.mark_alive(np.arange(len(self.agent.assignment.links)))
         self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
+        self.climbed = np.zeros(len(names))
         self.t = 0.0
 
     def step(self, count=1):
@@ -43,7 +44,9 @@ class Bench:
             rows = len(self.position)
             still, flying = np.zeros((rows, 3)), np.array([False, True])[:rows]
             life, position = self.agent.lifecycle, self.position.copy()
-            position[(life.phase <= READY) & ~life.active, 2] = 0.0  # on the floor, until it is told to climb
+            waits = (life.phase <= READY) & ~life.active  # on the floor, until it is told to climb
+            self.climbed = np.where(waits, 0.0, self.climbed + 0.005)
+            position[:, 2] = np.minimum(position[:, 2], self.climbed)
             state = BodyState(
                 time=np.full(rows, self.t), position=position, velocity=still, yaw=np.zeros(rows),
                 battery=np.full(rows, NAN), flying=flying, true_position=position, true_yaw=np.zeros(rows),
@@ -63,7 +66,7 @@ class Bench:
         self.step()
         for row in rows:
             assert self.agent.lifecycle.takeoff(row) == ""
-        self.step(2)
+        self.step(200)  # up at 0.5 m/s
         for row in rows:
             assert self.agent.start(row, self.t) == ""
         self.told(list(rows), self.position)
@@ -96,7 +99,7 @@ def test_nothing_is_pursued_before_the_start():
     bench.told([0, 1], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.8]])
     bench.step()
     assert bench.agent.lifecycle.takeoff(0) == bench.agent.lifecycle.takeoff(1) == ""
-    bench.step(3)
+    bench.step(200)
     assert bench.phases == [AIRBORNE, AIRBORNE]
     np.testing.assert_array_equal(bench.agent.goal, [[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])
     assert bench.agent.updates.tolist() == [0, 0]

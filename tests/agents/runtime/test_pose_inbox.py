@@ -179,9 +179,8 @@ def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
 
 def hazards(robot: Robot) -> list[str]:
     agent = robot.agent
-    seen: list = []
-    if agent.neighbours.clock_lag is not None:
-        agent._detector._lagging(agent.neighbours, agent.neighbours.clock_lag, seen)
+    lag = agent.neighbours.clock_lag
+    seen = [] if lag is None else list(agent._detector._lagging(agent.neighbours, lag))
     return [f"{each.cause.name}: {each.detail(0)}" for each in seen if each.rows[0]]
 
 

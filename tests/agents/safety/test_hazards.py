@@ -213,7 +213,7 @@ def spoiled(swarm, **values):
     def spoil(t, state):
         for name, value in values.items():
             was = getattr(state, name)
-            if isinstance(value, tuple):
+            if isinstance(was, tuple):
                 setattr(state, name, value)
             elif was is None:
                 setattr(state, name, np.tile(np.asarray(value, dtype=float), (len(state.yaw), 1)))

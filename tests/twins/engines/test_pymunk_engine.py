@@ -247,7 +247,7 @@ def test_a_row_can_be_put_elsewhere_at_rest():
     assert len(drive.touches) == 1
     drive.engine.place(np.array([0]), np.array([[3.0, 2.0, 0.0]]), np.array([1.0]), np.array([False]))
     np.testing.assert_array_equal(drive.engine.position[0], [3.0, 2.0, 0.0])
-    drive.go(1.0, np.full((2, 4), np.nan))
+    drive.go(1.0, [[np.nan] * 4, [0.0] * 4])
     np.testing.assert_allclose(drive.engine.position[0], [3.0, 2.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(drive.engine.velocity[0], 0.0, atol=1e-12)
     assert drive.engine.yaw[0] == pytest.approx(1.0, abs=1e-12)
