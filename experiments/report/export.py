@@ -126,6 +126,38 @@ def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
         raise _unwritable(file, error) from None
 
 
+FRAMES_HZ: Final = 15.0  # of a film
+
+
+def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> None:
+    """All cases side by side as a film, `speed` times as fast as the run: .mp4 (H.264, by ffmpeg) or .gif.
+
+    Raises:
+        ExportError: If there is no ffmpeg for an .mp4, or the file cannot be written.
+    """
+    from matplotlib.animation import FFMpegWriter, PillowWriter  # noqa: PLC0415
+
+    from experiments.report import trajectories  # noqa: PLC0415
+
+    mp4 = file.suffix.lower() == ".mp4"
+    if mp4 and not FFMpegWriter.isAvailable():
+        raise ExportError(
+            f"{file}: an .mp4 needs the program ffmpeg (Debian: apt install ffmpeg); a .gif needs nothing"
+        )
+    shown = list(traces.values())
+    if not any(trajectories.has_positions(trace) for trace in shown):
+        raise ExportError(f"{file}: no position is known in this run; there is nothing to show")
+    figure, show = trajectories.film(shown)
+    writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
+    try:
+        with writer.saving(figure, str(file), 150 if mp4 else 110):
+            for t in np.arange(0.0, max(float(trace.time[-1]) for trace in shown), speed / FRAMES_HZ):
+                show(float(t))
+                writer.grab_frame()
+    except OSError as error:
+        raise _unwritable(file, error) from None
+
+
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
     net, sent, experiment = trace.plan.links, trace.sent, trace.experiment

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.colors import to_rgb
@@ -28,6 +29,7 @@ from experiments.report.style import (
     MANY,
     PAPER,
     ROBOTS,
+    STYLE,
     WIDTH,
     Drawing,
     Line,
@@ -171,6 +173,45 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         [*entries.values(), *things[0]], labels, loc="upper center", ncols=min(fits, 5), bbox_to_anchor=(0.5, 1.0)
     )
     return figure
+
+
+TRAIL_S: Final = 12.0  # of motion that a frame of a film shows behind each robot
+
+
+def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
+    """A picture of all cases side by side in space, and a function that sets it to a time [s] of the run."""
+    shown = [trace for trace in traces if has_positions(trace)]
+    with mpl.rc_context(dict(STYLE) | {"savefig.transparent": False}):
+        figure = Figure(figsize=(4.0 * len(shown), 3.8))
+        clock = figure.text(0.5, 0.02, "", ha="center", fontsize=9)
+        parts = []
+        for k, trace in enumerate(shown):
+            axes = figure.add_subplot(1, len(shown), k + 1, projection="3d", computed_zorder=False)
+            assert isinstance(axes, Axes3D)
+            _frame(axes, shown)
+            axes.set_title(plain(trace.case), pad=0.0)
+            links = axes.add_collection3d(
+                Line3DCollection([], colors="#8a8a8a", linewidths=0.7, zorder=1), autolim=False
+            )
+            styles = robot_lines(trace)
+            trails = [axes.plot([], [], [], **{**style, "linewidth": 0.8, "zorder": 3})[0] for style in styles]
+            dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=style["color"])[0] for style in styles]
+            parts.append((trace, links, trails, dots, edges(trace.plan.links.receiver, trace.plan.links.sender)))
+
+        robot_legend(figure, shown)
+
+    def show(t: float) -> None:
+        clock.set_text(f"{t:.1f} s")
+        for trace, links, trails, dots, pairs in parts:
+            last = max(0, int(np.searchsorted(trace.time, t + 1e-9)) - 1)
+            first = int(np.searchsorted(trace.time, t - TRAIL_S))
+            place = trace.true_position
+            links.set_segments([place[last, [i, j]] for i, j in pairs])
+            for row, (trail, dot) in enumerate(zip(trails, dots, strict=True)):
+                trail.set_data_3d(*place[first : last + 1, row].T)
+                dot.set_data_3d(*place[last, row, :, None])
+
+    return figure, show
 
 
 def _draw_in_space(axes: Axes3D, trace: Trace, colour: str | None) -> None:

@@ -469,7 +469,7 @@ def _ratio(value: float | None, reference: float | None) -> str:
 
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
-def export(
+def export(  # noqa: PLR0917 - a command line
     folder: Annotated[
         str,
         typer.Argument(
@@ -485,18 +485,25 @@ def export(
     as_bundle: Annotated[
         bool, typer.Option("--bundle", help="All that is needed to repeat it: an archive for a paper's supplement.")
     ] = False,
+    video: Annotated[
+        Path | None, typer.Option("--video", metavar="FILE", help="A film of all cases: FILE.mp4 (by ffmpeg) or .gif.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of a film: how much faster than the run.")] = 4.0,
     as_json: AsJson = False,
 ) -> None:
-    """Write a run for MATLAB, its trajectories as one table, or all of it as a bundle that `./zenpark run` repeats."""
+    """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
     from experiments.recording import bundle
-    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat
+    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat, write_video
     from experiments.run import reopen
 
-    own = ".csv" if as_csv else ".zip" if as_bundle else ".mat"
+    if video is not None and (target or as_csv or as_bundle or video.suffix.lower() not in (".mp4", ".gif")):
+        raise ExportError(f"{video}: name the film behind --video alone, with .mp4 or .gif at its end")
+    own = video.suffix if video else ".csv" if as_csv else ".zip" if as_bundle else ".mat"
     place = Path(folder).resolve()
-    file = Path(target) if target else place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
+    usual = place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
+    file = video or (Path(target) if target else usual)
     suffix = file.suffix.lower()
-    if suffix not in (".mat", ".csv", ".zip") or (suffix != own and (as_csv or as_bundle)):
+    if (video is None and suffix not in (".mat", ".csv", ".zip")) or (suffix != own and (as_csv or as_bundle)):
         raise ExportError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
     if suffix == ".mat":
         require_savemat()  # before a long recording is read
@@ -507,6 +514,8 @@ def export(
         write_mat(found.traces, found.metrics, file)
     elif suffix == ".zip":
         bundle.write(Path(folder), file, [trace.experiment for trace in found.traces.values()])
+    elif video is not None:
+        write_video(found.traces, file, speed)
     else:
         write_csv(found.traces, file)
     if as_json:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from agents.formation.graph import laplacian
 from experiments.file.document import load, loads
@@ -29,6 +30,26 @@ def flown(tmp_path_factory):
     read = load("triangle", *SHORT)
     read.keep(folder / SOURCE)
     return folder, simulate(read, folder=folder)
+
+
+def test_a_film_shows_the_run_from_its_start_to_its_end(flown):
+    file = flown[0] / "film.gif"
+    commands.export(str(flown[0]), video=file, speed=8.0)
+    with Image.open(file) as film:
+        assert film.n_frames == math.ceil(4.0 / (8.0 / export.FRAMES_HZ))
+        pictures = []
+        for frame in (0, film.n_frames - 1):
+            film.seek(frame)
+            pictures.append(np.asarray(film.convert("RGB"), dtype=float))
+    assert np.abs(pictures[1] - pictures[0]).mean() > 0.5  # the robots are elsewhere
+
+
+def test_a_film_needs_its_encoder_and_a_name(flown, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ExportError, match="needs the program ffmpeg"):
+        commands.export(str(flown[0]), video=tmp_path / "film.mp4")
+    with pytest.raises(ExportError, match=r"\.mp4 or \.gif"):
+        commands.export(str(flown[0]), video=tmp_path / "film.avi")
 
 
 @pytest.fixture(scope="module")
