@@ -40,7 +40,9 @@ def test_positioning_is_started_again_and_the_end_of_a_device_is_told(tmp_path: 
     watcher = Watcher(flight.endpoint())
     watcher.until(lambda: "TB01" in watcher.state and watcher.state["TB01"].position[0] > 0.1, "the leader drives")
     flight.children()["vicon"].kill()
-    flight.until_said(r"vicon conductor: the vicon ended \(killed by SIGKILL\); started again: robots that do not know")
+    flight.until_said(
+        r"vicon conductor: the vicon ended \(killed by SIGKILL\); started again: robots without a position"
+    )
     watcher.until(lambda: watcher.state["TB01"].position[0] > 0.5, "it goes on")
     flight.children()["vicon-twin"].kill()
     flight.until_said(r"device conductor: the vicon-twin ended \(killed by SIGKILL\); robots that need it hold")
