@@ -204,7 +204,7 @@ def _comment(node: ast.stmt, lines: Sequence[str]) -> str:
 
 
 def api() -> Iterator[str]:
-    """What notebooks and plug-ins may import."""
+    """Modules that notebooks and plug-ins may import."""
     yield "# Python API\n"
     yield "## Notebooks\n"
     yield from (f"::: {module}\n" for module in NOTEBOOKS)

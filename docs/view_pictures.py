@@ -31,7 +31,7 @@ REDRAW_S = 6.0  # without a graphics card
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture of a replay."""
+    """Picture of a replay."""
 
     name: str
     folder: Path

@@ -82,7 +82,7 @@ class Wire:
 
 
 class Driver(Protocol):
-    """One protocol. Every method raises OSError if the robot does not answer, or not in this protocol."""
+    """Protocol of a server. Every method raises OSError if the robot does not answer, or not in this protocol."""
 
     ranged: bool  # whether it reads ranges
     patience_s: float  # [s] without an answer after which a request fails

@@ -46,7 +46,7 @@ _TYPES: Final = {
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """One key of the experiment file."""
+    """Key of the experiment file, with all that a reader needs."""
 
     key: str  # with the names in capitals: robots.ROBOT.start; plug-ins: trigger(send-on-delta).threshold
     text: str

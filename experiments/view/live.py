@@ -17,7 +17,7 @@ import zenoh
 
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
+from experiments.scene.drawing import DARK, LIGHT, Look, SceneDrawing, Shown, light
 from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer, RobotReport
@@ -88,7 +88,7 @@ class ShowFolder:
     """Check boxes for parts that are drawn on demand."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self.shown = Shown()
+        self._server, self.shown = server, Shown()
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
             for name, text in (
@@ -103,6 +103,18 @@ class ShowFolder:
         """Goals of many robots are not drawn until they are asked for."""
         if len(stage.names) > MANY:
             self._boxes["goals"].value = self.shown.goals = False
+
+    def draw_anew(self, former: SceneDrawing | None, stage: Stage, look: Look, panel: Panel) -> SceneDrawing:
+        """Drawing of a case in place of the one before, with its panel, and the camera on its arena."""
+        with self._server.atomic():
+            if former is not None:
+                former.remove()
+            drawing = SceneDrawing(self._server, stage, look)
+            self.fit(stage)
+            drawing.shown = self.shown
+            panel.set_stage(stage)
+            look_at(self._server, (stage.scene.high - stage.scene.low).tolist())
+        return drawing
 
     def _set(self, name: str, event: viser.GuiEvent[Any]) -> None:
         setattr(self.shown, name, event.target.value)
@@ -152,14 +164,7 @@ class LiveView:
     def _begin(self) -> None:
         """Another case."""
         stage = self.observer.stage
-        with self._server.atomic():
-            if self._drawing is not None:
-                self._drawing.remove()
-            self._drawing = SceneDrawing(self._server, stage, self._look)
-            self._show.fit(stage)
-            self._drawing.shown = self._show.shown
-            self._panel.set_stage(stage)
-            look_at(self._server, (stage.scene.high - stage.scene.low).tolist())
+        self._drawing = self._show.draw_anew(self._drawing, stage, self._look, self._panel)
         self._errors = LinkTracker(stage)
         if self._acting is not None:
             self._acting.set_stage(stage)

@@ -15,7 +15,7 @@ from agents.network.messages import Event
 from experiments.definition.experiment import Experiment
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
-from experiments.view.live import FRAME_S, TABLE_S, ShowFolder, look_at
+from experiments.view.live import FRAME_S, TABLE_S, ShowFolder
 from experiments.view.panel import PLOT_S, Panel, Row
 from experiments.view.replay import Clock, add_transport
 from experiments.virtual_time.simulation import Instant
@@ -54,14 +54,7 @@ class PacedView:
         self._events: list[Event] = []
         self._incidents = 0
         self._drawn = self._plotted = self._tabled = self._waited = -inf
-        with self._server.atomic():
-            if self._drawing is not None:
-                self._drawing.remove()
-            self._drawing = SceneDrawing(self._server, stage, self._look)
-            self._show.fit(stage)
-            self._drawing.shown = self._show.shown
-            self._panel.set_stage(stage)
-            look_at(self._server, (stage.scene.high - stage.scene.low).tolist())
+        self._drawing = self._show.draw_anew(self._drawing, stage, self._look, self._panel)
         self.clock.t = -inf
         return self.watch
 

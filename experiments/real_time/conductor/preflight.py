@@ -53,7 +53,7 @@ STANDS_M_S: Final = 0.02  # slower: a robot on wheels stands
 
 @dataclass(frozen=True)
 class Trials:
-    """What is tried beyond observing; both touch the motors."""
+    """Trials beyond observing; all of them touch the motors."""
 
     hop: bool = False  # drones hop to `HOP_M` (see `alone`), robots on wheels drive `DRIVE_M`
     stop: bool = False  # emergency stop of a drone that begins to climb, of a robot on wheels that drives
@@ -265,7 +265,7 @@ class Inspector:
                 yield made
 
     def _test_sticks(self, name: str) -> Tried:
-        """One Tello flies the stick test at the height of its take-off."""
+        """Stick test of a Tello, flown at the height of its take-off."""
         robot = self._processes.robot(name)
         device = robot.device | {"stick_test": True}
         robot = msgspec.structs.replace(robot, hover=tello.TAKEOFF_HEIGHT, device=device)
@@ -280,7 +280,7 @@ class Inspector:
         changed: Mapping[str, Robot] | None = None,
         hold_s: float = HOLD_S,
     ) -> Tried:
-        """One robot in a process of its own hops or drives, and lands or is stopped."""
+        """Trial of a robot in a process of its own: it hops or drives, and lands or is stopped."""
         tried = Tried()
         self._robots[name].forget_process()
         self._processes.start([name], changed)

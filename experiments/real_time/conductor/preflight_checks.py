@@ -59,7 +59,7 @@ BATTERY: Final[Mapping[str, str]] = {
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
-    """One check of one robot."""
+    """Check of a robot: verdict, reading and remedy."""
 
     check: str
     verdict: Verdict
