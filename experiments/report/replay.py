@@ -12,15 +12,20 @@ import numpy as np
 from agents.arrays import Array
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
+from experiments.report import trajectories
+from experiments.report.page import inline
+from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
 from experiments.scene.stage import FAIR_M, GOOD_M, Stage
 
 CASES: Final = 2  # side by side
+STILL: Final = 0.6  # of the run: when the picture was taken that stands where no script runs, and in print
 STEP_S: Final = 0.1  # between two samples
 NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
 TALL_M: Final = 1.2  # obstacles are drawn no higher
 QUIET: Final = ("robot", "says", "clock", "router")  # kinds of events that are not on the slider
 SCRIPT: Final = Path(__file__).with_name("replay.js")
+LINKS: Final = "Links: green within {good:g} cm of their target, amber within {fair:g} cm, red beyond."
 PAGE: Final = """<h2>Replay</h2>
 <style>
 .film canvas {{ width: 100%; height: min(60vh, 26rem); display: block; touch-action: none; cursor: grab; }}
@@ -30,17 +35,18 @@ PAGE: Final = """<h2>Replay</h2>
 .film .marks {{ position: relative; height: .6rem; margin: 0 .5rem; }}
 .film .marks i {{ position: absolute; width: .3rem; height: .6rem; background: #d55e00; cursor: pointer; }}
 .film output {{ min-width: 4em; text-align: right; }}
+figure.still svg, .still figcaption {{ max-width: none; }}
+@media print {{ .film {{ display: none; }} .still[hidden] {{ display: block; }} }}
 </style>
-<div class="film" id="film"><canvas tabindex="0" aria-label="{label}"></canvas>
+<figure class="still">{still}<figcaption>{label}, at {at:g} s of the run. {links}</figcaption></figure>
+<div class="film" id="film" hidden><canvas tabindex="0" aria-label="{label}"></canvas>
 <div class="bar"><button type="button">Play</button><div class="slide"><div class="marks"></div>
 <input type="range" step="0.01" aria-label="Time"></div><output></output>
 <select aria-label="Speed"><option value="0.25">¼×</option><option value="0.5">½×</option>
 <option value="1" selected>1×</option><option value="2">2×</option><option value="5">5×</option>
 <option value="10">10×</option></select></div>
 <p class="said" aria-live="off"></p>
-<small>Drag to turn, Ctrl and wheel to come closer. Links: green
-within {good:g} cm of their target, amber within {fair:g} cm,
-red beyond.</small></div>
+<small>Drag to turn, Ctrl and wheel to come closer. {links}</small></div>
 <script>{script}(document.getElementById("film"), {film});</script>
 """
 
@@ -50,10 +56,22 @@ def embedded(traces: Sequence[Trace]) -> str:
     first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1][:CASES]
     if not first:
         return ""
-    film = json.dumps(_film(first), separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
+    content = _film(first)
+    film = json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
     label = "Replay of " + ", ".join(trace.case for trace in first)
     script = SCRIPT.read_text("utf-8").replace("</", "<\\/").strip()
-    return PAGE.format(label=_plain(label), good=100 * GOOD_M, fair=100 * FAIR_M, script=script, film=film)
+    at, links = content["still"], LINKS.format(good=100 * GOOD_M, fair=100 * FAIR_M)
+    still = _still(first, at, f"{label}, at {at:g} s")
+    return PAGE.format(label=_plain(label), links=links, at=at, still=still, script=script, film=film)
+
+
+def _still(traces: Sequence[Trace], at: float, label: str) -> str:
+    """The picture of the replay at a time [s], as SVG; empty where no position is known."""
+    if not any(map(trajectories.has_positions, traces)):
+        return ""
+    figure, show = trajectories.film(traces)
+    show(at)
+    return inline(svg(figure), "still-", label)
 
 
 def _plain(text: str) -> str:
@@ -86,7 +104,7 @@ def _film(traces: Sequence[Trace]) -> dict[str, Any]:
         "obstacles": obstacles,
         "begin": 0.0,
         "end": end,
-        "still": round(0.6 * end, 2),
+        "still": round(STILL * end, 2),
         "events": sorted(events),
         "cases": [_case(trace, step) for trace in traces],
     }

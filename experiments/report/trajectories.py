@@ -19,6 +19,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-u
 
 from agents.arrays import Array
 from experiments.check.analysis import Analysis
+from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
@@ -41,6 +42,7 @@ from experiments.report.style import (
     styled,
     thinned,
 )
+from experiments.scene.stage import link_colours
 
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
@@ -179,37 +181,47 @@ TRAIL_S: Final = 12.0  # of motion that a frame of a film shows behind each robo
 
 
 def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
-    """A picture of all cases side by side in space, and a function that sets it to a time [s] of the run."""
+    """A picture of all cases side by side in space, and a function that sets it to a time [s] of the run.
+
+    Links have the colours of their errors; few robots have their names.
+    """
     shown = [trace for trace in traces if has_positions(trace)]
     with mpl.rc_context(dict(STYLE) | {"savefig.transparent": False}):
-        figure = Figure(figsize=(4.0 * len(shown), 3.8))
-        clock = figure.text(0.5, 0.02, "", ha="center", fontsize=9)
+        figure = Figure(figsize=(4.0 * len(shown), 3.0))
+        clock = figure.text(0.5, 0.03, "", ha="center", fontsize=9)
         parts = []
         for k, trace in enumerate(shown):
-            axes = figure.add_subplot(1, len(shown), k + 1, projection="3d", computed_zorder=False)
+            box = ((k - 0.05) / len(shown), -0.1, 1.05 / len(shown), 1.15)
+            axes = figure.add_axes(box, projection="3d", computed_zorder=False)
             assert isinstance(axes, Axes3D)
             _frame(axes, shown)
-            axes.set_title(plain(trace.case), pad=0.0)
-            links = axes.add_collection3d(
-                Line3DCollection([], colors="#8a8a8a", linewidths=0.7, zorder=1), autolim=False
-            )
+            figure.text((k + 0.5) / len(shown), 0.9, plain(trace.case), ha="center", fontsize=9)
+            links = axes.add_collection3d(Line3DCollection([], linewidths=1.0, zorder=1), autolim=False)
             styles = robot_lines(trace)
             trails = [axes.plot([], [], [], **{**style, "linewidth": 0.8, "zorder": 3})[0] for style in styles]
             dots = [axes.plot([], [], [], "o", ms=5, mec="none", color=style["color"])[0] for style in styles]
-            parts.append((trace, links, trails, dots, edges(trace.plan.links.receiver, trace.plan.links.sender)))
-
-        robot_legend(figure, shown)
+            few = len(trace.robots) <= MANY
+            halo = {"path_effects": [withStroke(linewidth=1.5, foreground=PAPER)], "zorder": 7}
+            names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
+            plan = trace.plan
+            error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
+            parts.append((trace, links, trails, dots, names, link_colours(error) / 255.0))
+        if any(len(trace.robots) > MANY for trace in shown):
+            robot_legend(figure, shown)
 
     def show(t: float) -> None:
         clock.set_text(f"{t:.1f} s")
-        for trace, links, trails, dots, pairs in parts:
+        for trace, links, trails, dots, names, colours in parts:
             last = max(0, int(np.searchsorted(trace.time, t + 1e-9)) - 1)
             first = int(np.searchsorted(trace.time, t - TRAIL_S))
-            place = trace.true_position
-            links.set_segments([place[last, [i, j]] for i, j in pairs])
+            place, net = trace.true_position, trace.plan.links
+            links.set_segments(np.stack([place[last, net.sender], place[last, net.receiver]], axis=1))
+            links.set_color(colours[last])
             for row, (trail, dot) in enumerate(zip(trails, dots, strict=True)):
                 trail.set_data_3d(*place[first : last + 1, row].T)
                 dot.set_data_3d(*place[last, row, :, None])
+            for name, at in zip(names, place[last], strict=False):
+                name.set_position_3d(at + np.array([0.0, 0.0, 0.05]))
 
     return figure, show
 

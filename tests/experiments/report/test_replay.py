@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.file.document import load
-from experiments.report import replay
+from experiments.report import replay, trajectories
 from experiments.run import simulate
 from tests.system.browser import CHROMIUM, needs_chromium
 
@@ -38,6 +38,22 @@ def test_positions_are_those_of_the_run_within_a_millimetre(traces):
             assert np.array(sample).reshape(-1, 4)[:, :3] / 1e3 == pytest.approx(trace.true_position[at], abs=1e-3)
 
 
+def test_the_still_picture_is_that_of_the_replay(traces):
+    page = replay.embedded(traces)
+    at = film_of(page)["still"]
+    still = page[page.index("<svg") : page.index("</svg>")]
+    assert f"Replay of periodic, event, at {at:g} s" in still
+    assert "<text" not in still  # no letters that a reader's machine may not have
+    assert len(still) < 3e5
+    figure, show = trajectories.film(traces)
+    show(at)
+    for axes, trace in zip(figure.axes, traces, strict=True):
+        last = int(np.searchsorted(trace.time, at + 1e-9)) - 1
+        dots = [line.get_data_3d() for line in axes.lines if line.get_marker() == "o"]
+        drawn = np.hstack(dots).T
+        assert drawn == pytest.approx(trace.true_position[last])
+
+
 def test_it_asks_no_other_machine_and_no_text_ends_its_script(traces):
     page = replay.embedded(traces)
     assert "http" not in page
@@ -47,7 +63,7 @@ def test_it_asks_no_other_machine_and_no_text_ends_its_script(traces):
 
 @needs_chromium
 @pytest.mark.system
-def test_the_slider_moves_robots(traces, tmp_path):
+def test_the_slider_moves_robots_and_a_still_picture_is_printed(traces, tmp_path):
     api = pytest.importorskip("playwright.sync_api")
     file = tmp_path / "page.html"
     file.write_text(f"<!doctype html><meta charset=utf-8>{replay.embedded(traces)}", "utf-8")
@@ -59,7 +75,14 @@ def test_the_slider_moves_robots(traces, tmp_path):
         page.goto(file.as_uri())
         page.locator("#film input").fill("2")
         places = page.evaluate("document.getElementById('film').replay.places()")
+        shown = [page.locator(part).is_visible() for part in ("#film", ".still svg")]
+        page.emulate_media(media="print")
+        printed = [page.locator(part).is_visible() for part in ("#film", ".still svg")]
+        plain = browser.new_context(java_script_enabled=False).new_page()
+        plain.goto(file.as_uri())
+        unscripted = [plain.locator(part).is_visible() for part in ("#film", ".still svg")]
         browser.close()
+    assert (shown, printed, unscripted) == ([True, False], [False, True], [False, True])
     assert (faults, asked) == ([], [file.as_uri()])
     for trace, robots in zip(traces, places, strict=True):
         at = int(np.argmin(np.abs(trace.time - 2.0)))
