@@ -1,28 +1,31 @@
-"""Ownership of a name on the network: a process touches the body of a robot only while it owns the robot's name.
+"""Ownership of a name on the network: a process commands others, or the body of a robot, only while it owns its name.
 
-A process claims a name with a token that carries the time of its start. Of several claims the earliest wins; a name
-that is owned already stays with its owner, whatever clocks say. Tokens end with their session, so a name is free again
-as soon as its owner is dead, or cut off, or stands still for longer than its lease. In the latter cases its tokens come
-back, maybe after another process has taken the name: a process that was cut off or stood still must ask
-(`OwnershipCheck`), and gives way to any other owner.
+Robots, the world and the central controller have names. A process claims a name with a token that carries the time of
+its start. Of several claims the earliest wins; a name that is owned already stays with its owner, whatever clocks say.
+Tokens end with their session, so a name is free again as soon as its owner is dead, or cut off, or stands still for
+longer than its lease. In the latter cases its tokens come back, maybe after another process has taken the name: a
+process that was cut off or stood still must ask (`OwnershipCheck`), and gives way to any other owner.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import Final
 
 import zenoh
 
+from agents.clock import uptime
 from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
+from agents.network.zenoh_config import LEASE_S
 
 OWNER_VANISH_S: Final = 2.5  # limit for the tokens of a killed owner to vanish
 ANSWER_S: Final = 10.0  # limit for the routers to answer
+TURN_S: Final = 0.01  # between two polls of a check
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
 
 
@@ -140,11 +143,14 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
 
 
 class OwnershipCheck:
-    """Check whether a process still owns its names, in a thread of its own: the control loop polls the result."""
+    """Check whether a process still owns its names, in a thread of its own: a loop polls the result."""
 
-    def __init__(self, alive: Sequence[str]) -> None:
-        """`alive` has the liveliness key of each name."""
-        self._alive = alive
+    awake_at: float  # last run of the process, on `uptime` [s]
+
+    def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S) -> None:
+        """Begins when the names are owned: liveliness keys `alive`, in a session whose lease is `lease_s` [s]."""
+        self._alive, self._stood_s = alive, 0.5 * lease_s
+        self.awake_at = uptime()
         self._taken = ""
         self._asking: threading.Thread | None = None
         self._anew = False
@@ -170,6 +176,32 @@ class OwnershipCheck:
         if self._taken:
             raise NameTaken(self._taken)
         return self._asking is None
+
+    def stood_still(self) -> bool:
+        """Whether the process stood still since the last call, for so long that its names may have another owner."""
+        last, self.awake_at = self.awake_at, uptime()
+        return self.awake_at - last >= self._stood_s
+
+    def settle(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
+        """Waits while a check runs, or for one if the process stood still since the last call; returns whether it did.
+
+        For processes without a body, before they send anything: another process may send the same meanwhile.
+
+        Args:
+            session: That of the names.
+            ended: Whether the process was told to end, which ends the wait.
+
+        Raises:
+            NameTaken: If another process owns one of the names.
+        """
+        if self.stood_still():
+            self.begin(session)
+        waited = False
+        while not self.over() and not ended():
+            waited = True
+            time.sleep(TURN_S)
+            self.awake_at = uptime()
+        return waited
 
     def end(self) -> None:
         """Ends the check."""

@@ -45,9 +45,6 @@ from agents.runtime.watchdog import AGAIN_S, Watchdog
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
-STOOD_S: Final = (
-    0.5 * network.ROBOT_LEASE_S
-)  # a process that stood still for longer may have lost the ownership of its name
 
 
 class Runtime:
@@ -70,8 +67,7 @@ class Runtime:
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
         self._utc = self._now = self._next = 0.0
-        self._awake_at = np.inf  # [s] last run of the process, on `uptime`
-        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names])
+        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names], network.ROBOT_LEASE_S)
         self._hands_off = False  # another process drives the bodies, or may do so
         self._reason_to_end: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
@@ -189,6 +185,7 @@ class Runtime:
         tokens = [keys.alive(name) for name in self._names]
         try:
             self._owned = claim(session, tokens, began=self._began, endpoints=setup.endpoints, stop=stop)
+            self._ownership.stood_still()
         except NameTaken as taken:
             raise NameTaken(
                 f"{self._whose(taken)}: a robot of this name is on the network already; end it first "
@@ -222,13 +219,12 @@ class Runtime:
             NameTaken: If another process has taken one of them.
             network.Unreachable: If the process was told to end, and no router has answered within `ANSWER_S`.
         """
-        last, self._awake_at = self._awake_at, uptime()
-        if self._awake_at - last < STOOD_S or self._watchdog.tripped:  # a hanging loop is the business of the watchdog
+        if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
-        woke, self._hands_off = self._awake_at, True
+        woke, self._hands_off = uptime(), True
         self._ownership.begin(self._session)
         while not self._mine():
-            if self._awake_at - woke > ANSWER_S and self._reason_to_end() is not None:
+            if uptime() - woke > ANSWER_S and self._reason_to_end() is not None:
                 names = ", ".join(self._names)
                 raise network.Unreachable(
                     f"{names}: told to end after it stood still, and no router answers who owns the name now; its body "
@@ -236,7 +232,7 @@ class Runtime:
                 )
             self._watchdog.beat()
             time.sleep(self._dt)
-            self._awake_at = uptime()
+        self._ownership.stood_still()
         self._hands_off = False
         return True
 
@@ -404,11 +400,12 @@ class Runtime:
     def _loop(self, stopping: Callable[[], str | None]) -> None:
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
+        self._reason_to_end = stopping
+        self._make_sure()  # opening the body may have taken long
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
-        self._joined, self._reason_to_end = True, stopping
-        self._awake_at = uptime()
+        self._joined = True
         self._watchdog.start()
         self._go_round(zero, stopping)
 

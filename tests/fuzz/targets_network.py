@@ -16,6 +16,7 @@ import numpy as np
 from agents.body.interface import BodyRequest, Disturbance
 from agents.body.kinds import KINDS
 from agents.network import messages as wire
+from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
 from experiments.definition import bodies
@@ -115,7 +116,7 @@ def world() -> Iterator[Target]:
 
     def make():
         net.forget()
-        process = WorldProcess(experiment, Population(experiment), net.session, Event())  # type: ignore[arg-type]
+        process = WorldProcess(experiment, Population(experiment), net.session, Event(), ownership=OwnershipCheck([]))  # type: ignore[arg-type]
         process._exchange.utc = time.time()
         t = 0.0
 

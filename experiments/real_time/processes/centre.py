@@ -28,7 +28,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken
+from agents.network.name_ownership import NameTaken, OwnershipCheck
 from agents.network.shutdown import end
 from agents.network.validation import reach_of
 from agents.plugins import registry
@@ -52,13 +52,20 @@ class CentreProcess:
     """Clock and network of a central controller."""
 
     def __init__(
-        self, experiment: Experiment, session: zenoh.Session, keys: Keys, endpoints: Sequence[str] = ()
+        self,
+        experiment: Experiment,
+        session: zenoh.Session,
+        keys: Keys,
+        ownership: OwnershipCheck,
+        endpoints: Sequence[str] = (),
     ) -> None:
         """Declares all but the token, which tells that orders are received. `endpoints` are those of the session."""
         assignment = Plan(experiment).centre_assignment()
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
+        self._ownership = ownership
         self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
+        self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
         self._period = assignment.decide_every / assignment.body_hz
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
@@ -95,6 +102,8 @@ class CentreProcess:
         self._utc = self._clock.at(zero)
         token = pubsub.alive_token(self._session, self._keys.centre_alive)
         while not over.wait(max(0.0, zero + self._next + self._patience - time.monotonic())):
+            if self._ownership.settle(self._session, over.is_set):
+                continue
             now = time.monotonic() - zero - self._patience
             behind = int((now - self._next) / self._period)
             self._missed += behind
@@ -102,7 +111,9 @@ class CentreProcess:
             self._late_s = max(self._late_s, now - self._next)
             self._next = t + self._period
             self._receive(t)
-            self._send(self.centre.decide(t, self._phase, self._start), t)
+            goals = self.centre.decide(t, self._phase, self._start)
+            if not self._ownership.settle(self._session, over.is_set):
+                self._send(goals, t)
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
         self._report(self._next)
@@ -110,7 +121,9 @@ class CentreProcess:
 
     def _receive(self, t: float) -> None:
         """Receives all since the last decision."""
-        self._router.silent_since(t)
+        was_cut_off, self._cut_off = self._cut_off, isfinite(self._router.silent_since(t))
+        if was_cut_off and not self._cut_off:
+            self._ownership.begin(self._session)
         for row, inbox in self._statuses.items():
             for status in inbox.read(_check_status):
                 self._update_status(row, status)
@@ -207,7 +220,7 @@ def serve(launch: Launch) -> int:
         token=Keys(experiment.network.realm).centre_alive,
         taken="a centre guides the robots",
     ) as joint:
-        process = CentreProcess(experiment, joint.session, joint.keys, endpoints)
+        process = CentreProcess(experiment, joint.session, joint.keys, joint.ownership, endpoints)
         joint.declared.append(process)
         others = [name for name in experiment.robots if name not in guided]
         print(

@@ -21,7 +21,7 @@ from agents.network import pubsub
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, claim
+from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import held
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
@@ -63,6 +63,7 @@ class Network(NamedTuple):
     keys: Keys
     endpoints: list[str]
     declared: list[object]  # kept until the session is closed, see `agents.network.shutdown.leave`
+    ownership: OwnershipCheck  # of the `token`
 
 
 @contextmanager
@@ -80,7 +81,7 @@ def joined(
     """Inside, the network of an experiment is joined; at the end it is left.
 
     Raises:
-        NameTaken: If another process owns `token`.
+        NameTaken: If another process owns `token`, or took it while this one stood still or was cut off.
         Unreachable: If no router answers.
     """
     began = Clock().utc()
@@ -99,7 +100,16 @@ def joined(
                         f"{taken} in the realm '{experiment.network.realm}' already: end it first, choose another "
                         "router with --connect, or another network.realm in the experiment file"
                     ) from None
-            yield Network(session, Keys(experiment.network.realm), endpoints, declared)
+            ownership = OwnershipCheck([token] if token else [])
+            try:
+                yield Network(session, Keys(experiment.network.realm), endpoints, declared, ownership)
+            except NameTaken:
+                raise NameTaken(
+                    f"another process has taken the name '{name}' in the realm '{experiment.network.realm}' while this "
+                    "one stood still or was cut off; it leaves"
+                ) from None
+            finally:
+                ownership.end()
 
 
 def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]) -> Document:

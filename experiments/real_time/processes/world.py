@@ -21,7 +21,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken
+from agents.network.name_ownership import NameTaken, OwnershipCheck
 from agents.network.shutdown import Farewell, end
 from agents.plugins import registry
 from agents.runtime import command_line
@@ -67,14 +67,17 @@ class WorldProcess:
         population: Population,
         session: zenoh.Session,
         lost: threading.Event,
+        *,
+        ownership: OwnershipCheck,
         endpoints: Sequence[str] = (),
     ) -> None:
         """`lost` is set to end as soon as the robots have landed; `endpoints` are those of the session."""
+        self._ownership, self._over = ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
         self._keys = Keys(experiment.network.realm)
         self._engine = registry.split(experiment.world.engine)[0]
         self._dt = 1.0 / experiment.rates.body_hz
-        self._exchange = Exchange(experiment, population, session, endpoints)
+        self._exchange = Exchange(experiment, population, session, ownership, endpoints)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -96,10 +99,12 @@ class WorldProcess:
         token = pubsub.alive_token(self._session, self._keys.world_alive)
         self._report(0.0)
         due = 0.0
+        self._over = over
         while not over.is_set():
             wait = zero + due - time.monotonic()
             if wait > 0.0:
                 time.sleep(wait)
+            self._ownership.settle(self._session, self._ended)
             began = time.monotonic() - zero
             if began - due > SLIP_S:
                 exchange.slept(began - due, began)
@@ -109,9 +114,12 @@ class WorldProcess:
             pace.worked += time.monotonic() - zero - began
             if pace.update(began, dt):
                 self._report(due)
-            if self._lost.is_set() and self._farewell.over():
+            if self._ended():
                 break
         token.undeclare()  # type: ignore[no-untyped-call]
+
+    def _ended(self) -> bool:
+        return self._over.is_set() or (self._lost.is_set() and self._farewell.over())
 
     def _tick(self, t: float) -> None:
         changed = False
@@ -127,6 +135,8 @@ class WorldProcess:
             if self._steps:
                 self._steps -= 1
                 changed |= not self._steps
+        if self._ownership.settle(self._session, self._ended):
+            return
         self._exchange.publish(t)
         if changed:
             self._report(t)
@@ -240,7 +250,8 @@ def serve(launch: WorldLaunch) -> int:
     ) as joint:
         # before anything watches those tokens: a session that has begun to watch answers from what it has heard
         there = _alive(joint.session, joint.keys)
-        world = WorldProcess(experiment, population, joint.session, lost, endpoints)
+        own = joint.ownership
+        world = WorldProcess(experiment, population, joint.session, lost, ownership=own, endpoints=endpoints)
         joint.declared.append(world)
         back = world.find(there)
         print(_ready(experiment, population, endpoints, back), flush=True)

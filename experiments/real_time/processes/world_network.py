@@ -21,6 +21,7 @@ from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
+from agents.network.name_ownership import OwnershipCheck
 from agents.runtime import range_inbox
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
@@ -50,7 +51,12 @@ class Exchange:
     trouble: str  # last refusal; empty if there was none
 
     def __init__(
-        self, experiment: Experiment, population: Population, session: zenoh.Session, endpoints: Sequence[str] = ()
+        self,
+        experiment: Experiment,
+        population: Population,
+        session: zenoh.Session,
+        ownership: OwnershipCheck,
+        endpoints: Sequence[str] = (),
     ) -> None:
         """Subscribes; `update_rows` declares the rest. `endpoints` are those of the session."""
         self._population, self._session = population, session
@@ -67,7 +73,9 @@ class Exchange:
         self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
+        self._ownership = ownership
         self._router = network.RouterWatch(session, keys.world_alive, endpoints)
+        self._cut_off = False
         self._setpoints = pubsub.Inbox(
             pubsub.subscriber(session, keys.setpoint("*"), DEPTH),
             messages.Command,
@@ -183,6 +191,9 @@ class Exchange:
 
     def receive(self, t: float) -> None:
         """Receives all until `t`."""
+        was_cut_off, self._cut_off = self._cut_off, self._router.silent_since(t) < inf
+        if was_cut_off and not self._cut_off:
+            self._ownership.begin(self._session)
         for token, there in self._owners.changes():
             if there:
                 self._note_owner(token)
@@ -205,7 +216,7 @@ class Exchange:
         """Applies the commands; robots without commands hold, drive on, or land after `LAND_S`."""
         population = self._population
         hold_s: float | Array = population.hold_s
-        if self._router.silent_since(t) < inf:  # without a router no command arrives: robots hold, but need not land
+        if self._cut_off:  # without a router no command arrives: robots hold, but need not land
             self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
             hold_s = HOLD_S
         silent = t - self._quiet > hold_s

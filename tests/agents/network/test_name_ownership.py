@@ -16,7 +16,6 @@ from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, claim, keep
-from agents.runtime import loop
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
 from experiments.definition.experiment import Formation, Robot
@@ -257,13 +256,15 @@ class Woken(Airborne):
         self.commands += 1
 
 
-@pytest.mark.parametrize("way", ["still", "cut off"])
+@pytest.mark.parametrize("way", ["still", "opening", "cut off"])
 def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkeypatch):
     monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     body = Woken()
     told: list[int] = []
+    now = [0.0]
+    monkeypatch.setattr(name_ownership, "uptime", lambda: now[0])
     with Net().worn() as net:
         robot = Runtime(Plan(experiment).assignment(("F",)), body, setup)
 
@@ -271,17 +272,19 @@ def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkey
             if not told:
                 told.append(body.commands)
                 net.replies = [Reply(Sample(Keys.life(Keys().alive("F"), "beef"), "", b""), good=True)]
-                if way == "still":
-                    monkeypatch.setattr(loop, "STOOD_S", 0.0)
-                else:
+                if way == "cut off":
                     robot._silent_since = 0.0  # until the router answers again
+                else:
+                    now[0] += 60.0
 
         body.looks = looks
+        if way == "opening":
+            body.open = looks
         with pytest.raises(NameTaken, match="F: another process has taken this name while this one stood still"):
             robot.run()
-    assert body.calls == ["open"]
-    assert told[0] > 0
-    if way == "still":
+    assert body.calls == ([] if way == "opening" else ["open"])
+    assert (told[0] > 0) == (way != "opening")
+    if way != "cut off":
         assert body.commands == told[0]
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from agents.agent import Agent
 from agents.network import messages
 from agents.network.keys import Keys
+from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
@@ -28,7 +29,7 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(experiment, Population(experiment), net.session)
+        world = Exchange(experiment, Population(experiment), net.session, OwnershipCheck([]))
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
