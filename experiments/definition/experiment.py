@@ -425,3 +425,9 @@ class Experiment(Part, frozen=True):
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
         Meta(description="each may override any field; the first is the reference of every ratio"),
     ] = {}
+
+    @property
+    def phases(self) -> list[tuple[float, str]]:
+        """Phases of a run: their beginnings since the common start [s], and their names."""
+        legs = sorted(self.timeline, key=lambda leg: leg.at_s)
+        return [(0.0, "formation"), *((leg.at_s, f"{leg.robot} under way") for leg in legs)]

@@ -27,6 +27,7 @@ from experiments.file.text import content, decoded, parsed
 __all__ = ["Document", "DocumentError", "Problem"]
 
 _Table = dict[str, Any]
+UNNAMED: Final = "default"  # the case of an experiment without cases
 TEXT: Final = "text"  # what an experiment is called that stands in no file
 _ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena may begin with another file
 
@@ -206,7 +207,7 @@ class _Reading:
         first = list(consistency.faults(experiment))
         found = {name: list(consistency.faults(case)) for name, case in resolved.items()}
         source.refuse([*first, *_of_cases(tables, found, first)])
-        cases_of = resolved or {"default": experiment}
+        cases_of = resolved or {UNNAMED: experiment}
         return Document(self.file, source.text, experiment, cases_of, source.arenas, source.overrides)
 
     def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
@@ -303,10 +304,14 @@ def _beginning(table: object, path: Keys) -> Keys:
     return path
 
 
-def case_document(experiment: Experiment) -> bytes:
-    """A case as one line of JSON for a robot without a file; without the hosts of the other robots."""
+def case_document(experiment: Experiment, case: str = UNNAMED) -> bytes:
+    """A case as one line of JSON for a robot without a file; without the hosts of the other robots.
+
+    Its name comes with it: `Document.cases` of what is received has this case alone.
+    """
     arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
-    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}))
+    cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
+    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}, cases=cases))
 
 
 def chosen_case(read: Document, name: str | None) -> Experiment:

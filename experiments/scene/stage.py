@@ -252,13 +252,18 @@ class LinkTracker:
         return error if present is None else np.where(present, error, np.nan)
 
     def of_robots(self, error: Array) -> Array:
-        """Sum of the errors of the links on which each robot receives (N,) [m], or sends if it receives on none."""
-        net, rows = self._stage.links, len(self._stage.names)
-        known = np.nan_to_num(error)
-        received = np.bincount(net.receiver, known, minlength=rows)
-        sent = np.bincount(net.sender, known, minlength=rows)
+        """Sum of the known errors of the links on which each robot receives (N,) [m], or sends if it receives on none.
+
+        NaN where none is known.
+        """
+        net, rows, known = self._stage.links, len(self._stage.names), np.isfinite(error)
+
+        def total(ends: Index) -> Array:
+            there = np.bincount(ends[known], minlength=rows) > 0
+            return np.where(there, np.bincount(ends[known], error[known], minlength=rows), np.nan)
+
         receives = np.bincount(net.receiver, minlength=rows) > 0
-        return np.asarray(np.where(receives, received, sent))
+        return np.where(receives, total(net.receiver), total(net.sender))
 
 
 class Trail:

@@ -16,7 +16,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.ros2.cdr import Codec, Undecodable, codec
-from experiments.recording.topics import JSON, TOPICS, Topic
+from experiments.recording.topics import JSON, METADATA, TOPICS, Topic
 from experiments.view.replay import Clock
 
 STEP_S: Final = 0.01
@@ -66,6 +66,8 @@ class Broadcast:
             self.experiment = msgspec.json.decode(attached, type=Experiment)
         except (msgspec.MsgspecError, RecursionError) as error:
             raise RecordingError(f"{path}: holds no experiment that this version can read ({error})") from None
+        about_run = next((each.metadata for each in records.metadata if each.name == METADATA), {})
+        self.case = about_run.get("case", document.UNNAMED)
         if not self._sent:
             raise RecordingError(f"{path}: holds no message; there is nothing to replay")
         self._session, self.keys = session, Keys(realm or self.experiment.network.realm)
@@ -92,7 +94,7 @@ class Broadcast:
         if strangers:
             raise Occupied(_occupied(keys, strangers))
         announced = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
-        announced.put(document.case_document(self.experiment))
+        announced.put(document.case_document(self.experiment, self.case))
         self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in sorted(names))]
         count = at = 0
         last, now = clock.t, time.monotonic()

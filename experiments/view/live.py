@@ -21,7 +21,7 @@ from experiments.scene.drawing import DARK, LIGHT, Look, SceneDrawing, Shown, li
 from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer, RobotReport
-from experiments.view.panel import PLOT_S, Panel, Row
+from experiments.view.panel import PLOT_S, Panel, Row, known
 
 if TYPE_CHECKING:
     import viser
@@ -195,18 +195,18 @@ class LiveView:
         observer, stage = self.observer, self.observer.stage
         errors = self._errors.of_robots(moment.error)
         rows = [
-            _row(name, observer.robots[name], Condition(int(moment.condition[k])), float(errors[k]))
+            _row(name, observer.robots[name], Condition(int(moment.condition[k])), known(errors[k]))
             for k, name in enumerate(stage.names)
         ]
         elapsed = observer.elapsed
         start = None if elapsed is None else time.time() - elapsed
-        phase = next((event.text for event in reversed(observer.events) if event.kind == "phase"), "")
+        phase = observer.phase
         if not connected(self._session):
             phase = "no router answers"
         elif not phase:
             phase = "waiting for robots" if not stage.names else "not started"
         duration = stage.experiment.duration_s if stage.experiment is not None else 0.0
-        self._panel.show_head(phase, elapsed, duration, self._watched.words)
+        self._panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
         self._panel.show_robots(rows)
         net, names = stage.links, stage.names
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
@@ -214,7 +214,7 @@ class LiveView:
         self._panel.show_events(list(observer.events), start)
 
 
-def _row(name: str, report: RobotReport, condition: Condition, error: float) -> Row:
+def _row(name: str, report: RobotReport, condition: Condition, error: float | None) -> Row:
     status = report.status
     if status is None:
         return Row(name, condition)

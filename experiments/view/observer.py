@@ -47,6 +47,7 @@ class Observer:
     """A realm as it is seen from outside; polled. Needs no experiment file."""
 
     stage: Stage
+    case: str
     robots: dict[str, RobotReport]  # by name, in the order of the stage
     events: deque[messages.Event]  # of the run, incidents of robots included, oldest first
     world: messages.WorldState | None
@@ -66,11 +67,10 @@ class Observer:
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         self._ranges: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
         self._opened = self._rated = time.monotonic()
-        self.stage = Stage.of_robots(())
         self.robots, self.scans = {}, {}
         self.events = deque(maxlen=EVENTS)
         self.world, self.conducted = None, False
-        self._begin(self.stage)
+        self._begin(Stage.of_robots(()))
 
     # ------------------------------------------------------------------ reception
 
@@ -117,15 +117,16 @@ class Observer:
                 read = document.received(sample.payload.to_bytes().decode(), str(sample.key_expr))
             except (DocumentError, UnicodeDecodeError):
                 continue  # of another version: robots are drawn without it
-            if read.experiment != self.stage.experiment:
-                self._begin(Stage.of_experiment(read.experiment))
+            case, experiment = next(iter(read.cases().items()))
+            if (case, experiment) != (self.case, self.stage.experiment):
+                self._begin(Stage.of_experiment(experiment), case)
                 self.events.clear()
                 changed = True
         return changed
 
-    def _begin(self, stage: Stage) -> None:
+    def _begin(self, stage: Stage, case: str = "") -> None:
         """Another case."""
-        self.stage = stage
+        self.stage, self.case = stage, case
         before, self.robots = self.robots, {}
         for name in stage.names:
             self.robots[name] = before.get(name, RobotReport())
@@ -192,6 +193,15 @@ class Observer:
         """Time since the common start [s]; None before it is known."""
         started = [r.status.started for r in self.robots.values() if r.status is not None and r.status.started > 0.0]
         return self.now() - min(started) if started else None
+
+    @property
+    def phase(self) -> str:
+        """Phase of the case by the conductor's last words, else by the clock; empty before the start."""
+        told = next((event.text for event in reversed(self.events) if event.kind == "phase"), "")
+        elapsed, experiment = self.elapsed, self.stage.experiment
+        if told or elapsed is None or experiment is None:
+            return told
+        return next((name for at, name in reversed(experiment.phases) if elapsed >= at), "")
 
     def now(self) -> float:
         """Time [s, UTC] by the stamps of the statuses: that of a recording, where one is played."""

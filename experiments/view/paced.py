@@ -16,7 +16,7 @@ from experiments.definition.experiment import Experiment
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
 from experiments.view.live import FRAME_S, TABLE_S, ShowFolder
-from experiments.view.panel import PLOT_S, Panel, Row
+from experiments.view.panel import PLOT_S, Panel, Row, known
 from experiments.view.replay import Clock, add_transport
 from experiments.virtual_time.simulation import Instant
 
@@ -140,14 +140,14 @@ class PacedView:
         battery = instant.state.battery
         rows = [
             Row(
-                name, Condition(int(moment.condition[k])), float(errors[k]), float(len(self._sent[k])),
-                None if isnan(battery[k]) else float(battery[k]), note=instant.agent.hazards.worst(k),
+                name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
+                known(battery[k]), note=instant.agent.hazards.worst(k),
             )
             for k, name in enumerate(self._stage.names)
         ]  # fmt: skip
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
-        self._panel.show_head(f"{self._case}: {phase}", moment.time, self._experiment.duration_s, where)
+        self._panel.show_head(self._case, phase, moment.time, self._experiment.duration_s, where)
         self._panel.show_robots(rows)
         self._panel.show_links(moment.error, [None] * len(moment.error))
         self._panel.show_events(self._events, 0.0)

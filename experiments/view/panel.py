@@ -11,6 +11,7 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.network.messages import Event
+from experiments.file.document import UNNAMED
 from experiments.scene.stage import (
     BAD,
     CHASSIS,
@@ -50,6 +51,11 @@ class Row:
     missed: int | None = None  # ticks
     delay: float | None = None  # [s] largest of its links
     note: str = ""
+
+
+def known(value: float) -> float | None:
+    """A number for a row; None for NaN."""
+    return None if np.isnan(value) else float(value)
 
 
 class History:
@@ -125,12 +131,13 @@ class Panel:
             scales={"x": {"time": False, "range": (-HISTORY_S, 0.0)}},
         )  # fmt: skip
 
-    def show_head(self, phase: str, elapsed: float | None, duration: float, where: str) -> None:
-        """Title, phase, clock [s], and which run it is."""
+    def show_head(self, case: str, phase: str, elapsed: float | None, duration: float, where: str) -> None:
+        """Title, case, phase, clock [s], and which run it is."""
+        named = f"{case}: {phase}" if case not in ("", UNNAMED) else phase
         clock = "" if elapsed is None else f"{elapsed:.1f} s of {duration:g} s" if duration else f"{elapsed:.1f} s"
         text = (
             f'<div style="padding:0 1.4em 0 1em;font-size:0.85em"><b>{escape(self.stage.title or "robots")}</b><br>'
-            f"<span>{escape(phase)}</span> <span style='float:right'>{clock}</span>"
+            f"<span>{escape(named)}</span> <span style='float:right'>{clock}</span>"
             f"<div style='opacity:0.6;overflow-wrap:anywhere'>{escape(where)}</div></div>"
         )
         _set(self._head, text)
@@ -169,8 +176,23 @@ def css(colour: Sequence[int]) -> str:
     return f"rgb({red},{green},{blue})"
 
 
+HEADS: Final = ("error", "tx/s", "battery", "missed", "delay")
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    """What is known of a robot, below `HEADS`."""
+    error = row.error
+    return (
+        "" if error is None else f"<span style='color:{css(_graded(error))}'>{100 * error:.1f} cm</span>",
+        "" if row.rate is None else f"{row.rate:.1f}",
+        "" if row.battery is None else f"{100 * row.battery:.0f} %",
+        "" if row.missed is None else f"{row.missed}",
+        "" if row.delay is None else f"{1e3 * row.delay:.1f} ms",
+    )
+
+
 def table(rows: Sequence[Row], stage: Stage) -> str:
-    """Table of robots as HTML: of many, those that need attention first, then by error."""
+    """Table of robots as HTML: of many, those that need attention first, then by error; without empty columns."""
     colours: Mapping[str, Sequence[int]] = dict(zip(stage.names, stage.colours.tolist(), strict=True))
     shown = list(rows)
     left = ""
@@ -178,28 +200,20 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         shown.sort(key=lambda row: (-row.condition, -(row.error or 0.0)))
         left = f"<div style='opacity:0.6'>and {len(rows) - TABLE} more; the worst are shown</div>"
         shown = shown[:TABLE]
-    heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{each}</th>"
-                    for each in ("error", "tx/s", "battery", "missed", "delay"))  # fmt: skip
+    filled = [_cells(row) for row in shown]
+    columns = [k for k in range(len(HEADS)) if not filled or any(cells[k] for cells in filled)]
+    heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{HEADS[k]}</th>" for k in columns)
     lines = []
-    for row in shown:
+    for row, cells in zip(shown, filled, strict=True):
         word, colour = CONDITIONS[row.condition]
         dot = f"<span style='color:{css(colours.get(row.name, UNKNOWN))}'>&#9679;</span>"
         badge = f" <span style='color:{css(colour)};font-weight:600'>{word}</span>" if word else ""
-        cells = (
-            ""
-            if row.error is None
-            else f"<span style='color:{css(_graded(row.error))}'>{100 * row.error:.1f} cm</span>",
-            "" if row.rate is None else f"{row.rate:.1f}",
-            "" if row.battery is None else f"{100 * row.battery:.0f} %",
-            "" if row.missed is None else f"{row.missed}",
-            "" if row.delay is None else f"{1e3 * row.delay:.1f} ms",
-        )
         note = ""
         if row.note:
             note = f"<tr><td colspan='6' style='color:{css(colour)};padding-left:1.2em'>{escape(row.note)}</td></tr>"
         lines.append(
             f"<tr><td style='white-space:nowrap'>{dot} {escape(row.name)}{badge}</td>"
-            + "".join(f"<td style='text-align:right;white-space:nowrap'>{cell}</td>" for cell in cells)
+            + "".join(f"<td style='text-align:right;white-space:nowrap'>{cells[k]}</td>" for k in columns)
             + f"</tr>{note}"
         )
     return (

@@ -18,7 +18,7 @@ from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder, look_at
-from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row
+from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row, known
 
 if TYPE_CHECKING:
     import viser
@@ -67,8 +67,9 @@ class Film:
         """The table at `t` [s]."""
         moment = self.moment(t)
         errors = self._links.of_robots(moment.error)
+        ticks = self.tracks.clock == "real"  # virtual time misses none
         return [
-            _row(name, track, Condition(int(moment.condition[k])), float(errors[k]), t)
+            _row(name, track, Condition(int(moment.condition[k])), known(errors[k]), t, ticks=ticks)
             for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True))
         ]
 
@@ -142,13 +143,13 @@ def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) ->
     return np.array(rows, dtype=float).reshape(-1, width)
 
 
-def _row(name: str, track: Track, condition: Condition, error: float, t: float) -> Row:
+def _row(name: str, track: Track, condition: Condition, error: float | None, t: float, *, ticks: bool) -> Row:
     status = _last(track.statuses, t)
     rate = float(np.searchsorted(track.sent, t, side="right") - np.searchsorted(track.sent, t - 1.0, side="right"))
     if status is None:
         return Row(name, condition, error, rate)
     note = status.hazard or (status.reason if condition > Condition.DONE else "")
-    return Row(name, condition, error, rate, status.battery, status.missed, None, note)
+    return Row(name, condition, error, rate, status.battery, status.missed if ticks else None, None, note)
 
 
 class Clock:
@@ -297,7 +298,7 @@ class ReplayView:
             self._slider.value = round(t, 2)
         said = [event for event in tracks.events if event.stamp <= t]
         phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
-        panel.show_head(f"{tracks.case}: {phase}", t, tracks.experiment.duration_s, self._where)
+        panel.show_head(tracks.case, phase, t, tracks.experiment.duration_s, self._where)
         panel.show_robots(film.rows(min(t, tracks.end)))
         error = film.moment(min(t, tracks.end)).error
         panel.show_links(error, [None] * len(error))

@@ -375,9 +375,7 @@ class Logbook:
     def _conducted(self) -> Iterator[tuple[float, str, str, str]]:
         yield self._log.airborne, "phase", "conductor", "airborne"
         yield 0.0, "start", "conductor", "common start"
-        yield 0.0, "phase", "conductor", "formation"
-        for leg in sorted(self._experiment.timeline, key=lambda leg: leg.at_s):
-            yield leg.at_s, "phase", "conductor", f"{leg.robot} under way"
+        yield from ((at, "phase", "conductor", name) for at, name in self._experiment.phases)
         yield self._experiment.duration_s, "phase", "conductor", "landing"
 
 

@@ -6,6 +6,7 @@ It decides nothing that a robot needs: if it dies, the robots land by themselves
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -210,10 +211,7 @@ class Conductor:
 
     def _walk(self, start: float) -> None:
         """Follow the run to its end."""
-        legs = sorted(self._experiment.timeline, key=lambda leg: leg.at_s)
-        names = ["formation", *(f"{leg.robot} under way" for leg in legs)]
-        times = [0.0, *(leg.at_s for leg in legs)]
-        reached = -1
+        coming = deque(self._experiment.phases)
         end = start + self._experiment.duration_s
         self._changes.begin(start)
         self._repeat_at = start
@@ -224,10 +222,9 @@ class Conductor:
             self._progress.elapsed = now - start
             self._report_tardy(start)
             self._start_late(start)
-            while reached + 1 < len(times) and now - start >= times[reached + 1]:
-                reached += 1
-                self._progress.phase = names[reached]
-                self._view.report("phase", "conductor", names[reached], stamp=start + times[reached])
+            while coming and now - start >= coming[0][0]:
+                at, self._progress.phase = coming.popleft()
+                self._view.report("phase", "conductor", self._progress.phase, stamp=start + at)
             busy = self._changes.under_way
             left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
             if all(view.reached("landing") for view in left) and (left or not busy):

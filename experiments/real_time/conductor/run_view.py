@@ -136,7 +136,7 @@ class NetworkView:
             self.report("router", "conductor", f"{where}: look with `./zenpark keys {options}`")
         self._clock = pubsub.publisher(session, keys.clock, messages.JSON)
         self._experiment = pubsub.pose_publisher(session, keys.experiment, messages.JSON)
-        self._experiment.put(document.case_document(experiment))
+        self._experiment.put(document.case_document(experiment, context.case))
         self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # to the conductor
         self._token = pubsub.alive_token(session, keys.conductor)
         statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)

@@ -405,6 +405,13 @@ def test_a_fault_in_json_is_located(write):
     assert problem.column == problem.source.index("7.5") + 1
 
 
+def test_a_case_comes_over_the_network_with_its_name():
+    for name, cases in (("event", read("triangle").cases()), ("default", read("convoy", ["cases={}"]).cases())):
+        sent = document.case_document(cases[name], name).decode()
+        assert document.received(sent, "network").cases() == {name: cases[name]}
+        assert document.chosen_case(document.received(sent, "network"), None) == cases[name]
+
+
 # Links
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -99,6 +102,30 @@ def test_phases_stand_on_the_slider(flown):
     film = Film(tracks.read(flown[1]))
     worded = [mark[1] for mark in marks([film]) if isinstance(mark, tuple)]
     assert "landing" in worded
+
+
+def test_the_table_has_what_the_recording_has_and_no_empty_columns(flown):
+    read = tracks.read(flown[1])
+    film = Film(read)
+    assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
+    text = table(film.rows(read.end), film.stage)
+    assert "tx/s" in text
+    assert not {word for word in ("battery", "missed", "delay", "nan", "None") if word in text}
+    status = msgspec.structs.replace(read.tracks[0].statuses[0], stamp=1.0, battery=0.8, missed=3)
+    told = (replace(read.tracks[0], statuses=(status,)), *read.tracks[1:])
+    real = Film(replace(read, clock="real", tracks=told))
+    assert [(row.battery, row.missed) for row in real.rows(1.5)[:2]] == [(0.8, 3), (None, None)]
+    assert real.rows(0.5)[0].battery is None
+    text = table(real.rows(1.5), real.stage)
+    assert "battery" in text
+    assert ">80 %<" in text
+
+
+def test_a_robot_without_links_has_no_error(tmp_path):
+    alone = load("robotic-park", "duration_s=1.0", "timeline=[]", "formation.links={}", "cases={}")
+    simulate(alone, folder=tmp_path)
+    film = Film(tracks.read(tmp_path / "default.mcap"))
+    assert {row.error for row in film.rows(0.5)} == {None}
 
 
 def test_curves_of_many_robots_are_three():
