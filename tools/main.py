@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from tools.bench import bench
-from tools.commands import check, estop, hosts, lab, network, orders, processes, run, sweep, view
+from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
 from tools.commands.options import Group, example, print_json
 from tools.reliability import chaos, soak
 
@@ -29,7 +29,7 @@ app: Final = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _module in (run, view, sweep, check, soak, chaos, bench, processes, network, estop):
+for _module in (run, results, view, sweep, check, soak, chaos, bench, processes, network, orders):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
 app.add_typer(lab.app, name="cert")

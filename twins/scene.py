@@ -152,15 +152,6 @@ def corners(outline: Array, pose: Array) -> Array:
     return np.stack([cos * x - sin * y + pose[..., 0, None], sin * x + cos * y + pose[..., 1, None]], axis=-1)
 
 
-def reach(scene: Scene, obstacle: int) -> tuple[Array, Array]:
-    """Smallest and largest x, y (2,) [m] of an obstacle at the start."""
-    pose, outline = scene.pose[obstacle], scene.outline[obstacle]
-    if outline is None:
-        return pose[:2] - scene.radius[obstacle], pose[:2] + scene.radius[obstacle]
-    points = corners(outline, pose)
-    return points.min(axis=0), points.max(axis=0)
-
-
 def distance(scene: Scene, obstacle: int, pose: Array, point: Array) -> Array:
     """Distance (...) in the plane from points to an obstacle [m]; negative inside a box or a cylinder.
 

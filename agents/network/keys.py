@@ -46,7 +46,7 @@ class Keys:
 
     # of the world and the central controller; `state` and `alive` belong to robots only
     world = _RealmKey("world/report")  # pace, pauses, contacts
-    world_order = _RealmKey("world/order")  # queryable: pause, step, reset, spawn, remove
+    world_order = _RealmKey("world/order")  # queryable: pause, resume, reset
     contact = _RealmKey("world/contact")  # every contact in the world, when it begins
     world_alive = _RealmKey("world/here")  # liveliness token
     centre = _RealmKey("centre/report")  # guided robots, load, counters

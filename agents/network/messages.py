@@ -247,13 +247,8 @@ class WorldState(Message, frozen=True):
 class WorldOrder(Message, frozen=True):
     """Order of an operator to a world."""
 
-    order: Literal["pause", "resume", "step", "reset", "spawn", "remove"]
-    steps: int = 1  # of step: ticks until the next pause
-    name: str | None = None  # of spawn, remove and reset (left out: all)
-    kind: str | None = None  # of a robot to spawn
-    at: tuple[float, float] | None = None  # [m] x, y of a robot to spawn
-    yaw: float = 0.0  # [rad] of a robot to spawn
-    obstacle: dict[str, object] | None = None  # to spawn, as in the experiment file
+    order: Literal["pause", "resume", "reset"]
+    name: str | None = None  # of reset: a robot (left out: all)
 
 
 class WorldReply(Message, frozen=True):

@@ -63,16 +63,8 @@ def of_all() -> dict[str, list[object]]:
         received={"KH01": 2}, lost={"KH01": 1}, dropped={"KH01": 0}, malformed=0, pid=1, cpu_s=0.1, rss_mb=60.0,
     )  # fmt: skip
     orders = [
-        messages.WorldOrder("pause"), messages.WorldOrder("resume"), messages.WorldOrder("step", steps=3),
+        messages.WorldOrder("pause"), messages.WorldOrder("resume"),
         messages.WorldOrder("reset"), messages.WorldOrder("reset", name="KH01"),
-        messages.WorldOrder("remove", name="KH02"),
-        messages.WorldOrder("spawn", name="KH02", kind="khepera4", at=(0.5, 0.5), yaw=1.0),
-        messages.WorldOrder("spawn", name="CF02", kind="crazyflie", at=(0.2, -0.5)),
-        messages.WorldOrder("spawn", name="box", obstacle={"at": [0.1, 0.2], "radius": 0.1, "height": 0.5}),
-        messages.WorldOrder("spawn", name="moving", obstacle={
-            "at": [0.1, 0.2], "box": [0.1, 0.2],
-            "plan": {"kind": "circle", "radius": 0.1}}),
-        messages.WorldOrder("spawn", name="pushed", obstacle={"at": [-0.1, 0.6], "box": [0.1, 0.2], "mass": 1.0}),
     ]  # fmt: skip
     return {
         KEYS.estop: [messages.Stop("a test", "to see")],

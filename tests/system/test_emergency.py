@@ -13,7 +13,8 @@ from agents.network import endpoints
 from agents.runtime import run_registry
 from experiments.recording import playback
 from tests.system.lab import ENVIRONMENT, ROOT, Flight
-from tools.commands import estop as estop_command
+from tools.commands import orders as order_commands
+from tools.commands import results
 
 pytestmark = pytest.mark.system
 
@@ -53,9 +54,9 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     up = [[flight.endpoint()], [other.endpoint()]]
     assert [run.endpoints for run in run_registry.runs()] == up
     monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
-    assert estop_command.runs(as_json=True) is None
+    assert results.runs(as_json=True) is None
     assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
-    assert estop_command.estop(reason="person in arena") == 0
+    assert order_commands.estop(reason="person in arena") == 0
     assert capsys.readouterr().out.splitlines() == [
         f"stopped: CF01, KH01 (two that stay together, {each.folder}, at {endpoint})"
         for each, (endpoint,) in zip((flight, other), up, strict=True)

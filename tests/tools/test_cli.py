@@ -181,7 +181,7 @@ def test_help_is_light():
 
 def test_an_emergency_stop_waits_for_no_numpy():
     _, modules = loaded("estop", "--connect", "tcp/127.0.0.1:9")
-    assert "tools.commands.estop" in modules
+    assert "tools.commands.orders" in modules
     assert not {"numpy", "matplotlib", "mcap"} & modules
     said, modules = loaded("runs")
     assert said == "no run is up on this machine\n"

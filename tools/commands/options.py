@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from functools import wraps
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -105,6 +108,24 @@ Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, 
 Report = Annotated[bool, typer.Option(help="Writes the report.")]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
+
+
+def with_options(command: Callable[..., int]) -> Callable[..., int]:
+    """Give a command each field of its last parameter, a dataclass, as an option of its own."""
+    signature = inspect.signature(command, eval_str=True)
+    *own, last = signature.parameters.values()
+    fields = dataclasses.fields(last.annotation)
+    types = get_type_hints(last.annotation, include_extras=True)
+
+    @wraps(command)
+    def called(*args: object, **given: object) -> int:
+        shared = {field.name: given.pop(field.name) for field in fields if field.name in given}
+        return command(*args, **given, **{last.name: last.annotation(**shared)})
+
+    more = [last.replace(name=each.name, default=each.default, annotation=types[each.name]) for each in fields]
+    called.__dict__["__signature__"] = signature.replace(parameters=[*own, *more])
+    called.__annotations__ = {each.name: each.annotation for each in (*own, *more)}
+    return called
 
 
 def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included

@@ -1,23 +1,41 @@
-"""Orders to the robots of a run or to those started by hand (`./zenpark robot`), and to a world (`./zenpark world`)."""
+"""Orders to robots (`./zenpark robot`), to a world (`./zenpark world`), and the emergency stop (`./zenpark estop`)."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from tools import completion
-from tools.commands.options import As, AsJson, Connect, Lab, Realm, example, group, print_json, session
+from tools.commands.options import (
+    CONNECT,
+    As,
+    AsJson,
+    Connect,
+    Lab,
+    Realm,
+    example,
+    group,
+    print_json,
+    routers,
+    session,
+    with_options,
+)
 
 if TYPE_CHECKING:
     import zenoh
 
     from agents.network import messages
     from agents.network.keys import Keys
+    from experiments.real_time.conductor.orders import EmergencyStop
 
+app: Final = typer.Typer()
 robot_app: Final = group("Give orders to robots: those of a run that is under way, and those started by hand.")
 world_app: Final = group("Run a world by hand, and give orders to the one that is running.")
 
@@ -39,6 +57,7 @@ NamesOrAll = Annotated[
     ),
 ]
 
+IDENTITY: Final = "operator"
 WAIT_S: Final = 2.0  # for a router
 # orders to the robots themselves, in a run or by hand; without names to all of them
 ORDERS: Final[Mapping[messages.OrderKind, str]] = {
@@ -64,27 +83,45 @@ CHANGES: Final[Mapping[messages.ChangeKind, str]] = {
 }
 
 
-def _print_results(done: Mapping[str, str], refused: Mapping[str, str], *, as_json: bool) -> int:
-    """Print the result of an order for each robot; the exit code: 1 if a robot refused, else 0."""
-    from tools.commands.network import printable
+@dataclass(frozen=True)
+class Operator:
+    """Options of a command that gives orders: where, as whom, and how the result is printed."""
 
-    if as_json:
-        print_json({"ok": not refused, "done": done, "refused": refused})
-    else:
-        for name, text in done.items():
-            print(f"{printable(name)}: {printable(text)}")
-        for name, text in refused.items():
-            print(f"{printable(name)}: no: {printable(text)}", file=sys.stderr)
-    return int(bool(refused))
+    connect: Connect = None
+    realm: Realm = "park"
+    lab: Lab = None
+    identity: As = "operator"
+    as_json: AsJson = False
 
+    @contextmanager
+    def joined(self) -> Iterator[tuple[zenoh.Session, Keys]]:
+        """A session at the routers, and the keys of the realm."""
+        from agents.network.keys import Keys
 
-def _refuse(reason: str, *, as_json: bool) -> int:
-    from tools.commands.network import printable
+        with session("robot", self.connect, self.lab, self.identity, WAIT_S) as opened:
+            yield opened, Keys(self.realm)
 
-    if as_json:
-        print_json({"ok": False, "error": reason})
-    print(f"zenpark: {printable(reason)}", file=sys.stderr)
-    return 2
+    def print_results(self, done: Mapping[str, str], refused: Mapping[str, str]) -> int:
+        """Print the result of an order for each robot; the exit code: 1 if a robot refused, else 0."""
+        from tools.commands.network import printable
+
+        if self.as_json:
+            print_json({"ok": not refused, "done": done, "refused": refused})
+        else:
+            for name, text in done.items():
+                print(f"{printable(name)}: {printable(text)}")
+            for name, text in refused.items():
+                print(f"{printable(name)}: no: {printable(text)}", file=sys.stderr)
+        return int(bool(refused))
+
+    def refuse(self, reason: str) -> int:
+        """Print why a whole order was refused; the exit code."""
+        from tools.commands.network import printable
+
+        if self.as_json:
+            print_json({"ok": False, "error": reason})
+        print(f"zenpark: {printable(reason)}", file=sys.stderr)
+        return 2
 
 
 def _alive(opened: zenoh.Session, keys: Keys) -> list[str]:
@@ -94,27 +131,26 @@ def _alive(opened: zenoh.Session, keys: Keys) -> list[str]:
     return sorted(name for name in found if name is not None)
 
 
-def _give(
-    what: messages.OrderKind, robots: Sequence[str], opened: zenoh.Session, keys: Keys, who: str, *, as_json: bool
-) -> int:
+def _give(what: messages.OrderKind, robots: Sequence[str], by: Operator) -> int:
     """Give an order to the robots themselves, to all if none is named, and tell the recorder; the exit code."""
     from agents.network import messages
     from experiments.real_time.conductor import orders
 
-    receivers = robots or _alive(opened, keys)
-    if not receivers:
-        return _refuse(f"no robot in the realm '{keys.realm}'; `./zenpark keys` shows the members", as_json=as_json)
-    at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
-    replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
-    done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
-    refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
-    text = f"{what}: {', '.join(done) or 'no robot'}" + f"; refused by {', '.join(refused)}" * bool(refused)
-    event = messages.Event(time.time(), "order", who, text)
-    opened.put(keys.event, messages.encode(event), encoding=messages.JSON)
-    return _print_results(done, refused, as_json=as_json)
+    with by.joined() as (opened, keys):
+        receivers = robots or _alive(opened, keys)
+        if not receivers:
+            return by.refuse(f"no robot in the realm '{by.realm}'; `./zenpark keys` shows the members")
+        at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
+        replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
+        done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
+        refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
+        text = f"{what}: {', '.join(done) or 'no robot'}" + f"; refused by {', '.join(refused)}" * bool(refused)
+        event = messages.Event(time.time(), "order", by.identity, text)
+        opened.put(keys.event, messages.encode(event), encoding=messages.JSON)
+    return by.print_results(done, refused)
 
 
-def _change(order: messages.RunOrder, opened: zenoh.Session, keys: Keys, *, as_json: bool) -> int:
+def _change(order: messages.RunOrder, by: Operator) -> int:
     """Give an order to the conductor, wait until it is done, and print the result for each robot.
 
     Returns:
@@ -122,47 +158,25 @@ def _change(order: messages.RunOrder, opened: zenoh.Session, keys: Keys, *, as_j
     """
     from experiments.real_time.conductor import orders
 
-    reply = orders.send_run_order(opened, keys, order)
-    if reply.reason:
-        return _refuse(reply.reason, as_json=as_json)
-    return _print_results(reply.done, reply.refused, as_json=as_json)
+    with by.joined() as (opened, keys):
+        reply = orders.send_run_order(opened, keys, order)
+    return by.refuse(reply.reason) if reply.reason else by.print_results(reply.done, reply.refused)
 
 
 def _order_command(what: messages.OrderKind) -> Callable[..., int]:
-    def order(
-        names: NamesOrAll = None,
-        *,
-        connect: Connect = None,
-        realm: Realm = "park",
-        lab: Lab = None,
-        identity: As = "operator",
-        as_json: AsJson = False,
-    ) -> int:
-        from agents.network.keys import Keys
+    def order(names: NamesOrAll = None, *, by: Operator) -> int:
+        return _give(what, names or [], by)
 
-        with session("robot", connect, lab, identity, WAIT_S) as opened:
-            return _give(what, names or [], opened, Keys(realm), identity, as_json=as_json)
-
-    return order
+    return with_options(order)
 
 
 def _change_command(what: messages.ChangeKind) -> Callable[..., int]:
-    def change(
-        names: Names,
-        *,
-        connect: Connect = None,
-        realm: Realm = "park",
-        lab: Lab = None,
-        identity: As = "operator",
-        as_json: AsJson = False,
-    ) -> int:
-        from agents.network.keys import Keys
+    def change(names: Names, *, by: Operator) -> int:
         from agents.network.messages import RunOrder
 
-        with session("robot", connect, lab, identity, WAIT_S) as opened:
-            return _change(RunOrder(what, names, who=identity), opened, Keys(realm), as_json=as_json)
+        return _change(RunOrder(what, names, who=by.identity), by)
 
-    return change
+    return with_options(change)
 
 
 for _order, _help in ORDERS.items():
@@ -172,20 +186,10 @@ for _order, _help in ORDERS.items():
 
 
 @robot_app.command(epilog=example("robot stop KH01"))
-def stop(
-    names: Names,
-    *,
-    connect: Connect = None,
-    realm: Realm = "park",
-    lab: Lab = None,
-    identity: As = "operator",
-    as_json: AsJson = False,
-) -> int:
+@with_options
+def stop(names: Names, *, by: Operator) -> int:
     """Cut the motors of robots: a drone falls. `./zenpark estop` cuts those of all."""
-    from agents.network.keys import Keys
-
-    with session("robot", connect, lab, identity, WAIT_S) as opened:
-        return _give("stop", names, opened, Keys(realm), identity, as_json=as_json)
+    return _give("stop", names, by)
 
 
 for _what, _help in CHANGES.items():
@@ -193,6 +197,7 @@ for _what, _help in CHANGES.items():
 
 
 @robot_app.command(epilog=example("robot replace CF02 --with S1", "robot replace KH01 --body twin --at 0.5 -0.2"))
+@with_options
 def replace(
     name: Annotated[
         str,
@@ -209,159 +214,160 @@ def replace(
         Place | None, typer.Option(metavar="X Y", help="Where a twin starts [m]; else as the file says.")
     ] = None,
     yaw: Annotated[float, typer.Option(help="Of a twin that is put somewhere [rad].")] = 0.0,
-    connect: Connect = None,
-    realm: Realm = "park",
-    lab: Lab = None,
-    identity: As = "operator",
-    as_json: AsJson = False,
+    by: Operator,
 ) -> int:
     """Let another body take over a robot's name, links and plan; by default a spare of its kind."""
-    from agents.network.keys import Keys
     from agents.network.messages import RunOrder
 
-    order = RunOrder("replace", [name], who=identity, spare=spare, body=body, at=at, yaw=yaw)
-    with session("robot", connect, lab, identity, WAIT_S) as opened:
-        return _change(order, opened, Keys(realm), as_json=as_json)
+    return _change(RunOrder("replace", [name], who=by.identity, spare=spare, body=body, at=at, yaw=yaw), by)
 
 
-def _tell_world(
-    order: messages.WorldOrder, connect: list[str] | None, realm: str, lab: str | None, identity: str, *, as_json: bool
-) -> int:
+def _tell_world(order: messages.WorldOrder, done: str, by: Operator) -> int:
     """Give an order to the world of a realm and print its reply; the exit code."""
-    from agents.network.keys import Keys
     from experiments.real_time.conductor import orders
 
-    with session("world", connect, lab, identity, WAIT_S) as opened:
-        reply = orders.send_world_order(opened, Keys(realm), order)
-    if as_json:
+    with by.joined() as (opened, keys):
+        reply = orders.send_world_order(opened, keys, order)
+    if by.as_json:
         print_json(reply)
     elif reply.ok:
-        print(f"{done(order)}; the world {'stands still' if reply.paused else 'runs'} at {reply.time:.2f} s")
+        print(f"{done}; the world {'stands still' if reply.paused else 'runs'} at {reply.time:.2f} s")
     else:
         print(f"no: {reply.reason}", file=sys.stderr)
     return int(not reply.ok)
 
 
-def _plain(what: Any) -> Callable[..., int]:  # noqa: ANN401 - a kind of WorldOrder
-    def order(
-        connect: Connect = None,
-        realm: Realm = "park",
-        lab: Lab = None,
-        identity: As = "operator",
-        as_json: AsJson = False,
-    ) -> int:
-        from agents.network.messages import WorldOrder
-
-        return _tell_world(WorldOrder(what), connect, realm, lab, identity, as_json=as_json)
-
-    return order
-
-
-for _pace, _help in (
-    ("pause", "Let the world stand still; robots hold, because their positions are still published."),
-    ("resume", "Let a paused world go on."),
-):
-    world_app.command(name=_pace, help=_help, epilog=example(f"world {_pace}"))(_plain(_pace))
-
-
-@world_app.command(epilog=example("world step --steps 50"))
-def step(
-    *,
-    steps: Annotated[int, typer.Option(min=1, help="Ticks.")] = 1,
-    connect: Connect = None,
-    realm: Realm = "park",
-    lab: Lab = None,
-    identity: As = "operator",
-    as_json: AsJson = False,
-) -> int:
-    """Let a world make some ticks, and pause it."""
+@world_app.command(epilog=example("world pause"))
+@with_options
+def pause(*, by: Operator) -> int:
+    """Let the world stand still; robots hold, because their positions are still published."""
     from agents.network.messages import WorldOrder
 
-    return _tell_world(WorldOrder("step", steps=steps), connect, realm, lab, identity, as_json=as_json)
+    return _tell_world(WorldOrder("pause"), "paused", by)
+
+
+@world_app.command(epilog=example("world resume"))
+@with_options
+def resume(*, by: Operator) -> int:
+    """Let a paused world go on."""
+    from agents.network.messages import WorldOrder
+
+    return _tell_world(WorldOrder("resume"), "goes on", by)
 
 
 @world_app.command(epilog=example("world reset", "world reset KH01"))
+@with_options
 def reset(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A robot or an obstacle. [all]")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A robot. [all, and pushed obstacles]")] = None,
     *,
-    connect: Connect = None,
-    realm: Realm = "park",
-    lab: Lab = None,
-    identity: As = "operator",
-    as_json: AsJson = False,
+    by: Operator,
 ) -> int:
-    """Put a robot or an obstacle of a world back to its start, or all of them."""
+    """Put a robot of a world back to its start, or all of them and what was pushed."""
     from agents.network.messages import WorldOrder
 
-    return _tell_world(WorldOrder("reset", name=name), connect, realm, lab, identity, as_json=as_json)
+    done = f"{name} is back at its start" if name else "all are back at their starts"
+    return _tell_world(WorldOrder("reset", name=name), done, by)
 
 
-@world_app.command(epilog=example("world remove KH01"))
-def remove(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot or an obstacle.")],
+@app.command(epilog=example("estop", "estop --connect @runs/first/network.txt"))
+def estop(
     *,
-    connect: Connect = None,
-    realm: Realm = "park",
-    lab: Lab = None,
-    identity: As = "operator",
-    as_json: AsJson = False,
-) -> int:
-    """Take a robot or an obstacle out of a world."""
-    from agents.network.messages import WorldOrder
-
-    return _tell_world(WorldOrder("remove", name=name), connect, realm, lab, identity, as_json=as_json)
-
-
-@world_app.command(
-    epilog=example(
-        "world spawn KH09 --kind khepera4 --at 0.5 -0.5",
-        'world spawn box1 --obstacle \'{"box": [0.4, 0.2], "mass": 2.0}\' --at 1.0 0.0',
-    )
-)
-def spawn(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot or an obstacle.")],
-    *,
-    kind: Annotated[str | None, typer.Option(help="Of a robot that is not in the file.")] = None,
-    at: Annotated[Place | None, typer.Option(metavar="X Y", help="Where it is put [m].")] = None,
-    yaw: Annotated[float, typer.Option(help="Of a robot that is put in [rad].")] = 0.0,
-    obstacle: Annotated[
-        str | None, typer.Option(metavar="JSON", help='Puts in an obstacle, such as \'{"radius": 0.1, "at": [0, 1]}\'.')
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Only at this router; may be repeated. [all runs of this machine, and the routers of ${CONNECT}]",
+        ),
     ] = None,
-    connect: Connect = None,
-    realm: Realm = "park",
+    realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
+    reason: Annotated[str, typer.Option(metavar="TEXT", help="Sent with the stop.")] = "zenpark estop",
     lab: Lab = None,
-    identity: As = "operator",
+    identity: Annotated[
+        str | None, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab. [the run's operator]")
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Put a robot or an obstacle into a world."""
-    from agents.network.messages import WorldOrder
-    from experiments.file import structure
-    from twins.scene import Obstacle
+    """Cut the motors of every robot of every run of this machine, or at a router."""
+    from agents.network import endpoints as topology
+    from agents.runtime import run_registry
+    from experiments.real_time.conductor.orders import EmergencyStop
 
-    given = None
-    if obstacle is not None:
-        given = structure.parse_object("--obstacle", obstacle, Obstacle, ("arena", "obstacles", name))
-        if at is not None:
-            given["at"] = at
-        if not given.keys() & {"at", "wall"}:
-            raise typer.BadParameter(f"{name} has no place; say where, with --at X Y")
-    order = WorldOrder("spawn", name=name, kind=kind, at=at, yaw=yaw, obstacle=given)
-    return _tell_world(order, connect, realm, lab, identity, as_json=as_json)
+    if given := routers(connect, lab):
+        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], reason, as_json=as_json)
+    up = run_registry.runs()
+    stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
+    known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
+    for others in (_of_environment(lab), [topology.DEFAULT_ENDPOINT]):  # of another machine; of a zenohd, say
+        if others and known.isdisjoint(topology.bare(others)):
+            stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
+            known |= {*topology.bare(others)}
+    return _stop_all(stops, reason, as_json=as_json)
 
 
-def done(order: messages.WorldOrder) -> str:
-    """The effect of an order that the world has obeyed."""
-    match order.order:
-        case "pause":
-            return "paused"
-        case "resume":
-            return "goes on"
-        case "step":
-            return f"makes {order.steps} tick{'s' * (order.steps != 1)}"
-        case "reset":
-            return f"{order.name} is back at its start" if order.name else "all are back at their starts"
-        case "remove":
-            return f"{order.name} is out"
-    what = order.name if order.kind is None else f"{order.name}, a {order.kind},"
-    where = "" if order.at is None else f" at x = {order.at[0]:g} m, y = {order.at[1]:g} m"
-    return f"{what} is in{where}"
+def _of_environment(lab: str | None) -> list[str]:
+    """Routers that the environment names; none if they are wrong, which must not keep the others from being stopped."""
+    import os
+
+    from agents.network.endpoints import EndpointError
+    from agents.network.lab import LabError
+
+    try:
+        return routers(os.environ.get(CONNECT, "").split(), lab)
+    except (EndpointError, LabError) as error:
+        print(f"zenpark: {CONNECT}: {error}", file=sys.stderr)
+        return []
+
+
+def _stop_all(stops: Sequence[EmergencyStop], reason: str, *, as_json: bool) -> int:
+    """Send all stops at the same time and print their results.
+
+    Returns:
+        The exit code: 0, or 1 if a robot has not stopped in time, or if no robot was seen.
+
+    Raises:
+        EndpointError, Unreachable: If no router can be reached.
+    """
+    threads = [threading.Thread(target=stop.send, args=(reason,), daemon=True) for stop in stops]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if as_json:
+        routers_asked = [
+            {
+                "where": stop.where,
+                "stopped": sorted(stop.seen - stop.moving),
+                "not_known_to_have_stopped": sorted(stop.moving),
+                "failure": None if stop.failure is None else str(stop.failure),
+            }
+            for stop in stops
+        ]
+        missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
+        ok = not missed and any(stop.seen for stop in stops)
+        print_json({"ok": ok, "routers": routers_asked})
+        return int(not ok)
+    bad = False
+    seen = [stop for stop in stops if stop.seen]
+    for stop in stops:
+        known = "" if stop.run is None else f" ({stop.where})"
+        if stop.moving:
+            print(f"NOT known to have stopped: {', '.join(sorted(stop.moving))}{known}", file=sys.stderr)
+            bad = True
+        elif stop.seen:
+            print(f"stopped: {', '.join(sorted(stop.seen))}{known}", flush=True)
+        elif stop.expected:
+            why = "no robot is there" if stop.failure is None else str(stop.failure)
+            print(f"NOT known to have stopped: {stop.where}: {why}", file=sys.stderr)
+            bad = True
+    if seen or bad:
+        return int(bad)
+    failures = [stop.failure for stop in stops if stop.failure is not None]
+    if len(failures) == len(stops):
+        raise failures[-1]
+    where = "; ".join(f"in the realm '{stop.realm}' {stop.where}" for stop in stops if stop.failure is None)
+    print(
+        f"NOTHING WAS STOPPED: no robot is seen {where}. Name the router of the run: "
+        "--connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
+        file=sys.stderr,
+    )
+    return 1

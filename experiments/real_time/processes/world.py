@@ -34,7 +34,6 @@ from experiments.real_time.processes.world_population import Population, Refused
 
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # lateness that is caught up; the rest of the time is lost, which shows in the factor
-MOST_STEPS: Final = 1_000_000
 EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
@@ -82,8 +81,9 @@ class WorldProcess:
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
         self.paused = False
-        self._steps = 0
-        self._enter()
+        names = zip(population.names, population.carried.tolist(), strict=True)
+        self._carried = [name for name, here in names if here]
+        self._farewell = Farewell(session, self._keys, self._carried, lost)
 
     def find(self, there: Set[str]) -> list[str]:
         """Places simulated robots that are on the network at the poses of their states; returns their names."""
@@ -128,26 +128,15 @@ class WorldProcess:
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # robots that must land cannot wait
         self._exchange.receive(t)
-        if not self.paused or self._steps:
+        if not self.paused:
             self._exchange.apply_commands(t)
             self._population.advance()
             self._pace.ticks += 1
-            if self._steps:
-                self._steps -= 1
-                changed |= not self._steps
         if self._ownership.settle(self._session, self._ended):
             return
         self._exchange.publish(t)
         if changed:
             self._report(t)
-
-    def _enter(self) -> None:
-        """Follows a change of the rows."""
-        self._exchange.update_rows()
-        population = self._population
-        carried = [name for name, here in zip(population.names, population.carried.tolist(), strict=True) if here]
-        self._carried = carried
-        self._farewell = Farewell(self._session, self._keys, carried, self._lost)
 
     # ------------------------------------------------------------------ orders
 
@@ -168,26 +157,12 @@ class WorldProcess:
         """Raises Refused."""
         population, what = self._population, order.order
         if what == "pause":
-            self.paused, self._steps = True, 0
+            self.paused = True
         elif what == "resume":
-            self.paused, self._steps = False, 0
-        elif what == "step":
-            if not 1 <= order.steps <= MOST_STEPS:
-                raise Refused(f"{order.steps} steps; step takes 1 to {MOST_STEPS} ticks of {1e3 * self._dt:g} ms")
-            self.paused, self._steps = True, order.steps
-        elif what == "reset":
-            population.reset(order.name)
-            self._exchange.update_rows()
+            self.paused = False
         else:
-            if order.name is None:
-                raise Refused(f"{what} needs a name")
-            if what == "remove":
-                population.remove(order.name)
-            elif order.obstacle is not None:
-                population.spawn_obstacle(order.name, order.obstacle)
-            else:
-                population.spawn_robot(order.name, order.kind, order.at, order.yaw)
-            self._enter()
+            population.reset(order.name)
+            self._exchange.restart()
 
     def _report(self, t: float) -> None:
         population, exchange = self._population, self._exchange

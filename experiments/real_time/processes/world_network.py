@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from functools import partial
 from math import inf
 from typing import Final
@@ -58,7 +58,7 @@ class Exchange:
         ownership: OwnershipCheck,
         endpoints: Sequence[str] = (),
     ) -> None:
-        """Subscribes; `update_rows` declares the rest. `endpoints` are those of the session."""
+        """`endpoints` are those of the session."""
         self._population, self._session = population, session
         keys = self._keys = Keys(experiment.network.realm)
         self._encoding = experiment.network.encoding
@@ -68,7 +68,6 @@ class Exchange:
         self._truth_every = max(1, round(experiment.rates.body_hz / TRUTH_HZ))
         # commands to robots with another body are for another simulator
         self._elsewhere = {keys.setpoint(name) for name, robot in experiment.robots.items() if robot.body != WORLD}
-        self._measured = frozenset(Plan(experiment).externally_measured)
         self._clock = Clock()
         self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
@@ -87,75 +86,49 @@ class Exchange:
         )
         self._contacts = pubsub.publisher(session, keys.contact, messages.JSON)
         self._events = pubsub.publisher(session, keys.event, messages.JSON)
-        self._publishers: dict[str, zenoh.Publisher] = {}
-        self._mirrors: dict[str, tuple[int, pubsub.Inbox[messages.State]]] = {}
         self._done: dict[str, int] = {}  # number of the last executed command
-        self._lives: dict[
-            str, str
-        ] = {}  # session that owns the name of a robot: a new one numbers its commands from anew
+        # session that owns the name of a robot: a new one numbers its commands from anew
+        self._lives: dict[str, str] = {}
         self._owners = pubsub.AliveWatch(session, keys.lives(keys.alive("*")))
         self._strangers: set[str] = set()
         self._met: set[frozenset[str]] = set()
         self._started: dict[str, float] = {}
         self._begun = inf
         self._ticks = 0
-        self._names: tuple[str, ...] = ()
-        self._quiet = self._received_at = np.zeros(0)
-        self._place, self._velocity, self._yaw = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        self.update_rows()
+        names = self._names = population.names
+        rows = len(names)
+        self._quiet = np.full(rows, inf)  # begin of the silence of each row; infinity: it needs no command
+        # time and pose of the last state of each mirrored row
+        self._received_at = np.full(rows, -inf)
+        self._place, self._velocity, self._yaw = np.full((rows, 3), np.nan), np.zeros((rows, 3)), np.zeros(rows)
+        self._carried, self._mirrored = np.flatnonzero(population.carried), np.flatnonzero(~population.carried)
+        carried = self._carried.tolist()
+        self._row = {keys.setpoint(names[row]): row for row in carried}
+        measured = frozenset(Plan(experiment).externally_measured)
+        placed = [row for row in carried if names[row] not in measured]
+        self._placed = np.array(placed, dtype=np.intp)
+
+        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[str, zenoh.Publisher]:
+            return {names[row]: pubsub.publisher(session, key(names[row]), self._mime) for row in rows}
+
+        self._positions = publishers(keys.position, placed)
+        self._truths = publishers(keys.truth, carried)
+        self._ranges = publishers(keys.ranges, np.flatnonzero(population.seen).tolist())
+        self._mirrors = [(row, self._states_of(names[row])) for row in self._mirrored.tolist()]
+        self.restart()
 
     def begin(self, monotonic: float) -> None:
         """Sets the clock of the world to 0 at this time of the monotonic clock [s]."""
         self.utc = self._clock.at(monotonic)
 
-    def update_rows(self) -> None:
-        """Follows a change of the rows of the population."""
-        population, keys, session = self._population, self._keys, self._session
-        names, rows = population.names, len(population.names)
-        old = {name: row for row, name in enumerate(self._names)}
-        kept = [(row, old[name]) for row, name in enumerate(names) if name in old]
-        now, was = (np.array([pair[k] for pair in kept], dtype=np.intp) for k in (0, 1))
-        # begin of the silence of each row; infinity: it needs no command
-        self._quiet, quiet = np.full(rows, inf), self._quiet
-        # time and pose of the last state of each mirrored row
-        self._received_at, received_at = np.full(rows, -inf), self._received_at
-        self._place, place = np.full((rows, 3), np.nan), self._place
-        self._velocity, velocity = np.zeros((rows, 3)), self._velocity
-        self._yaw, yaw = np.zeros(rows), self._yaw
-        self._quiet[now], self._received_at[now] = quiet[was], received_at[was]
-        self._place[now], self._velocity[now], self._yaw[now] = place[was], velocity[was], yaw[was]
-        self._names = names
+    def restart(self) -> None:
+        """Follows a body that is made anew: it has no commands, and does not know the mirrored robots."""
+        rows = len(self._names)
         self._held = np.zeros(rows, dtype=bool)
         self._given = np.full((rows, 4), np.nan)  # setpoints since the last step
-        self._carried = np.flatnonzero(population.carried)
-        self._row = {keys.setpoint(names[row]): row for row in self._carried.tolist()}
-        for name in old.keys() - set(names):
-            self._done.pop(name, None)
-        self._strangers -= set(names)
-        self._placed = np.array(
-            [row for row in self._carried.tolist() if names[row] not in self._measured], dtype=np.intp
-        )
-        wanted = {keys.position(names[row]) for row in self._placed.tolist()}
-        wanted |= {keys.truth(names[row]) for row in self._carried.tolist()}
-        wanted |= {keys.ranges(names[row]) for row in np.flatnonzero(population.seen).tolist()}
-        for key in self._publishers.keys() - wanted:
-            self._publishers.pop(key).undeclare()  # type: ignore[no-untyped-call]
-        for key in wanted - self._publishers.keys():
-            self._publishers[key] = pubsub.publisher(session, key, self._mime)
-        self._positions = [(names[row], self._publishers[keys.position(names[row])]) for row in self._placed.tolist()]
-        self._truths = [(names[row], self._publishers[keys.truth(names[row])]) for row in self._carried.tolist()]
-        mirrored = np.flatnonzero(~population.carried)
-        self._mirrored = mirrored
-        there = {names[row]: row for row in mirrored.tolist()}
-        for name in self._mirrors.keys() - there.keys():
-            self._mirrors.pop(name)[1].close()
-        self._mirrors = {
-            name: (row, self._mirrors[name][1] if name in self._mirrors else self._states_of(name))
-            for name, row in there.items()
-        }
         self._scanned = np.full(rows, -inf)
         self._rays: Rays | None = None
-        if len(mirrored):
+        if len(self._mirrored):
             self._update_mirrors()
 
     def restore_positions(self, there: Set[str]) -> list[str]:
@@ -224,16 +197,16 @@ class Exchange:
             holding = np.flatnonzero(silent & ~self._held)
             if len(holding):
                 self._held[holding] = True
-                population.drive(population.holding(holding), holding)
+                population.body.command(population.holding(holding))
             tired = np.flatnonzero(silent & (t - self._quiet > LAND_S) & population.body.engine.flying)
             if len(tired):
-                population.land(tired)
+                population.body.land(tired)
                 self._quiet[tired] = inf
                 for row in tired.tolist():
                     self.publish_event("silent", self._names[row], f"lands: no command for {LAND_S:g} s")
         given = np.isfinite(self._given[:, 0])
         if some(given):
-            population.drive(self._given, np.flatnonzero(given))
+            population.body.command(self._given)
             self._given = np.full_like(self._given, np.nan)
 
     def _obey(self, row: int, command: messages.Command, t: float) -> None:
@@ -247,7 +220,7 @@ class Exchange:
             population.takeoff(row, command.height)
             self._quiet[row] = t + CLIMB_S
         else:
-            (population.land if action == "land" else population.stop)(np.array([row]))
+            (population.body.land if action == "land" else population.body.stop)(np.array([row]))
             self._quiet[row] = inf
 
     def _note_owner(self, token: str) -> None:
@@ -278,14 +251,13 @@ class Exchange:
             self.publish_event(
                 "refused",
                 "world",
-                f"{name} gets commands, but is not in this world: start the world with the experiment that has "
-                f"it, or add it with `./zenpark world spawn {name}`",
+                f"{name} gets commands, but is not in this world: start the world with the experiment that has it",
             )
 
     def _update_poses(self, t: float) -> None:
         """Updates the poses of mirrored robots."""
         changed = False
-        for row, inbox in self._mirrors.values():
+        for row, inbox in self._mirrors:
             state = self._newest(inbox)
             if state is not None and state.position is not None:
                 self._place[row], self._velocity[row] = state.position, state.velocity or messages.STILL
@@ -364,12 +336,10 @@ class Exchange:
         self.trouble = reason
         self.publish_event("refused", source, reason)
 
-    def _publish(
-        self, publishers: list[tuple[str, zenoh.Publisher]], position: Array, yaw: Array, stamp: float
-    ) -> None:
+    def _publish(self, publishers: Mapping[str, zenoh.Publisher], position: Array, yaw: Array, stamp: float) -> None:
         encoding = self._encoding
         for (name, publisher), place, heading in zip(
-            publishers, position.round(6).tolist(), yaw.round(6).tolist(), strict=True
+            publishers.items(), position.round(6).tolist(), yaw.round(6).tolist(), strict=True
         ):
             publisher.put(messages.encode(messages.position(name, stamp, place, heading), encoding))
 
@@ -384,4 +354,4 @@ class Exchange:
             self._scanned[row] = time[k]
             scan = RangeScan(0.0, rays.bearing[part], rays.elevation[part], rays.distance[part])
             message = range_inbox.message(self._names[row], stamp, scan)
-            self._publishers[self._keys.ranges(self._names[row])].put(messages.encode(message, self._encoding))
+            self._ranges[self._names[row]].put(messages.encode(message, self._encoding))

@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, Recovered, recover
 from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
-from tools.commands import run as commands
+from tools.commands import results as commands
 
 KILLED = """
 from pathlib import Path

@@ -16,7 +16,7 @@ from experiments.recording.run_folder import SOURCE
 from experiments.report import export
 from experiments.report.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
 from experiments.run import simulate
-from tools.commands import run as commands
+from tools.commands import results as commands
 
 scipy_io = pytest.importorskip("scipy.io")
 

@@ -7,8 +7,6 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from experiments.definition.experiment import Arena, Experiment, Robot, World
 from experiments.real_time.processes.world_population import Population, Refused
@@ -50,10 +48,9 @@ def at(world: Population, name: str) -> list[float]:
 def go(world: Population, ticks: int, **setpoints: tuple[float, float, float, float]) -> None:
     for _ in range(ticks):
         given = np.full((len(world.names), 4), np.nan)
-        rows = np.array([row(world, name) for name in setpoints], dtype=np.intp)
         for name, setpoint in setpoints.items():
             given[row(world, name)] = setpoint
-        world.drive(given, rows)
+        world.body.command(given)
         world.advance()
 
 
@@ -79,31 +76,6 @@ def test_who_asks_for_ranges_gets_sensors_without_being_carried() -> None:
     assert world.seen.tolist() == [True, False]
 
 
-def test_those_who_stay_go_on_when_others_come_and_go(world: Population) -> None:
-    world.takeoff(row(world, "CF01"), 0.6)
-    go(world, 90, KH01=(0.2, 0.1, 0.0, 0.0))
-    before, height = at(world, "KH01"), at(world, "CF01")[2]
-    assert 0.05 < height < 0.5
-    world.spawn_robot("KH02", "khepera4", (0.5, -0.5), 1.0)
-    assert world.names == ("KH01", "CF01", "TB01", "KH02")
-    assert at(world, "KH01") == before
-    assert at(world, "CF01")[2] == pytest.approx(height, abs=1e-6)
-    assert at(world, "KH02") == [0.5, -0.5, 0.0]
-    go(world, 250)
-    assert at(world, "CF01")[2] == pytest.approx(0.6, abs=0.01), "its climb goes on"
-    world.remove("KH01")
-    world.land(np.array([row(world, "CF01")]))
-    go(world, 20)
-    world.remove("TB01")
-    go(world, 250)
-    assert world.names == ("CF01", "KH02")
-    assert at(world, "CF01") == [0.0, 1.0, 0.0]
-    assert not world.body.engine.flying.any()
-    world.spawn_robot("KH01", None, None, 0.0)
-    assert at(world, "KH01") == [0.0, 0.0, 0.0], "a robot of the file comes back to its start"
-    assert world.time == pytest.approx(6.1)
-
-
 def test_reset_puts_back_and_leaves_in_the_air_what_flies(world: Population) -> None:
     world.takeoff(row(world, "CF01"), 0.6)
     go(world, 250)
@@ -120,90 +92,39 @@ def test_reset_puts_back_and_leaves_in_the_air_what_flies(world: Population) -> 
     assert at(world, "CF01") == [0.0, 1.0, pytest.approx(0.6, abs=0.01)], "it holds there"
     with pytest.raises(Refused, match="TB01 is only mirrored here"):
         world.reset("TB01")
-    world.spawn_robot("KH02", "khepera4", (1.0, 1.0), 0.0)
     go(world, 200, KH01=(0.2, 0.0, 0.0, 0.0))
-    world.put("KH02", (0.0, 0.0, 0.0), 0.0, flying=False)
-    with pytest.raises(Refused, match="KH01 would overlap KH02 by 140 mm"):
+    world.put("CF01", (0.0, 0.0, 0.0), 0.0, flying=False)
+    with pytest.raises(Refused, match=r"KH01 would overlap CF01 by \d+ mm: move that first"):
+        world.reset("KH01")
+    with pytest.raises(Refused, match=r"there is no 'KH02' in this world; did you mean 'KH01'\?"):
+        world.reset("KH02")
+
+
+def test_reset_puts_back_what_was_pushed_and_lets_time_go_on() -> None:
+    given = experiment(KH01=Robot(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
+    arena = msgspec.structs.replace(given.arena, obstacles={"crate": msgspec.structs.replace(CRATE, mass=0.2)})
+    world = Population(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk")))
+    go(world, 400, KH01=(0.2, 0.0, 0.0, 0.0))
+    assert world.obstacles()["crate"][0] < -1.55
+    world.reset(None)
+    assert world.obstacles()["crate"] == (-1.5, -1.0, pytest.approx(math.pi / 2, abs=1e-6))
+    assert at(world, "KH01") == [-1.0, -1.0, 0.0]
+    assert world.time == pytest.approx(4.0)
+
+
+def test_nothing_is_put_back_into_an_obstacle() -> None:
+    cart = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [0.0, 1.0], "speed": 0.5})
+    given = experiment()
+    world = Population(
+        msgspec.structs.replace(given, arena=msgspec.structs.replace(given.arena, obstacles={"cart": cart}))
+    )
+    world.begin(0.0)
+    go(world, 300)
+    with pytest.raises(Refused, match="KH01 would overlap cart by 170 mm: reset all"):
         world.reset("KH01")
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "place", "why"),
-    [
-        ("KH01", None, None, "KH01 is in this world already; remove it first, or reset it"),
-        ("KH02", None, (0.5, 0.5), "a new robot needs its kind and a place"),
-        ("KH02", "roomba", (0.5, 0.5), "there is no kind of robot 'roomba'; known: crazyflie"),
-        ("KH 2", "khepera4", (0.5, 0.5), "'KH 2' cannot be a name"),
-        ("world", "khepera4", (0.5, 0.5), "'world' cannot be a name"),
-        ("KH02", "khepera4", (0.1, 0.05), "KH02 would overlap KH01 by 28 mm"),
-        ("KH02", "khepera4", (1.94, 0.0), "outside the arena, which is 4 by 4 m"),
-        ("KH02", "khepera4", (math.nan, 0.0), "finite numbers"),
-        ("KH02", "khepera4", (1.4, 1.4), "KH02 would overlap post by 29 mm"),
-        ("KH02", "khepera4", (-1.5, -0.75), "KH02 would overlap crate by 20 mm"),
-        ("KH02", "khepera4", (-1.35, -1.0), "KH02 would overlap crate by 20 mm"),
-        ("KH02", "khepera4", (-1.5, -1.0), "KH02 would overlap crate by 170 mm"),
-        ("KH02", "khepera4", (0.3, -1.45), "KH02 would overlap fence by 20 mm"),
-        ("KH02", "khepera4", (0.55, -1.5), "KH02 would overlap fence by 20 mm"),
-    ],
-)
-def test_who_cannot_come_in(
-    world: Population, name: str, kind: str | None, place: tuple[float, float] | None, why: str
-) -> None:
-    with pytest.raises(Refused, match=why):
-        world.spawn_robot(name, kind, place, 0.0)
-    assert world.names == ("KH01", "CF01", "TB01")
-
-
-def test_there_is_room_beside_over_and_under(world: Population) -> None:
-    world.spawn_robot("KH02", "khepera4", (0.1401, 0.0), 0.0)
-    world.spawn_robot("KH03", "khepera4", (1.5, -1.5), 0.0)  # the shelf hangs half a metre over it
-    world.takeoff(row(world, "CF01"), 0.6)
-    go(world, 250)
-    world.spawn_robot("KH04", "khepera4", (0.0, 1.0), 0.0)
-    assert at(world, "KH04") == [0.0, 1.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "why"),
-    [
-        ("post", {"radius": 0.1}, "there is something called post already"),
-        ("KH01", {"radius": 0.1}, "there is something called KH01 already"),
-        ("wall", {"radius": 0.1, "at": [1, 1]}, "'wall' cannot be a name"),
-        ("box", {"radius": 0.1}, "box would overlap KH01"),
-        ("box", {"radius": 0.1, "at": [1.95, 0]}, "out of the arena, which is 4 by 4 m"),
-        ("box", {"box": [1.0, 1.0], "at": [1.4, 1.4], "yaw": 0.785}, "out of the arena"),
-        ("box", {"at": [1, 1]}, "box is no obstacle: .*exactly one of box, radius and wall"),
-        (
-            "box",
-            {"radius": -1.0, "at": [1, 1]},
-            "box is no obstacle: 'radius' must be a number > 0, not -1.0",
-        ),
-        ("box", {"radius": 0.1, "at": [math.nan, 1]}, "a number is not finite"),
-        ("box", {"radius": 0.1, "at": [1, 1], "plan": "dance"}, "box is no obstacle: no 'dance' among the planners"),
-        ("box", {"radius": 0.1, "at": [1, 1], "colour": "red"}, "box is no obstacle: .*colour"),
-    ],
-)
-def test_which_obstacle_cannot_stand(world: Population, name: str, given: dict[str, object], why: str) -> None:
-    with pytest.raises(Refused, match=why):
-        world.spawn_obstacle(name, given)
-    assert list(world.obstacles()) == ["post", "crate", "fence", "shelf"]
-
-
-def test_obstacles_come_and_go(world: Population) -> None:
-    world.spawn_obstacle("lamp", {"radius": 0.2, "at": [0.0, 0.0], "bottom": 0.5})
-    assert world.obstacles()["lamp"] == (0.0, 0.0, 0.0)
-    world.remove("post")
-    assert list(world.obstacles()) == ["crate", "fence", "shelf", "lamp"]
-    assert world.obstacles()["crate"] == (-1.5, -1.0, pytest.approx(math.pi / 2, abs=1e-6))
-    with pytest.raises(Refused, match=r"there is no 'lamb' in this world; did you mean 'lamp'\?"):
-        world.remove("lamb")
-    world.remove("KH01")
-    world.remove("TB01")
-    with pytest.raises(Refused, match="CF01 is the last robot of this world: end the world instead"):
-        world.remove("CF01")
-
-
-def test_what_moves_by_a_plan_begins_with_the_run_and_goes_on_when_somebody_comes() -> None:
+def test_what_moves_by_a_plan_begins_with_the_run_and_goes_on_after_a_reset() -> None:
     belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
     given = experiment()
     arena = msgspec.structs.replace(given.arena, obstacles={"belt": belt})
@@ -214,7 +135,7 @@ def test_what_moves_by_a_plan_begins_with_the_run_and_goes_on_when_somebody_come
     go(world, 150)
     assert world.obstacles()["belt"][0] == pytest.approx(0.5, abs=0.05)
     moved = world.obstacles()["belt"][0]
-    world.spawn_robot("KH02", "khepera4", (-1.0, 1.0), 0.0)
+    world.reset(None)
     go(world, 20)
     assert world.obstacles()["belt"][0] == pytest.approx(moved + 0.1, abs=0.03)
 
@@ -234,30 +155,6 @@ def test_contacts_have_names() -> None:
     pairs = {frozenset((meeting.first, meeting.second)) for meeting in found}
     assert pairs == {frozenset(("KH01", "KH02")), frozenset(("KH03", "wall")), frozenset(("KH04", "post"))}
     assert all(meeting.impulse > 0.0 and meeting.overlap < 1e-3 for meeting in found)
-
-
-number = st.floats(allow_nan=True, allow_infinity=True)
-place = st.tuples(number, number) | st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
-
-
-@pytest.fixture(scope="module")
-def busy() -> Population:
-    return Population(experiment())
-
-
-@settings(max_examples=100)
-@given(st.text(max_size=4) | st.just("KH09"), place, number)
-def test_whatever_is_ordered_ends_well(busy: Population, name: str, where: tuple[float, float], yaw: float) -> None:
-    """Robots that were let in do not overlap; everything else is `Refused`."""
-    try:
-        busy.spawn_robot(name, "khepera4", where, yaw)
-    except Refused:
-        return
-    there = busy.state.true_position[busy.carried, :2]
-    apart = np.linalg.norm(there[:, None] - there, axis=2) + 10.0 * np.eye(len(there))
-    assert apart.min() > 0.065 + 0.07 - 1e-9
-    assert (np.abs(there) < 2.0).all()
-    busy.remove(name)
 
 
 def test_wheels_stop_without_commands_only_with_a_watchdog(world: Population) -> None:

@@ -1,0 +1,375 @@
+"""Commands that read results (report, compare, export, recover) and find or remove their folders (runs, clean)."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from tools import completion
+from tools.commands.options import AsJson, example, print_json
+
+if TYPE_CHECKING:
+    from experiments.recording.run_folder import PastRun
+    from experiments.run import Run
+
+app: Final = typer.Typer()
+
+
+@app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
+def report(
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders of runs.",
+            autocompletion=completion.folders,
+        ),
+    ],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+    *,
+    label: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Of each run of a comparison, in order. [A, B, ...]")
+    ] = None,
+    width: Annotated[
+        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of the files in figures/: 3.5 or 7.16.")
+    ] = 3.5,
+    as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs) instead.")] = False,
+    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """Write the report of one run, or compare several."""
+    from experiments.recording.reader import RecordingError
+    from experiments.report import report as pages  # matplotlib takes 0.6 s
+    from experiments.report import typeset
+    from experiments.run import reopen
+
+    labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
+    _refuse_labels(labels, runs)
+    read = [reopen(folder) for folder in runs]
+    for folder, run in zip(runs, read, strict=True):
+        if not run.traces:
+            raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
+    named = [(name, list(run.traces.values())) for name, run in zip(labels, read, strict=True)]
+    if as_latex or as_markdown:
+        cases = pages.labelled(named) if len(read) > 1 else list(read[0].metrics.values())
+        print((typeset.latex if as_latex else typeset.markdown)(pages.result_tables(cases)))
+        return 0
+    target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
+    try:
+        if len(read) == 1:
+            write_figures_of_merit(read, target)
+            page = write_report(read, target, width)
+        else:
+            page = pages.compare(target, named, differences=_differences(labels, runs))
+    except OSError as error:
+        raise RecordingError(
+            f"{target}: cannot be written: {error.strerror}; choose another place with --out"
+        ) from None
+    if as_json:
+        print_json({"report": page, "runs": [{"folder": run.folder, **run.summary()} for run in read]})
+    else:
+        print(page)
+    return 0
+
+
+def _refuse_labels(labels: Sequence[str], runs: Sequence[str]) -> None:
+    """Raise DocumentError unless each run has a label."""
+    from experiments.file.problems import DocumentError, Problem
+
+    if len(labels) != len(runs):
+        message = f"{len(labels)} labels for {len(runs)} runs"
+        raise DocumentError([Problem("--label", 0, 0, message, "give one for each run, in their order")])
+
+
+def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:
+    """Label and folder of each run, and how it differs from the first one; of those that keep their file."""
+    from experiments.recording.run_folder import differences, past_runs
+
+    past = {run.folder: run for run in past_runs([Path(folder) for folder in folders])}
+    known = [(name, past[str(Path(folder))]) for name, folder in zip(labels, folders, strict=True)
+             if str(Path(folder)) in past]  # fmt: skip
+    return [(name, run.folder, differences(known[0][1], run)) for name, run in known]
+
+
+@app.command(epilog=example("compare runs/first runs/second --json"))
+def compare(
+    folders: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...", help="Folders of runs, or folders full of them.", autocompletion=completion.folders
+        ),
+    ],
+    out: Annotated[str | None, typer.Option(metavar="FILE", help="Write a page with figures as well.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
+    from experiments.recording.reader import RecordingError
+    from experiments.recording.run_folder import differences, past_runs
+    from tools.progress import columns
+
+    # in the given order: the first one is the reference
+    found = [run for folder in folders for run in past_runs([Path(folder)])]
+    found = list({run.folder: run for run in found}.values())
+    if len(found) < 2:
+        raise RecordingError(
+            f"{', '.join(folders)}: {len(found)} runs there; name two or more (`./zenpark runs --past`)"
+        )
+    first = found[0]
+    differ = {run.folder: differences(first, run) for run in found[1:]}
+    if as_json:
+        print_json({"reference": first.folder, "runs": found, "differences": differ})
+    else:
+        print(f"reference: {first.folder}")
+        for folder, each in differ.items():
+            print(f"{folder}: {'; '.join(each) or 'the same file, seeds, code and versions'}")
+        reference = next(iter(first.cases.values()), {})
+        rows = []
+        for run in found:
+            for case, figures in run.cases.items():
+                cells = [f"{figure(figures[name])}{_ratio(figures[name], reference.get(name))}" for name in figures]
+                rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
+        head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s")
+        print()
+        print("\n".join(columns([head, *rows])))
+    return report([run.folder for run in found], out) if out is not None else 0
+
+
+def _ratio(value: float | None, reference: float | None) -> str:
+    """A figure as a multiple of the reference's, behind it; empty if one is not known."""
+    return f" ({value / reference:.3g}×)" if value is not None and reference else ""
+
+
+@app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
+def export(  # noqa: PLR0917 - a command line
+    folder: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN",
+            help="Folder of a run.",
+            autocompletion=completion.folders,
+        ),
+    ],
+    target: Annotated[
+        str | None, typer.Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in the run's folder]")
+    ] = None,
+    as_csv: Annotated[bool, typer.Option("--csv", help="A table of trajectories: case, time, robot, x, ...")] = False,
+    as_bundle: Annotated[
+        bool, typer.Option("--bundle", help="All that is needed to repeat it: an archive for a paper's supplement.")
+    ] = False,
+    video: Annotated[
+        Path | None, typer.Option("--video", metavar="FILE", help="A film of all cases: FILE.mp4 (by ffmpeg) or .gif.")
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.1, max=100.0, help="Of a film: how much faster than the run.")] = 4.0,
+    as_json: AsJson = False,
+) -> None:
+    """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
+    from experiments.recording import bundle
+    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat, write_video
+    from experiments.run import reopen
+
+    if video is not None and (target or as_csv or as_bundle or video.suffix.lower() not in (".mp4", ".gif")):
+        raise ExportError(f"{video}: name the film behind --video alone, with .mp4 or .gif at its end")
+    own = video.suffix if video else ".csv" if as_csv else ".zip" if as_bundle else ".mat"
+    place = Path(folder).resolve()
+    usual = place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
+    file = video or (Path(target) if target else usual)
+    suffix = file.suffix.lower()
+    if (video is None and suffix not in (".mat", ".csv", ".zip")) or (suffix != own and (as_csv or as_bundle)):
+        raise ExportError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
+    if suffix == ".mat":
+        require_savemat()  # before a long recording is read
+    found = reopen(Path(folder))
+    if not found.traces:
+        raise ExportError(f"{folder}: no case had begun; there is nothing to export")
+    if suffix == ".mat":
+        write_mat(found.traces, found.metrics, file)
+    elif suffix == ".zip":
+        bundle.write(Path(folder), file, [trace.experiment for trace in found.traces.values()])
+    elif video is not None:
+        write_video(found.traces, file, speed)
+    else:
+        write_csv(found.traces, file)
+    if as_json:
+        print_json({"file": file, "cases": list(found.traces)})
+    else:
+        print(f"{file}: {', '.join(found.traces)}")
+
+
+@app.command(epilog=example("recover runs/first/event.mcap"))
+def recover(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A recording that was cut off.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="Where the whole one goes.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repair a recording whose writer was killed."""
+    from experiments.recording.reader import recover as repair
+
+    source = Path(file)
+    chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
+    found = repair(source, chosen)
+    if as_json:
+        print_json(
+            {
+                "file": source if found.complete else chosen,
+                "was_whole": found.complete,
+                "messages": found.messages,
+                "robots": found.robots,
+            }
+        )
+        return
+    what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
+    print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
+
+
+def write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
+    """Write `metrics.csv` and `metrics.json` of a run into its folder."""
+    from experiments.report import metrics_files
+
+    folder.mkdir(parents=True, exist_ok=True)
+    every = [case for each in runs for case in each.metrics.values()]
+    metrics_files.write_csv(folder / "metrics.csv", every)
+    metrics_files.write_json(folder / "metrics.json", every)
+
+
+def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
+    """Write figures and report of a run into its folder; return the report."""
+    from experiments.report import report as pages
+    from experiments.report import style as figures
+    from experiments.report.page import date_of
+
+    every = [case for each in runs for case in each.metrics.values()]
+    traces = [trace for each in runs for trace in each.traces.values()]
+    for name, figure in runs[0].figures(width).items():
+        figures.save(figure, folder / "figures", name)
+    return pages.write(
+        folder,
+        traces,
+        date=date_of(runs[0].made),
+        run=runs[0].folder,
+        text=runs[0].source,
+        measured=every,
+        notes=[n for each in runs for n in each.notes],
+    )
+
+
+def figure(value: float | None) -> str:
+    return "?" if value is None else f"{value:.3g}"
+
+
+Words = Annotated[
+    list[str] | None, typer.Argument(metavar="[WORD...]", help="Runs with all of these as tag, or in name and title.")
+]
+Below = Annotated[list[str] | None, typer.Option("--in", metavar="FOLDER", help="Where to look for runs. [runs]")]
+
+
+@app.command(epilog=example("runs", "runs --past paper --json"))
+def runs(
+    words: Words = None,
+    *,
+    past: Annotated[bool, typer.Option("--past", help="Those that are over.")] = False,
+    below: Below = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
+    if past or words or below:
+        return _show_past(words or [], below, as_json=as_json)
+    return _show_running(as_json=as_json)
+
+
+def _show_running(*, as_json: bool) -> None:
+    import msgspec
+
+    from agents.runtime import run_registry
+
+    found = run_registry.runs()
+    if as_json:
+        print_json([{**msgspec.to_builtins(run), "alive": run.alive} for run in found])
+        return
+    for run in found:
+        since = time.strftime("%H:%M:%S", time.localtime(run.since))
+        died = "" if run.alive else "; its process has died"
+        print(f"{run.title}  since {since}, pid {run.pid}, at {run.where}, realm {run.realm}{died}")
+        if run.folder:
+            print(f"  {run.folder}")
+        if run.robots:
+            print("  " + ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items()))
+    if not found:
+        print("no run is up on this machine")
+
+
+def _past(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
+    from experiments.recording.run_folder import RUNS, past_runs
+
+    folders = [Path(each) for each in below] if below else [RUNS]
+    return [run for run in past_runs(folders) if run.matches(words)]
+
+
+def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
+    from experiments.recording.run_folder import day_of
+    from tools.progress import columns
+
+    found = _past(words, below)
+    if as_json:
+        print_json(found)
+        return
+    if not found:
+        print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
+        return
+    head = ("when, UTC", "run", "case", "1/s", "IAE", "RMSE, m", "acquired, s", "MB", "tags")
+    rows = []
+    for run in found:
+        clock = " (virtual)" * run.origin.virtual
+        first = [day_of(run), f"{run.folder}{clock}"]
+        for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
+            values = ["-" if value is None else f"{value:.3g}" for value in figures.values()] or ["-"] * 4
+            last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
+            rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
+    print("\n".join(columns([head, *rows])))
+    print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB")
+
+
+@app.command(epilog=example("clean --older 30", "clean --older 30 --recordings --yes"))
+def clean(
+    words: Words = None,
+    *,
+    older: Annotated[float | None, typer.Option(min=0.0, metavar="DAYS", help="Older than this.")] = None,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Only recordings and logs; figures, report and file stay.")
+    ] = False,
+    tagged: Annotated[bool, typer.Option("--tagged", help="Also runs that have a tag.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Does it; else it is only shown.")] = False,
+    below: Below = None,
+) -> int:
+    """Remove folders of past runs: those of some words or age, never one with a tag or one that is up."""
+    import shutil
+
+    from agents.runtime import run_registry
+    from experiments.recording.run_folder import age_days
+
+    if not words and older is None:
+        raise typer.BadParameter("say which: words, or --older DAYS (0: all)")
+    up = {Path(run.folder).resolve() for run in run_registry.runs() if run.folder}
+    now = time.time()
+    chosen = [
+        run
+        for run in _past(words or [], below)
+        if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
+        if older is None or age_days(run, now) > older
+    ]
+    for run in chosen:
+        folder = Path(run.folder)
+        parts = [*folder.glob("*.mcap"), *folder.glob("logs")] if recordings else [folder]
+        try:
+            for part in parts if yes else ():
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
+        except OSError as error:
+            print(f"zenpark: {error.filename}: cannot be removed: {error.strerror}", file=sys.stderr)
+            return 1
+        print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
+    print(f"runs: {len(chosen)}" + ("" if yes or not chosen else "; --yes does it"))
+    return 0
