@@ -1,17 +1,24 @@
-"""A recording played onto the network: keys and payloads as flown, for every tool that looks at a run."""
+"""A recording played onto the network: keys and payloads as flown, for every tool that looks at a run.
+
+The replay owns the names of its robots (`agents.network.name_ownership`): a robot that starts is refused, and the
+replay ends as soon as another process owns one of them.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import zenoh
 
+from agents.clock import Clock as Utc
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
+from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.recording.reader import RecordingError, Records
@@ -75,43 +82,60 @@ class Broadcast:
         self._publishers: dict[str, Any] = {}
         self._declared: list[object] = []
 
-    def run(self, ended: threading.Event, clock: Clock) -> int:
+    def run(self, ended: threading.Event, clock: Clock, endpoints: Sequence[str] = ()) -> int:
         """Plays; returns the number of messages that were sent.
 
         Args:
             ended: Ends it when set.
             clock: From 0 to the length of the recording [s]; its speed, loop and pauses are followed.
+            endpoints: Those of the session.
 
         Raises:
-            Occupied: If a run is up in the realm, before or while it plays.
+            Occupied: If a run or a robot is up in the realm, before or while it plays.
+            Unreachable: If no router answers.
         """
-        keys, names = self.keys, {self.keys.alive(name) for name in self.experiment.robots}
-        watches = [pubsub.AliveWatch(self._session, key) for key in (keys.conductor, keys.alive("*"), keys.world_alive)]
+        keys, names = self.keys, [self.keys.alive(name) for name in self.experiment.robots]
+        began, mine = Utc().utc(), str(self._session.zid())
+        owners = Keys.life(keys.alive("*"), "*")
+        watched = (keys.conductor, keys.alive("*"), owners, keys.world_alive)
+        watches = [pubsub.AliveWatch(self._session, key) for key in watched]
         self._declared += watches
-        until, strangers = time.monotonic() + SEEN_S, set[str]()
-        while time.monotonic() < until and not ended.wait(STEP_S):
-            strangers |= {token for watch in watches for token, there in watch.changes() if there}
-        if strangers:
-            raise Occupied(_occupied(keys, strangers))
-        announced = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
-        announced.put(document.case_document(self.experiment, self.case))
-        self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in sorted(names))]
-        count = at = 0
-        last, now = clock.t, time.monotonic()
-        while not ended.wait(STEP_S):
-            strangers = {t for watch in watches for t, there in watch.changes() if there and t not in names}
-            if strangers:
+
+        def refuse_strangers(own: Sequence[str] = ()) -> None:
+            found = {token for watch in watches for token, there in watch.changes() if there}
+            if strangers := {token for token in found if token not in own and Keys.life_of(token) != mine}:
                 raise Occupied(_occupied(keys, strangers))
-            now, before = time.monotonic(), now
-            clock.advance(now - before)
-            if clock.t < last:
-                at = 0  # the loop begins again
-            last = clock.t
-            while at < len(self._sent) and self._sent[at][0] * 1e-9 - self.begin <= clock.t:
-                self._send(*self._sent[at][1:])
-                at, count = at + 1, count + 1
-            if at >= len(self._sent) and not clock.loop:
-                break
+
+        until = time.monotonic() + SEEN_S
+        while time.monotonic() < until and not ended.wait(STEP_S):
+            refuse_strangers()
+        count = at = 0
+        if ended.is_set():
+            return count
+        ownership = OwnershipCheck(names)
+        try:
+            self._declared.append(claim(self._session, names, began=began, endpoints=endpoints, stop=ended))
+            announced = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
+            announced.put(document.case_document(self.experiment, self.case))
+            self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in names)]
+            last, now = clock.t, time.monotonic()
+            while not ended.wait(STEP_S):
+                ownership.settle(self._session, ended.is_set)
+                refuse_strangers(names)
+                now, before = time.monotonic(), now
+                clock.advance(now - before)
+                if clock.t < last:
+                    at = 0  # the loop begins again
+                last = clock.t
+                while at < len(self._sent) and self._sent[at][0] * 1e-9 - self.begin <= clock.t:
+                    self._send(*self._sent[at][1:])
+                    at, count = at + 1, count + 1
+                if at >= len(self._sent) and not clock.loop:
+                    break
+        except NameTaken as taken:
+            raise Occupied(_occupied(keys, set(str(taken).split(", ")))) from None
+        finally:
+            ownership.end()
         return count
 
     def _send(self, channel: int, data: bytes) -> None:
@@ -136,7 +160,8 @@ class Broadcast:
 
 
 def _occupied(keys: Keys, tokens: set[str]) -> str:
+    shown = sorted({token.partition("/life/")[0] for token in tokens})[:3]
     return (
-        f"in the realm '{keys.realm}' a run is up ({', '.join(sorted(tokens)[:3])}): robots would take the recording "
+        f"in the realm '{keys.realm}' a run is up ({', '.join(shown)}): robots would take the recording "
         "for their neighbours; name another realm (--realm replay), or wait for its end"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.run import simulate
 from tests.conftest import RouterProcess
-from tests.system.lab import Watcher, typed, zenpark
+from tests.system.lab import RobotProcess, Started, Watcher, typed, zenpark
 from tests.tools.commands.test_live_table import STATUS
 
 pytestmark = pytest.mark.system
@@ -91,3 +92,31 @@ def test_a_recording_is_played_with_keys_and_payloads_as_flown(
     assert "a run is up (park/run/conductor)" in refused.stderr
     token.undeclare()  # type: ignore[no-untyped-call]
     listening.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_a_replay_owns_the_names_of_its_robots_and_ends_when_it_was_replaced(
+    router: RouterProcess, watcher: Watcher, tmp_path: Path
+) -> None:
+    simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
+    played = Started("tools.guard", "replay", str(tmp_path), "--loop", "--connect", router.endpoint)
+    robots = []
+    try:
+        watcher.until(lambda: watcher.phase("KH01") and "KH01" in watcher.alive, "it plays")
+        robots.append(RobotProcess(router.endpoint, "triangle", "KH01"))
+        assert robots[0].process.wait(30.0) == 2
+        assert robots[0].process.stdout is not None
+        assert "KH01: a robot of this name is on the network already" in robots[0].process.stdout.read()
+        assert played.process.poll() is None
+        played.process.send_signal(signal.SIGSTOP)
+        watcher.until(lambda: "KH01" not in watcher.alive, "its lease is over")
+        robots.append(RobotProcess(router.endpoint, "triangle", "KH01"))
+        watcher.until(lambda: "KH01" in watcher.alive, "the robot is there")
+        played.process.send_signal(signal.SIGCONT)
+        assert played.process.wait(30.0) == 2
+        assert played.process.stdout is not None
+        assert "a run is up (park/KH01/alive)" in played.process.stdout.read()
+        assert robots[1].process.poll() is None
+    finally:
+        played.process.send_signal(signal.SIGCONT)
+        for each in [played, *robots]:
+            each.end()

@@ -208,7 +208,8 @@ def replay(
     file = _recordings(Path(run), case)[0]
     ended = threading.Event()
     with on_termination(ended.set):
-        opened = open_session(routers(connect, lab) or [DEFAULT_ENDPOINT], name="replay", wait_s=5.0, identity=identity)
+        endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
+        opened = open_session(endpoints, name="replay", wait_s=5.0, identity=identity)
         with held(opened) as (session, declared):
             played = Broadcast(session, file, realm)
             declared.append(played)
@@ -219,7 +220,7 @@ def replay(
             if seconds is not None:
                 threading.Timer(seconds, ended.set).start()
             print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)
-            print(f"messages sent: {played.run(ended, clock)}")
+            print(f"messages sent: {played.run(ended, clock, endpoints)}")
 
 
 def _pause_on_enter(clock: Clock) -> None:
