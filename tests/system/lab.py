@@ -73,11 +73,13 @@ class Looking:
         raise NotImplementedError
 
     def until(self, true: Callable[[], object], what: str, limit_s: float = PATIENCE_S) -> None:
-        """Looks until something is true."""
+        """Looks until something is true; while it asks for a robot that has said nothing yet, it is not."""
 
         def seen() -> object:
             self.look()
-            return true()
+            with contextlib.suppress(KeyError):
+                return true()
+            return False
 
         until(seen, what, limit_s)
 
@@ -219,7 +221,7 @@ class Flight:
     def said(self) -> str:
         return Path(self._errors.name).read_text()
 
-    def until_said(self, pattern: str, limit_s: float = PATIENCE_S) -> None:
+    def until_said(self, pattern: str, limit_s: float = 2.0 * PATIENCE_S) -> None:
         def said_or_over() -> bool:
             return bool(re.search(pattern, self.said())) or self.process.poll() is not None
 

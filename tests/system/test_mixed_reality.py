@@ -35,7 +35,7 @@ hears = "{hears}"
 [[timeline]]
 at_s = 2.0
 robot = "{twin}"
-plan = {{ kind = "waypoints", points = [[0.6, 0.0]], speed = 0.12 }}
+plan = {{ kind = "waypoints", points = [[0.6, 0.0]], speed = 0.2 }}
 """
 ON_THE_FLOOR = """
 [robots.TB01]

@@ -13,7 +13,6 @@ from tests.system.lab import zenpark
 pytestmark = pytest.mark.system
 
 
-@pytest.mark.mechanism("soak")
 def test_four_robots_for_a_few_seconds(tmp_path: Path) -> None:
     asked = ("--minutes", "0.1", "--robots", "4", "--json", "--out", str(tmp_path / "soak"))
     done = zenpark("soak", *asked, timeout_s=120.0)
