@@ -20,7 +20,6 @@ BENCHMARKS: Final = {  # module, which has a function of the benchmark's name
     "process": "process",  # CPU and memory of robot processes
     "encounters": "encounters",  # collisions with and without avoidance
     "safety": "reactions",  # reaction times
-    "intruders": "intruders",  # lateness of control loops under attack
 }
 
 

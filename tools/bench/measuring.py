@@ -56,7 +56,6 @@ def fly(
     look: Callable[[Progress], None],
     *,
     duration_s: float,
-    rights: Path | None = None,
 ) -> CaseResult:
     """Fly the reference experiment over routers that run: real time, periodic poses (50 Hz), no plan of the leader.
 
@@ -66,13 +65,12 @@ def fly(
         endpoints: Of the routers.
         look: Is given the run's progress some ten times a second.
         duration_s: From the common start [s].
-        rights: Access rights, in a lab.
     """
     read = load("robotic-park", f"duration_s={duration_s}", "timeline=[]", "trigger.period_s=0.02")
     source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
     source.write_text(read.text, encoding="utf-8")
     experiment = read.cases()["periodic"]
-    context = CaseContext(experiment, "periodic", folder, source, endpoints, launcher, hosts, rights=rights)
+    context = CaseContext(experiment, "periodic", folder, source, endpoints, launcher, hosts)
     return Conductor(context, look).run()
 
 
