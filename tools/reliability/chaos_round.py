@@ -71,7 +71,7 @@ class Setting:
     folder: Path  # where each round gets a folder
     changes: Sequence[str]  # as behind `--set`
     bodies: str | None  # as behind `--bodies`
-    seed: int  # of bits, segments and nonsense, which the script leaves open
+    seed: int  # of nonsense, which the script leaves open
 
 
 @dataclass
@@ -93,7 +93,6 @@ class _ActiveFault:
     incidents: dict[str, int] = field(default_factory=dict)  # number of the last incident of each robot before
     restarted: float | None = None
     back: float | None = None
-    died: bool = False
     violations: list[str] = field(default_factory=list)
 
     def add_violation(self, text: str) -> None:
@@ -143,7 +142,7 @@ class ChaosRound:
             switches = folder / SWITCHES
             switches.mkdir()
             Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
-            cables = stack.enter_context(Cables(random))
+            cables = stack.enter_context(Cables())
             laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
             launcher = stack.enter_context(Launcher(folder / "logs"))
             own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
@@ -301,7 +300,7 @@ class ChaosRound:
     def _close(self, active: _ActiveFault, well: float | None) -> None:
         now = time.monotonic()
         well = now if well is None else well
-        if active.fault.kind == "read-error" or active.died:
+        if active.fault.kind == "read-error":
             self._dead[active.victim] = now
         left = set() if self._conductor_dead or self._over() else active.there - self._dead.keys()
         down = [name for name in sorted(left) if self._down(name)]
@@ -370,16 +369,6 @@ class ChaosRound:
     def _receivers(self, sender: str, live: Set[str]) -> list[str]:
         """Living robots that receive the poses of a sender."""
         return [name for name in live if sender in self._senders[name]]
-
-    def _after_bits(self, active: _ActiveFault, live: Set[str]) -> str:
-        """Wrong bits may make Zenoh's client abort its process; TCP's own checksum would have kept them from it."""
-        victim = active.victim
-        if not active.died and "SIGABRT" in self._lost_since(active):
-            active.died, active.note = True, "its process was aborted by Zenoh"
-        if active.died:
-            up = self._observer.invariants.in_the_air(victim)
-            return f"{victim} has not come down yet" if up else self._after_kill(active, live)
-        return self._after_any(active, live)
 
     def _lost_since(self, active: _ActiveFault) -> str:
         """Report of the conductor on the end of the victim's process since the fault began; empty without one."""

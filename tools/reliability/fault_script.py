@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from signal import SIGKILL, SIGSTOP, Signals
 from typing import Final, Literal
@@ -10,15 +10,12 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from tools.reliability.cables import Condition
-
 Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
 FORM_S: Final = 15.0  # a formation needs so long to come together: a round gets about the faults that it has time for
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
 LAST_S: Final = 6.0  # before the end of the run nothing new begins
 CONDUCTOR_AFTER: Final = 3  # faults before the death of the launcher, after which no other is possible
-FLIPS: Final = 0.05  # share of segments with a wrong bit
 
 
 @dataclass(frozen=True)
@@ -32,12 +29,12 @@ class FaultKind:
     most: int = 1_000  # in one round
     signal: Signals | None = None  # that its process gets
     role: str = ""  # process that gets the signal; empty: that of the victim
-    cable: Callable[[float], Condition] | None = None  # state of the cables by its size
+    cuts: bool = False  # the cables of the victim
     clock: tuple[str, float] | None = None  # switch, with the role of the victim's process for {}, and direction
     reported: str = ""  # process whose end the conductor must report
     stage: Stage = "plain"  # the only one on which it can be done; "plain": on each
     never: Stage | None = None  # a stage on which it cannot be done
-    size: tuple[float, float] = (0.0, 0.0)  # range of its size
+    size: tuple[float, float] = (0.0, 0.0)  # range of its size [s]
     signed: bool = False  # the size may be negative as well
 
 
@@ -49,7 +46,7 @@ FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
     "partition": FaultKind(
         "Nothing passes between a robot and the router for 3 s; messages of that time arrive afterwards.",
         3.0,
-        cable=lambda _: Condition(cut=True),
+        cuts=True,
     ),
     "router": FaultKind(
         "SIGKILL to the only router; the conductor starts it again.",
@@ -84,24 +81,6 @@ FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
         most=1,
         signal=SIGKILL,
         role="conductor",
-    ),
-    "loss": FaultKind(
-        "20 % of the segments of every robot are lost for 3 s and sent again after TCP's timeouts.",
-        3.0,
-        victim=False,
-        size=(0.2, 0.2),
-        cable=lambda share: Condition(loss=share),
-    ),
-    "delay": FaultKind(
-        "50 to 300 ms more in both directions for 3 s, for one robot.",
-        3.0,
-        size=(0.05, 0.3),
-        cable=lambda seconds: Condition(delay_s=seconds),
-    ),
-    "bits": FaultKind(
-        "One bit is wrong in 5 % of a robot's segments for 1 s: its connection breaks.",
-        1.0,
-        cable=lambda _: Condition(flips=FLIPS),
     ),
     "clock": FaultKind(
         "The wall clock of all processes steps by 0.5 to 5 s, forward or back.",
@@ -147,7 +126,7 @@ class Fault(msgspec.Struct, frozen=True):
     after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
     lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
     victim: str = ""  # a robot; if it has ended by then, the next that is alive. Empty: the whole run
-    size: float = 0.0  # delay or clock step [s], or share of lost segments
+    size: float = 0.0  # clock step [s]
 
     @property
     def properties(self) -> FaultKind:

@@ -19,7 +19,7 @@ from agents.network import messages
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.real_time.hosts.launcher import Launcher, Process
-from tools.reliability.cables import GOOD, Cables
+from tools.reliability.cables import Cables
 from tools.reliability.fault_script import Fault
 from tools.reliability.run_process import PROC, WatchedRun
 from tools.reliability.spoilt_process import Switch
@@ -62,8 +62,8 @@ class Injector:
         if how.signal is not None:
             sent = self._send(victim or how.role, how.signal)
             self._stopped = sent if how.signal == signal.SIGSTOP else []
-        if how.cable is not None:
-            self._cables.set(how.cable(size), self._groups.get(victim))
+        if how.cuts:
+            self._cables.cut(self._groups[victim])
         if kind == "read-error":
             self._switch(f"read-{victim}").write(1.0)
         if kind == "double":
@@ -100,7 +100,7 @@ class Injector:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
         self._stopped = []
-        self._cables.set(GOOD)
+        self._cables.mend()
 
     def spoil(self, victim: str, session: zenoh.Session, keys: Keys) -> int:
         """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""

@@ -58,11 +58,11 @@ def test_only_the_kinds_that_were_asked_for():
 
 
 def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
-    tables = {name for name, kind in FAULT_KINDS.items() if kind.signal or kind.cable or kind.clock}
+    tables = {name for name, kind in FAULT_KINDS.items() if kind.signal or kind.cuts or kind.clock}
     assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
     looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_round.ChaosRound)}
     assert {kind for kind in KINDS if kind in looked_after} == {
-        "kill", "bits", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
+        "kill", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip
 
 
