@@ -24,7 +24,12 @@ STEP = re.compile(
     re.MULTILINE,
 )
 COMPUTING = {"cert", "check", "clean", "compare", "explain", "export", "import", "new", "report", "sweep"}
-REAL = ("run way.toml", "run shadow.toml --open", "run two.toml --bodies protocol", "run three.toml --here")
+REAL = (
+    "run way.toml",
+    "run shadow.toml --out runs/shadow --open",
+    "run two.toml --bodies protocol",
+    "run three.toml --here",
+)
 
 
 class Step(NamedTuple):
@@ -92,11 +97,11 @@ def test_a_guide_can_be_followed(
 def test_a_guide_flies_in_real_time(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [step for guide in GUIDES for step in steps(guide)]
     assert Step("command", command) in found
-    words = [word for word in shlex.split(command) if word != "--open"]
-    (text,) = [step.text for step in found if step.file == words[1]]
-    file, out = tmp_path / words[1], tmp_path / "runs" / Path(words[1]).stem
+    _, name, *options = (word for word in shlex.split(command.partition("--out")[0]))
+    (text,) = [step.text for step in found if (step.kind, step.file) == ("toml", name)]
+    file, out = tmp_path / name, tmp_path / "runs" / Path(name).stem
     file.write_text(text, "utf-8")
-    ended = zenpark("run", file, *words[2:], "--no-report", "--out", out, timeout_s=120.0)
+    ended = zenpark("run", file, *options, "--no-report", "--out", out, timeout_s=120.0)
     assert ended.returncode == 0, (ended.stdout, ended.stderr)
     monkeypatch.chdir(tmp_path)
     for step in found:
