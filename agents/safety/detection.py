@@ -93,8 +93,17 @@ class Detector:
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""
-        neighbours, health = now.neighbours, now.health
-        found = [self._orders(rows), self._measured(now.state, rows), self._disobedient(now, rows)]
+        state, neighbours, health = now.state, now.neighbours, now.health
+        found = [self._measured(state, rows)]
+        if some(rows.ordered) or some(rows.not_finite) or rows.unguided is not None:
+            found.append(self._orders(rows))
+        if state.heard is not None:
+            found.append(self._unheard(now.t, state.heard))
+        if self._obedience.due(now.t):
+            watched = rows.cruising & ~now.where.invalid
+            self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
+        if some(self._obedience.still) or some(self._obedience.strays):
+            found.append(self._disobedient(self._obedience))
         if not now.where.all_valid:
             found.append(self._outside(now))
         if self._limits.separation is not None:
@@ -105,7 +114,8 @@ class Detector:
             found.append(self._lagging(neighbours, neighbours.clock_lag))
         if health.just_resumed(now.t):
             found.append(self._not_refreshed(now, rows))
-        found.append(self._surroundings(now.t, health))
+        if health.troubled:
+            found.append(self._surroundings(now.t, health))
         return [each for each in chain.from_iterable(found) if some(each.rows)]
 
     def _receivers(self, links: Mask) -> Mask:
@@ -152,8 +162,9 @@ class Detector:
         squared = np.vecdot(state.velocity, state.velocity)
         if not every(squared < self._slow_squared):
             yield from self._moving(state, squared, rows)
-        low = state.battery < limits.battery_low
-        yield Observation(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limits.battery_low:.0%})")
+        if some(low := state.battery < limits.battery_low):
+            text = f"{{:.0%}} (limit {limits.battery_low:.0%})"
+            yield Observation(Cause.BATTERY, low, lambda row: text.format(state.battery[row]))
         if state.flying.tobytes() != self._all_fly:
             fallen = (self._flies > state.flying) & rows.cruising
             yield Observation(Cause.FALLEN, fallen, lambda _: "its motors are off")
@@ -162,10 +173,8 @@ class Detector:
             yield Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead))
         if state.attitude is not None:
             attitude, leans = state.attitude, tilted(state.attitude, limits.tilt) & self._flies & state.flying
-            text = "it leans {:.0f}° (limit {:.0f}°)"
-            yield Observation(
-                Cause.TILT, leans, lambda row: text.format(degrees(tilt_angle(attitude, row)), degrees(limits.tilt))
-            )
+            lean = f"it leans {{:.0f}}° (limit {degrees(limits.tilt):.0f}°)"
+            yield Observation(Cause.TILT, leans, lambda row: lean.format(degrees(tilt_angle(attitude, row))))
         if some(rows.landing):
             late = rows.landing & self._flies & state.flying
             yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s")
@@ -183,14 +192,13 @@ class Detector:
         text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
         yield Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
 
-    def _disobedient(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
-        """Rows whose devices do not answer, that do not move as they are told, or move otherwise."""
-        t, state, obedience = now.t, now.state, self._obedience
-        if state.heard is not None:
-            heard = state.heard
-            silent = t - heard > self._limits.own_silence_s
-            yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
-        obedience.update(t, rows.setpoint, state.position, state.yaw, rows.cruising & ~now.where.invalid)
+    def _unheard(self, t: float, heard: Array) -> Iterator[Observation]:
+        """Rows whose devices do not answer."""
+        silent = t - heard > self._limits.own_silence_s
+        yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
+
+    def _disobedient(self, obedience: Obedience) -> Iterator[Observation]:
+        """Rows that do not move as they are told, or move otherwise."""
         yield Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
         yield Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
 

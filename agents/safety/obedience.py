@@ -56,8 +56,12 @@ class Obedience:
         self._told_s, self._vain_turn = np.zeros((2, rows))
         self._vain = np.zeros((rows, 3))
 
+    def due(self, t: float) -> bool:
+        """Whether `update` has something to do at `t` [s]; ask on every tick."""
+        return t >= self._due
+
     def update(self, t: float, setpoint: Array, position: Array, yaw: Array, watched: Mask) -> None:
-        """Compare at `t` [s]; call it on every tick.
+        """Compare at `t` [s]; before the next sample is due nothing happens.
 
         Args:
             t: Now [s].
@@ -66,7 +70,7 @@ class Obedience:
             yaw: (N,) measured [rad].
             watched: (N,) rows that follow their setpoints, with a valid pose.
         """
-        if t < self._due:
+        if not self.due(t):
             return
         missed = t - self._due >= SAMPLE_S  # ticks were missed, or it is the first one
         self._due = t + SAMPLE_S

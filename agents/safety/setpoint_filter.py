@@ -69,10 +69,10 @@ class SetpointFilter:
     def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
         """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
         off = np.abs(position - self._centre)
-        known = (np.abs(yaw) < ABSURD) & (age <= self.limits.own_silence_s)
-        if every(off <= self._half) and every(known):
+        known, fresh = np.abs(yaw) < ABSURD, age <= self.limits.own_silence_s
+        if every(off <= self._half) and every(known) and every(fresh):
             return self._sure
-        invalid = ~np.asarray(known & (np.abs(position) < ABSURD).all(axis=1))
+        invalid = ~np.asarray(known & fresh & (np.abs(position) < ABSURD).all(axis=1))
         off = np.where(invalid[:, None], 0.0, off)  # an unknown pose is not outside
         excess = np.maximum((off - self._half).max(axis=1), 0.0)
         walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~invalid & (position[:, 2] > self.limits.high[2]))
@@ -114,8 +114,9 @@ class SetpointFilter:
                 self._limit(again, here, yaw, late)
                 again = np.where(other[:, None], again, safe)  # limits twice over may differ in the last bit
                 avoided, safe = np.asarray((np.abs(again - safe) > ROUNDING).any(axis=1)), again
-        other = np.abs(safe - setpoint) > ROUNDING
-        changed = np.asarray(other.any(axis=1)) if some(other) else no_row
+        changed = no_row
+        if safe.tobytes() != setpoint.tobytes():
+            changed = np.asarray((np.abs(safe - setpoint) > ROUNDING).any(axis=1))
         if troubled:
             changed = (changed | not_finite) & ~invalid
             # a body that controls its position on board keeps its last setpoint while the position is not known here

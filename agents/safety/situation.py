@@ -47,6 +47,11 @@ class ProcessHealth:
         """Whether the control loop misses so many ticks that it controls nothing."""
         return self.missed_share > LATE_SHARE
 
+    @property
+    def troubled(self) -> bool:
+        """Whether router, conductor or control loop fails."""
+        return self.offline_since < np.inf or self.conductor_lost_since < np.inf or self.loop_failing
+
     def count_tick(self, missed: int, period: float) -> None:
         """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
         if missed or self.missed_share > 0.0:
