@@ -47,7 +47,7 @@ class TwinBody:
         flies = np.array([k.flies for k in kinds])
         names, seeds, nature = request.names, request.seeds, request.disturbance
         air = np.flatnonzero(flies)
-        self._in_air, self._drives = span(air), ~flies
+        self._in_air, self._all_fly, self._drives = span(air), len(air) == rows, ~flies
         aloft = [nature[i] for i in air]
         air_names, air_seeds = [names[i] for i in air], [seeds[i] for i in air]
         self._jitter = HoverJitter(aloft, Noise(air_names, air_seeds, "hover jitter", 2), self._dt)
@@ -59,7 +59,9 @@ class TwinBody:
         self._command = np.full((rows, 4), np.nan)
         self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
         self._endurance = np.array([k.endurance_s for k in kinds])
-        self._used = np.zeros(rows)
+        self._used, self._uses, self._flew = np.zeros(rows), np.zeros(rows), b""
+        self._absent = bool(self._world.mirrored.any())  # mirrored robots may be absent: their positions are NaN
+        self._no_time = np.zeros(rows)
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(rows)
         self._measured_at, self._measured, self._velocity = -inf, np.zeros((rows, 3)), np.zeros((rows, 3))
@@ -135,11 +137,17 @@ class TwinBody:
         before = engine.position[:, :2].copy() if self._drift.present else None
         if self._jitter.present:
             self._jitter.advance()
-            share = np.minimum(engine.position[self._in_air, 2] / FULL_WOBBLE, 1.0)
-            self._wobble = np.zeros((len(self._used), 2))  # a new array: engines may keep the last one
-            self._wobble[self._in_air] = share[:, None] * self._jitter.displacement
+            displacement, height = self._jitter.displacement, engine.position[self._in_air, 2]
+            if not every(height >= FULL_WOBBLE):
+                displacement = np.minimum(height / FULL_WOBBLE, 1.0)[:, None] * displacement
+            self._wobble = displacement
+            if not self._all_fly:
+                self._wobble = np.zeros((len(self._used), 2))  # a new array: engines may keep the last one
+                self._wobble[self._in_air] = displacement
         engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
-        self._used += self._dt * (engine.flying | self._drives)
+        if (flying := engine.flying.tobytes()) != self._flew:
+            self._flew, self._uses = flying, self._dt * (engine.flying | self._drives)
+        self._used += self._uses
         if before is not None:
             self._drift.advance(engine.position[:, :2] - before)
         if self._sensors is not None:
@@ -156,9 +164,8 @@ class TwinBody:
             measured = measured.copy()
             measured[:, :2] += self._drift.error
         self._estimate(measured)
-        rows = len(truth)
         state = BodyState(
-            time=np.full(rows, self._t),
+            time=self._no_time + self._t,
             position=measured,
             velocity=self._velocity,
             yaw=heading,
@@ -186,8 +193,7 @@ class TwinBody:
             self._velocity = np.zeros_like(self._velocity)
         elif since > 0.0:
             velocity = velocity_after(self._velocity, measured - self._measured, since)
-            known = np.isfinite(velocity)  # a mirrored robot may be absent
-            self._velocity = velocity if every(known) else np.where(known, velocity, 0.0)
+            self._velocity = np.where(np.isfinite(velocity), velocity, 0.0) if self._absent else velocity
         self._measured_at, self._measured = self._t, measured
 
 

@@ -20,14 +20,14 @@ class HoverJitter:
         sigma = np.array([0.0 if j is None else j.sigma for j in jitter])
         keep = np.array([1.0 if j is None else math.exp(-dt / j.correlation_s) for j in jitter])
         self._keep = np.repeat(keep[:, None], 2, axis=1)
-        self._push = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
-        self._noise = noise
+        noise.scale = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
+        self._push = noise
         self.present = bool(sigma.any())
         self.displacement = np.zeros((len(disturbance), 2))
 
     def advance(self) -> None:
         """One step of dt; exact for any dt."""
-        self.displacement = self._keep * self.displacement + self._push * self._noise.draw()
+        self.displacement = self._keep * self.displacement + self._push.draw()
 
 
 class Measurement:
@@ -37,13 +37,13 @@ class Measurement:
         """`spatial` (n, 3): 1 on the axes on which a row's position is measured, else 0."""
         sigma = np.array([d.position_sigma or 0.0 for d in disturbance])
         yaw = np.array([d.yaw_sigma or 0.0 for d in disturbance])
-        self._sigma = np.concatenate([sigma[:, None] * spatial, yaw[:, None]], axis=1)
+        noise.scale = np.concatenate([sigma[:, None] * spatial, yaw[:, None]], axis=1)
         self._noise = noise
-        self.present = bool(self._sigma.any())
+        self.present = bool(noise.scale.any())
 
     def draw(self) -> Array:
         """Noise (n, 4): x, y, z [m], yaw [rad]."""
-        return self._sigma * self._noise.draw()
+        return self._noise.draw()
 
 
 class Drift:

@@ -13,7 +13,9 @@ BLOCK = 256  # draws per refill: spreads the generator's overhead over this many
 
 
 class Noise:
-    """White Gaussian noise of unit variance, (n, width) per draw."""
+    """White Gaussian noise, (n, width) per draw, of unit variance times `scale`."""
+
+    scale: Array | float = 1.0  # (n, width); set it before the first draw
 
     def __init__(
         self, names: Sequence[str], seeds: Sequence[int], purpose: str, width: int, block: int = BLOCK
@@ -31,6 +33,8 @@ class Noise:
         """The next (n, width)."""
         if self._next == len(self._block):
             self._block = np.stack([g.standard_normal((self._size, self._width)) for g in self._generators], axis=1)
+            self._block *= self.scale
             self._next = 0
+        drawn: Array = self._block[self._next]
         self._next += 1
-        return np.asarray(self._block[self._next - 1])
+        return drawn
