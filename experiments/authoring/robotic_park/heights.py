@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import Park
+from experiments.authoring.robotic_park.file import CENTRAL, Park, Pose, Relation, Robot
 from experiments.check.realisation import ENOUGH
 
 ROUNDS: Final = 300
@@ -24,6 +24,7 @@ TINY: Final = 1e-12
 SHAPE_MET: Final = 0.01  # [m] a larger error is another shape
 LOWEST: Final = 0.3  # [m] of a drone
 ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
+REAL_ORIGIN: Final = (0.0, 0.0, 0.8)  # [m] of the origin in the driver of real Crazyflies
 MOVED: Final = 0.02  # [m] a height that is another than at the start
 SPACING: Final = 0.6  # [m] between robots whose start is made up
 
@@ -176,7 +177,7 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted.pairs) == 0, (0.0, 0.0, 0.0))
     if not len(wanted.pairs):
         return plain
-    given = any(relation.centre is not None for _, task in park.tasks for relation in task.relations)
+    given = any(origin_of(park, robot, relation) for robot, task in park.tasks for relation in task.relations)
     found, anchored = find_shape(wanted, start, flies), len(wanted.row) > 0
     missed = found.worst
     if anchored and missed > SHAPE_MET:
@@ -211,6 +212,17 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
 
 
+def origin_of(park: Park, robot: Robot, relation: Relation) -> Pose | None:
+    """Place [m] of the origin that a robot keeps a distance to; None where it is that of the arena.
+
+    The file may give one. If not, the driver of real Crazyflies has one of its own (`REAL_ORIGIN`); those of Kheperas
+    and in Webots, and the central controller, take that of the arena.
+    """
+    own = robot.kind == "crazyflie" and robot.place != "virtual" and park.architecture != CENTRAL
+    of_driver = REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
+    return relation.centre or of_driver
+
+
 def _starts(park: Park, notes: list[str]) -> Array:
     """Starts (N, 3) [m]; robots without a start stand on a ring, in the order of the file."""
     count = len(park.robots)
@@ -242,7 +254,7 @@ def _wanted(park: Park, start: Array, flies: Mask) -> ShapeTargets:
                 relative.append((x, y, z if flies[i] or flies[j] else level))
             elif relation.name == "origin" and len(relation.values) == 1:
                 anchored.append(i)
-                point.append(relation.centre or (0.0, 0.0, 0.0))
+                point.append(origin_of(park, robot, relation) or (0.0, 0.0, 0.0))
                 radius.append(relation.values[0])
     return ShapeTargets(
         np.array(pairs, dtype=np.intp).reshape(-1, 2),

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from experiments.authoring.robotic_park.file import CENTRAL, PLACES, SURFACES, Park, Relation, Robot, Task
-from experiments.authoring.robotic_park.heights import Heights
+from experiments.authoring.robotic_park.heights import Heights, origin_of
 
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
@@ -187,7 +187,7 @@ def _anchor(park: Park, robot: Robot, relation: Relation, found: Heights, gain: 
         return f"to = [{point}], along = [{along}]"
     if len(values) == 3:
         return f"to = [{values[0]:g}, {values[1]:g}, {found.hover[park.robots.index(robot)]:g}], gain = {gain:.4g}"
-    x, y, z = relation.centre or found.centre
+    x, y, z = origin_of(park, robot, relation) or found.centre
     assert robot.task is not None
     own = _weight(park, robot) * _gain(park, robot, robot.task, values[0])
     return f"distance = {values[0]:g}, to = [{x:g}, {y:g}, {z:g}], gain = {own:.4g}"

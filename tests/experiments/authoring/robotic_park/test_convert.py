@@ -160,6 +160,20 @@ def test_places(tmp_path, relation, anchor, note):
     assert any(note in each for each in notes)
 
 
+@pytest.mark.parametrize(("architecture", "theirs"), [("distributed", True), ("centralized", False)])
+def test_the_origin_of_real_crazyflies_is_that_of_their_driver(tmp_path, architecture, theirs):
+    relations = [[*each, "origin_0.4726"] for each in TRIANGLE]  # √(0.8²/3 + 0.1²): at 0.7 m, from (0, 0, 0.8)
+    text = file(three(relations, place="physical"), "physical", architecture).replace("khepera", "dron")
+    text = text.replace("pose: 0.00, 0.00, 0.00", "pose: 0.01, 0.00, 0.00")
+    read, notes = converted(tmp_path, text)
+    anchors = [anchor.to for anchor in read.experiment.formation.anchors.values()]
+    assert anchors == [[0.0, 0.0, 0.8 if theirs else anchors[0][2]]] * 3
+    hover = [each.hover for each in read.experiment.robots.values()]
+    assert (hover == [0.7] * 3) == theirs
+    assert figures(read.experiment).residual_mm < 0.1
+    assert any("the origin: lifted" in note for note in notes) != theirs  # the central controller's is at 0
+
+
 def test_an_origin_that_contradicts_the_distances_is_left_out(tmp_path):
     relations = [[*each, "origin_2.0"] for each in TRIANGLE]
     read, notes = converted(tmp_path, file(three(relations)))
