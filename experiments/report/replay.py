@@ -22,7 +22,6 @@ CASES: Final = 2  # side by side
 STILL: Final = 0.6  # of the run: when the picture was taken that stands where no script runs, and in print
 STEP_S: Final = 0.1  # between two samples
 NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
-TALL_M: Final = 1.2  # obstacles are drawn no higher
 QUIET: Final = ("robot", "says", "clock", "router")  # kinds of events that are not on the slider
 SCRIPT: Final = Path(__file__).with_name("replay.js")
 LINKS: Final = "Links: green within {good:g} cm of their target, amber within {fair:g} cm, red beyond."
@@ -87,10 +86,9 @@ def _film(traces: Sequence[Trace]) -> dict[str, Any]:
     for number in range(len(scene.names)):
         outline = scene.outline[number]
         ring = circle(float(scene.radius[number]), ROUND) if outline is None else outline
-        high = min(float(scene.top[number]), float(scene.bottom[number]) + TALL_M)
         obstacles.append({
-            "ring": np.round(ring, 3).tolist(), "low": round(float(scene.bottom[number]), 3), "high": round(high, 3),
-            "closed": outline is None or bool(scene.closed[number]),
+            "ring": np.round(ring, 3).tolist(), "low": round(float(scene.bottom[number]), 3),
+            "high": round(float(stage.tops[number]), 3), "closed": outline is None or bool(scene.closed[number]),
         })  # fmt: skip
     events = {(round(event.stamp, 2), event.text) for trace in traces for event in trace.events
               if event.kind not in QUIET and 0.0 <= event.stamp <= end}  # fmt: skip

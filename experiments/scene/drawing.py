@@ -26,7 +26,6 @@ GOAL_ROUNDS: Final = 3
 TURNS: Final = 3  # digits of quaternions: a tenth of a degree, so that what stands is not drawn anew for its noise
 COARSE: Final = 5  # of more robots than that, trails have each fifth point
 SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
-TALL: Final = 1.2  # [m] walls and obstacles are drawn no higher
 
 
 @dataclass(frozen=True)
@@ -155,10 +154,7 @@ class SceneDrawing:
             self._lines(f"starts/{name}", np.concatenate([ends, np.full((4, 2, 1), 0.002)], axis=2), look.section)
 
     def _add_obstacle(self, number: int) -> Any:  # noqa: ANN401 - handles of viser
-        stage, scene = self.stage, self.stage.scene
-        low = float(scene.bottom[number])
-        if scene.top[number] > low + TALL:  # up to the ceiling: would hide what stands behind it
-            scene = replace(scene, top=np.where(np.arange(len(scene.top)) == number, low + TALL, scene.top))
+        stage, scene = self.stage, replace(self.stage.scene, top=self.stage.tops)
         opacity = 0.55 if np.isfinite(scene.mass[number]) else 0.85
         return self._mesh(
             f"obstacles/{stage.scene.names[number]}", models.obstacle(scene, number), self._look.obstacle, opacity

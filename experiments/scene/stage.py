@@ -39,6 +39,8 @@ FLASH_S: Final = 0.12  # a link is lit for so long after its sender transmits
 TRAIL: Final = 60  # points of a trail
 TRAIL_S: Final = 0.2  # between two of them
 DASH_M: Final = 0.04
+TALL_M: Final = 1.2  # obstacles are drawn no higher: one up to the ceiling would hide what stands behind it
+NAME_M: Final = 0.25  # above the highest robot
 NOWHERE: Final = (0.0, 0.0, -1000.0)  # where hidden parts are put: far below the floor
 
 # Okabe and Ito's colours, which the colour-blind tell apart, and two more
@@ -190,6 +192,18 @@ class Stage:
     def radius(self) -> Array:
         """Horizontal half-size of each robot (N,) [m]."""
         return np.array([kind.radius for kind in self.kinds])
+
+    @cached_property
+    def tops(self) -> Array:
+        """Tops of the obstacles as they are drawn (M,) [m]."""
+        return np.minimum(self.scene.top, self.scene.bottom + TALL_M)
+
+    @cached_property
+    def size(self) -> Array:
+        """What a picture of it shows (3,) [m]: the arena, up to the highest robot or obstacle."""
+        robots = () if self.experiment is None else self.experiment.robots.values()
+        high = max([NAME_M, *(robot.hover or 0.0 for robot in robots), *self.tops.tolist()]) + NAME_M
+        return np.array([*(self.scene.high - self.scene.low)[:2], high])
 
     @cached_property
     def flies(self) -> Mask:
@@ -394,7 +408,7 @@ def trail_segments(trail: Array) -> Array:
 
 
 def trail_colours(stage: Stage, points: int, background: Colour) -> Colours:
-    """Colours (N·(K−1), 2, 3) of such segments: from the robot's colour to the background."""
-    share = np.linspace(0.15, 1.0, points)[None, :, None]
+    """Colours (N·(K−1), 2, 3) of such segments: from the robot's colour towards the background."""
+    share = np.linspace(0.15, 0.8, points)[None, :, None]
     faded = (1.0 - share) * stage.colours[:, None, :] + share * np.array(background)
     return np.stack([faded[:, :-1], faded[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.uint8)

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from agents.runtime.run_registry import Run
 
 REASON: Final = "button of zenpark view"
-SETTLED_S: Final = 0.4  # after the last move of a slider or target its value is sent
+SETTLED_S: Final = 0.4  # after the last move of a slider, or the end of a drag, its value is sent
 SLIDERS: Final = 6
 NOTE_S: Final = 8.0
+HANDLE: Final = 0.25  # [m] of a target, in an arena of 2.5 m; in a larger one, as much larger
 LEADERS: Final = 5  # most that are dragged
 HELD_S: Final = 1.5  # until the goal that a leader reports is the one that it was sent to
 LAST: Final = "Repeat it with `./zenpark estop`, or cut the power."
@@ -163,9 +164,10 @@ class Acting:
         for target in self._targets.values():
             target.remove()
         self._targets = {}
+        scale = HANDLE * max(1.0, float(self._stage.size[:2].max()) / 2.5)
         for name in self._stage.leaders[:LEADERS] if shown else ():
             target = self._server.scene.add_transform_controls(
-                f"/targets/{name}", scale=0.25, active_axes=(True, True, False), disable_rotations=True,
+                f"/targets/{name}", scale=scale, active_axes=(True, True, False), disable_rotations=True,
                 depth_test=False, position=(0.0, 0.0, -1000.0),
             )  # fmt: skip
             target.on_update(partial(self._drag, name))
@@ -173,6 +175,9 @@ class Acting:
 
     def _drag(self, name: str, event: Any) -> None:  # noqa: ANN401 - viser's own type
         if event.client is None:
+            return
+        if event.phase != "end":
+            self._held_until = inf
             return
         x, y, _ = event.target.position
         self._held_until = time.monotonic() + SETTLED_S + HELD_S

@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from io import StringIO
+from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import zenoh
 
+from agents.arrays import Array, norm
 from agents.network.keys import Keys
 from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, Look, SceneDrawing, Shown, light
@@ -31,7 +33,12 @@ FRAME_S: Final = 1.0 / 30.0
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
 LOOPBACK: Final = "127.0.0.1"
-FARTHEST: Final = 2.2  # times as far as on a wide page
+FOV: Final = 0.8  # [rad] upright
+ASPECT: Final = 1.2  # width over height of a page that is not known yet
+FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
+FREE: Final = (-0.92, 0.92)  # of a page from its middle to its edges, where the arena is shown: lowest, highest
+PHONE: Final = 0.7  # width over height of a page whose panel is below, not beside
+ABOVE: Final = (0.24, 0.96)  # as `FREE`, of such a page
 
 
 def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
@@ -54,28 +61,61 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
         brand_color=(0, 114, 178),
     )
     server.gui.main_panel.dock_right()
-    server.on_client_connect(partial(_step_back, server))
     light(server)
     return server
 
 
-def look_at(server: viser.ViserServer, size: Sequence[float], *, centre: Sequence[float] = (0.0, 0.0)) -> None:
-    """Camera of pages that are opened from now on, and of those that are open: the whole of `size` x, y, z [m]."""
-    x, y = centre[0], centre[1]
-    reach = max(size[0], size[1])
-    place, at = (x - 0.45 * reach, y - 0.9 * reach, 0.68 * reach), (x, y, 0.14 * reach)
-    server.initial_camera.position, server.initial_camera.look_at = place, at
-    for client in server.get_clients().values():
+def standpoint(size: Sequence[float] | Array, aspect: float) -> tuple[Array, Array]:
+    """Place of a camera and the point that it looks at [m], so that a box on the floor fills the page.
+
+    Args:
+        size: Of the box, x, y, z [m], with its middle above the origin.
+        aspect: Width of the page over its height.
+    """
+    away = FROM / norm(FROM)
+    right = np.array([-away[1], away[0], 0.0]) / norm(away[:2])
+    corners = np.array(list(product((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0)))) * size
+    near, over, up = corners @ away, corners @ right, corners @ np.cross(away, right)
+    low, high = np.tan(0.5 * FOV) * np.array(ABOVE if aspect < PHONE else FREE)
+    wide = (near + np.abs(over) / (np.tan(0.5 * FOV) * aspect * FREE[1])).max()
+    tall = ((up + high * near).max() - (up + low * near).min()) / (high - low)
+    distance = max(wide, tall)
+    shift = 0.5 * ((up - high * (distance - near)).max() + (up - low * (distance - near)).min())
+    at = shift * np.cross(away, right)
+    return at + distance * away, at
+
+
+class Camera:
+    """Camera of each page: at first the whole arena is in sight, whatever the shape of the page."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._size: Array = np.ones(3)  # [m]
+        self._placed: dict[int, Array] = {}  # [m] by page
+        server.initial_camera.fov = FOV
+        server.on_client_connect(self._greet)
+
+    def show(self, size: Array) -> None:
+        """Another arena, with all that stands in it (3,) [m]."""
+        self._size, initial = size, self._server.initial_camera
+        initial.position, initial.look_at = standpoint(size, ASPECT)
+        for client in self._server.get_clients().values():
+            self._place(client)
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self._follow(client))
+        self._place(client)
+
+    def _follow(self, client: viser.ClientHandle) -> None:
+        """Fits a camera that no hand has moved: a page sets its own when it opens, and its shape changes then."""
+        known = (self._server.initial_camera.position, self._placed.get(client.client_id))
+        if any(each is not None and np.allclose(client.camera.position, each, atol=1e-3) for each in known):
+            self._place(client)
+
+    def _place(self, client: viser.ClientHandle) -> None:
+        place, at = standpoint(self._size, client.camera.aspect)
+        self._placed[client.client_id] = place
         client.camera.position, client.camera.look_at = place, at
-
-
-def _step_back(server: viser.ViserServer, client: viser.ClientHandle) -> None:
-    """A page that is higher than wide, as a phone's, sees the arena from farther away, above the panel."""
-    if (aspect := client.camera.aspect) < 1.0:
-        at = np.array(server.initial_camera.look_at)
-        away = (np.array(server.initial_camera.position) - at) * min(1.0 / aspect, FARTHEST)
-        at[2] -= 0.30 * float(np.linalg.norm(away))
-        client.camera.position, client.camera.look_at = at + away, at
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -85,10 +125,10 @@ def close_server(server: viser.ViserServer) -> None:
 
 
 class ShowFolder:
-    """Check boxes for parts that are drawn on demand."""
+    """Check boxes for parts that are drawn on demand, and the camera."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._server, self.shown = server, Shown()
+        self._server, self.shown, self.camera = server, Shown(), Camera(server)
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
             for name, text in (
@@ -113,7 +153,7 @@ class ShowFolder:
             self.fit(stage)
             drawing.shown = self.shown
             panel.set_stage(stage)
-            look_at(self._server, (stage.scene.high - stage.scene.low).tolist())
+            self.camera.show(stage.size)
         return drawing
 
     def _set(self, name: str, event: viser.GuiEvent[Any]) -> None:

@@ -37,6 +37,8 @@ TABLE: Final = 20  # rows; of more robots, those that need attention first, then
 EVENTS: Final = 12
 LINKS: Final = 30  # rows
 QUIET: Final = ("says",)  # kinds of events that are not shown
+# the panel of a narrow page, which viser makes 20 em wide
+WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width:100%!important}}</style>"
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,9 @@ class Panel:
         """Title, case, phase, clock [s], and which run it is."""
         named = f"{case}: {phase}" if case not in ("", UNNAMED) else phase
         clock = "" if elapsed is None else f"{elapsed:.1f} s of {duration:g} s" if duration else f"{elapsed:.1f} s"
+        title = escape(self.stage.title or "robots")
         text = (
-            f'<div style="padding:0 1.4em 0 1em;font-size:0.85em"><b>{escape(self.stage.title or "robots")}</b><br>'
+            f'{WHOLE_WIDTH}<div style="padding:0 1.4em 0 1em;font-size:0.85em"><b>{title}</b><br>'
             f"<span>{escape(named)}</span> <span style='float:right'>{clock}</span>"
             f"<div style='opacity:0.6;overflow-wrap:anywhere'>{escape(where)}</div></div>"
         )

@@ -17,7 +17,7 @@ from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
 from experiments.scene.tracks import LOST_S, Track, Tracks
-from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder, look_at
+from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder
 from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row, known
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ class ReplayView:
         self._shown = -1
         look = DARK if dark else LIGHT
         self._drawings = []
-        sizes = [film.stage.scene.high - film.stage.scene.low for film in films]
+        sizes = [film.stage.size for film in films]
         pitch = GAP * max(float(size[0]) for size in sizes)
         with server.atomic():
             for k, film in enumerate(films):
@@ -231,7 +231,7 @@ class ReplayView:
                     drawing.name(film.tracks.case)
                 self._drawings.append(drawing)
         largest = np.max(sizes, axis=0)
-        look_at(server, (float(largest[0]) + 0.55 * pitch * (len(films) - 1), float(largest[1]), float(largest[2])))
+        self._show.camera.show(largest + np.array([pitch * (len(films) - 1), 0.0, 0.0]))
         self._histories = [film.history() for film in films]
         self._choose(0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -24,6 +24,8 @@ FLAGS = (
     "--ignore-gpu-blocklist",
 )  # fmt: skip
 
+FRAMES = 15
+
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
 
@@ -35,12 +37,19 @@ class Page:
         self.hosts: set[str] = set()  # of all its requests, `host:port`
         self.nodes: dict[str, dict[str, Any]] = {}  # properties of the scene's nodes, as they arrived last
         self.texts: list[str] = []  # of messages that carry text: notifications
+        self.camera: dict[str, Any] = {}  # of the page, as it said last
         page.on("request", lambda request: self.hosts.add(request.url.split("/")[2] if "//" in request.url else ""))
         page.on("websocket", self._listen)
 
     def _listen(self, socket: Any) -> None:
         self.hosts.add(socket.url.split("/")[2])
         socket.on("framereceived", lambda data: self._receive(data) if isinstance(data, bytes) else None)
+        socket.on("framesent", lambda data: self._answer(data) if isinstance(data, bytes) else None)
+
+    def _answer(self, data: bytes) -> None:
+        message = msgspec.msgpack.decode(data)
+        if message["type"] == "ViewerCameraMessage":
+            self.camera = message
 
     def _receive(self, data: bytes) -> None:
         """Messages as viser packs them: sizes, compressed msgpack, then the arrays, each aligned to eight bytes."""
@@ -71,6 +80,34 @@ class Page:
     def positions(self, name: str) -> np.ndarray:
         """Positions (N, 3) of the copies of a batched mesh [m]."""
         return np.frombuffer(self.nodes[name]["batched_positions"], dtype="<f4").reshape(-1, 3)
+
+    def pixel(self, point: Sequence[float]) -> tuple[float, float]:
+        """Where the page draws a point of the scene [m]."""
+        wide, tall = self.camera["image_width"], self.camera["image_height"]
+        w, x, y, z = self.camera["wxyz"]
+        turned = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+        right, down, ahead = turned.T @ (np.array(point) - self.camera["position"])
+        scale = 0.5 * tall / np.tan(0.5 * self.camera["fov"]) / ahead
+        return 0.5 * wide + scale * right, 0.5 * tall + scale * down
+
+    def drag(self, begin: Sequence[float], end: Sequence[float]) -> None:
+        """Drags what is drawn at one point of the scene to another [m], with the mouse."""
+        mouse = self.page.mouse
+        self.page.evaluate(  # what has arrived is drawn some frames later
+            """left => new Promise(done => {
+                const next = () => (left-- ? requestAnimationFrame(next) : done());
+                next();
+            })""",
+            FRAMES,
+        )
+        mouse.move(*self.pixel(begin))
+        mouse.down()
+        mouse.move(*self.pixel(end), steps=5)
+        mouse.up()
 
     def until(self, true: Any, what: str, limit_s: float = PATIENCE_S) -> None:
         """Waits, and lets the page's messages in meanwhile."""

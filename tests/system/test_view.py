@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,12 +13,15 @@ import pytest
 
 from agents.network import messages, pubsub
 from agents.network.endpoints import free_endpoint
+from agents.runtime.orders import PAUSED
+from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.run import simulate
 from experiments.scene.stage import Condition, Moment, Stage
+from experiments.view import acting
 from tests.conftest import RouterProcess
-from tests.system.browser import needs_chromium, opened
-from tests.system.lab import NEAR, ROOT, Flight, RobotProcess, Started, Watcher, zenpark
+from tests.system.browser import Page, needs_chromium, opened
+from tests.system.lab import NEAR, ROOT, Flight, RobotProcess, Started, Watcher, typed, zenpark
 
 pytest.importorskip("viser", reason="needs viser")
 pytestmark = [pytest.mark.system, needs_chromium]
@@ -50,51 +53,131 @@ def viewed(*arguments: object) -> Iterator[str]:
         assert process.end() == 0
 
 
+KINDS = {"turtlebot3": 1, "khepera4": 3, "crazyflie": 3}  # robots of the reference experiment
+
+
+def places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.ndarray:
+    """Positions (7, 3) of the robots of the reference experiment in the page [m], or of what else it draws of them."""
+    names = [f"{root}/{what.format(kind)}" for kind in KINDS]
+    page.until(lambda: all(name in page.nodes for name in names), "drawn")
+    return np.concatenate([page.positions(name) for name in names])
+
+
+@contextmanager
+def announced(watcher: Watcher, park: Experiment, case: str) -> Iterator[None]:
+    """A case as a conductor announces it."""
+    told = pubsub.pose_publisher(watcher.session, watcher.keys.experiment, messages.JSON)
+    told.put(document.case_document(park, case))
+    yield
+    told.undeclare()  # type: ignore[no-untyped-call]
+
+
 @pytest.mark.mechanism("view")
-def test_seven_robots_move_links_change_colour_and_the_button_stops_all(tmp_path: Path) -> None:
-    read = document.load("robotic-park", *NEAR[1::2], "duration_s=60")
-    park = read.cases()["event"]
-    file = tmp_path / "event.json"
-    file.write_bytes(document.write_json(park))
-    router = RouterProcess()
-    robots = RobotProcess(router.endpoint, file, *park.robots)
-    watcher = Watcher(router.endpoint)
+def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
+    router: RouterProcess, watcher: Watcher, tmp_path: Path
+) -> None:
+    low = (f"robots.{name}.hover=0.2" for name in ("CF01", "CF02", "CF03"))  # soon airborne
+    park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"]
+    (tmp_path / "event.json").write_bytes(document.write_json(park))
+    names, robots = list(park.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *park.robots)
     try:
-        told = pubsub.pose_publisher(watcher.session, watcher.keys.experiment, messages.JSON)
-        told.put(document.case_document(park))
-        with viewed("--connect", router.endpoint) as address, opened(address, 640, 480) as page:
-            names = list(park.robots)
+        with announced(watcher, park, "event"), viewed("--connect", router.endpoint) as address:
             watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
             assert all(watcher.order(name, messages.Order("takeoff")).ok for name in names)
-            watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in names), "airborne")
-            kinds = [f"/case/robots/{kind}/body" for kind in ("turtlebot3", "khepera4", "crazyflie")]
-            page.until(lambda: all(name in page.nodes for name in kinds), "drawn")
-
-            def places() -> np.ndarray:
-                return np.concatenate([page.positions(name) for name in kinds])
-
-            page.until(lambda: np.all(places()[:, 2] > -1.0), "seen")
-            before, colours = places(), page.nodes["/case/links"]["colors"]
-            at = time.time() + 0.5
-            assert all(watcher.order(name, messages.Order("start", at=at)).ok for name in names)
-            page.until(lambda: (np.linalg.norm(places() - before, axis=1) > 0.01).sum() >= 6, "followers move")
-            assert watcher.order("TB01", messages.Order("go", goal=(-0.4, 0.8))).ok
-            page.until(lambda: np.all(np.linalg.norm(places() - before, axis=1) > 0.01), "the leader moves")
-            page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
-            page.button("EMERGENCY STOP").click()
-            page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
-            watcher.until(
-                lambda: all(watcher.status[name].reason.startswith("emergency stop by operator") for name in names),
-                "their statuses say so",
-            )
-            assert page.hosts == {address.removeprefix("http://")}
+            with opened(address, 480, 360) as page:
+                watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in names), "airborne")
+                page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
+                before, colours = places(page), page.nodes["/case/links"]["colors"]
+                at = time.time() + 0.2
+                assert all(watcher.order(name, messages.Order("start", at=at)).ok for name in names)
+                watcher.until(lambda: watcher.phase("TB01") == "running", "begun")
+                assert watcher.order("TB01", messages.Order("go", goal=(-0.4, 0.8))).ok
+                page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
+                page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
+                page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
+                page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
+                page.button("EMERGENCY STOP").click()
+                page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
+                watcher.until(
+                    lambda: all(watcher.status[name].reason.startswith("emergency stop by operator") for name in names),
+                    "their statuses say so",
+                )
+                assert page.hosts == {address.removeprefix("http://")}
     finally:
-        watcher.close()
         robots.kill()
-        router.kill()
 
 
-def test_an_observer_of_a_lab_has_no_buttons(tmp_path: Path) -> None:
+def test_orders_of_the_page_reach_the_robots_and_are_events(
+    router: RouterProcess, watcher: Watcher, tmp_path: Path
+) -> None:
+    convoy = document.load("convoy", "timeline=[]").cases()["event"]
+    (tmp_path / "event.json").write_bytes(document.write_json(convoy))
+    names, robots = list(convoy.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *convoy.robots)
+    heard = pubsub.Inbox(
+        pubsub.pose_subscriber(watcher.session, watcher.keys.event, 256, pubsub.EVENTS), messages.Event
+    )
+    events: list[str] = []
+
+    def recorded(text: str) -> bool:
+        events.extend(f"{event.kind} {event.source} {event.text}" for event in heard.read())
+        return any(event.startswith(f"order operator {text}") for event in events)
+
+    def everywhere(true: Callable[[messages.Status], bool]) -> bool:
+        watcher.look()
+        return all(true(watcher.status[name]) for name in names)
+
+    try:
+        with (
+            announced(watcher, convoy, "event"),
+            viewed("--connect", router.endpoint) as address,
+            opened(address, 900, 600) as page,
+        ):
+            watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
+            at = time.time() + 0.2
+            for order in (messages.Order("takeoff"), messages.Order("start", at=at)):
+                assert all(watcher.order(name, order).ok for name in names)
+            page.until(lambda: everywhere(lambda status: status.phase == "running"), "running")
+
+            page.page.locator(".mantine-Notification-closeButton").click()  # it says that there is no graphics card
+            page.page.get_by_label("Drag the leaders' targets").check()
+            page.until(lambda: "/targets/TB01" in page.nodes, "the target is shown")
+            start = np.array(convoy.robots["TB01"].start[:2])
+            square = np.array([*start + 0.255 * acting.HANDLE * 3.0 / 2.5, 0.0])  # by which it is dragged in the plane
+            place = page.nodes["/targets/TB01"]
+
+            def dragged(by: tuple[float, float], answer: str) -> None:
+                page.until(
+                    lambda: np.allclose(place.get("position", (np.inf,) * 3)[:2], start, atol=0.01), "it is at its goal"
+                )
+                del place["position"]  # it comes again when the target is back
+                page.drag(square, square + np.array([*by, 0.0]))
+                page.until(lambda: recorded(f"TB01 to {answer}"), f"sent: {events}")
+
+            dragged((0.1, -1.2), "x = 0.10 m, y = -1.80 m: 0 of 1 robots; TB01: x = ")  # outside the arena
+            dragged((0.4, 0.3), "x = 0.40 m, y = -0.30 m: 1 of 1 robots")
+            page.until(lambda: (watcher.look(), watcher.state["TB01"].goal[0] > 0.1)[1], "the leader goes there")
+            assert np.linalg.norm(np.subtract(watcher.state["TB01"].goal[:2], start)) < 0.5, "not at once"
+
+            page.button("Hold all").click()
+            page.until(lambda: recorded("hold: 4 of 4 robots"), "held")
+            page.until(lambda: everywhere(lambda status: status.reason == PAUSED), "statuses say so")
+            page.button("Resume all").click()
+            page.until(lambda: recorded("resume: 4 of 4 robots"), "resumed")
+            page.until(lambda: everywhere(lambda status: not status.reason), "statuses say so")
+
+            page.page.get_by_role("slider").first.press("ArrowRight")
+            page.until(lambda: recorded("trigger.threshold = 0.0102: 4 of 4 robots"), f"set: {events}")
+            changed = [watcher.order(name, messages.Order("get", name="trigger.threshold")).value for name in names]
+            assert changed == pytest.approx([0.0102] * 4)
+
+            page.button("Land all").click()
+            page.until(lambda: recorded("land: 4 of 4 robots"), "landed")
+            page.until(lambda: everywhere(lambda status: status.phase == "done"), "statuses say so")
+    finally:
+        robots.kill()
+
+
+def test_an_observer_of_a_lab_has_no_buttons_and_shift_s_stops_an_operators_run(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
@@ -109,36 +192,41 @@ def test_an_observer_of_a_lab_has_no_buttons(tmp_path: Path) -> None:
         ):
             page.until(lambda: "/case/robots/khepera4/body" in page.nodes, "drawn")
             page.until(lambda: np.all(page.positions("/case/robots/khepera4/body")[:, 2] > -1.0), "seen")
-            assert page.button("EMERGENCY STOP").count() == buttons
-            assert page.button("Land all").count() == buttons
-    assert zenpark("estop", "--connect", endpoint, "--lab", lab).returncode == 0
+            page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase, though it is late")
+            for name in ("EMERGENCY STOP", "Land all", "Hold all", "Resume all"):
+                assert page.button(name).count() == buttons
+            assert page.page.get_by_role("slider").count() >= buttons
+            page.page.keyboard.press("Shift+S")
+            if buttons:
+                page.until(lambda: page.page.get_by_text("stopped: CF01, KH01, KH02").count(), "answers are shown")
     flight.finish()
+    said = [event.text for event in typed(tmp_path / "run" / "event.mcap", "/events") if event.kind == "order"]
+    assert said == ["emergency stop: stopped: CF01, KH01, KH02"]
 
 
 def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> None:
     run = simulate(document.load("robotic-park", "duration_s=6", "timeline=[]"), cases=["event"], folder=tmp_path)
     trace = run.traces["event"]
-    rows = [trace.robots.index(name) for name in ("CF01", "CF02", "CF03")]
     with viewed(tmp_path) as address, opened(address, 640, 480) as page:
-        page.until(lambda: "/case0/robots/crazyflie/body" in page.nodes, "drawn")
+        assert places(page, root="/case0").shape == trace.true_position[0].shape
         time_box = page.page.locator("input[type=text]").nth(0)
         for t in (4.0, 0.5, 2.5):
-            wanted = trace.true_position[int(np.searchsorted(trace.time, t - 1e-6)), rows]
+            wanted = trace.true_position[int(np.searchsorted(trace.time, t - 1e-6))]
             time_box.fill(str(t))
             time_box.press("Enter")
             page.until(
-                lambda wanted=wanted: np.abs(page.positions("/case0/robots/crazyflie/body") - wanted).max() < 1e-3,
+                lambda wanted=wanted: np.abs(places(page, root="/case0") - wanted).max() < 1e-3,
                 f"robots are where they were at {t} s",
             )
         page.button("Play").click()
-        before = page.positions("/case0/robots/crazyflie/body").copy()
-        page.until(lambda: np.any(page.positions("/case0/robots/crazyflie/body") != before), "it plays")
+        before = places(page, root="/case0")
+        page.until(lambda: np.any(places(page, root="/case0") != before), "it plays")
         assert page.hosts == {address.removeprefix("http://")}
 
 
 def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     from experiments.scene.drawing import LIGHT, SceneDrawing  # noqa: PLC0415 - viser may be missing
-    from experiments.view.live import ShowFolder, close_server, look_at, open_server  # noqa: PLC0415
+    from experiments.view.live import ShowFolder, close_server, open_server  # noqa: PLC0415
 
     crowd = document.loads(
         'title = "a hundred"\nduration_s = 9.0\narena = { size = [12.0, 12.0, 3.0] }\n'
@@ -155,7 +243,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     drawing, show = SceneDrawing(server, crowd_stage, LIGHT), ShowFolder(server)
     show.fit(crowd_stage)
     drawing.shown = show.shown
-    look_at(server, (12.0, 12.0, 3.0))
+    show.camera.show(crowd_stage.size)
     over = threading.Event()
     moment = Moment.unknown(crowd_stage)
     grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
