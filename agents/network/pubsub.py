@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from typing import Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
@@ -124,7 +124,9 @@ class Inbox(Generic[M]):
     ) -> None:
         """Reads `kind` from the queue of a subscription."""
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
+        self._queue = subscription.handler  # made anew by Zenoh whenever it is asked for
         self._robots = robots
+        self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
         self.malformed, self.trouble = 0, ""
 
     def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
@@ -133,17 +135,31 @@ class Inbox(Generic[M]):
 
     def read_samples(
         self, check: Callable[[M], object] | None = None, wanted: Callable[[str], bool] | None = None
+    ) -> Iterable[tuple[M, zenoh.Sample]]:
+        """As `read`, with the sample of each message; keys that are not `wanted` are skipped before decoding.
+
+        Empty, and false, if nothing is queued.
+        """
+        waiting = received(self._queue)
+        return self._decoded(waiting, check, wanted) if waiting else ()
+
+    def _decoded(
+        self,
+        waiting: Iterable[zenoh.Sample],
+        check: Callable[[M], object] | None,
+        wanted: Callable[[str], bool] | None,
     ) -> Iterator[tuple[M, zenoh.Sample]]:
-        """As `read`, with the sample of each message; keys that are not `wanted` are skipped before decoding."""
-        for sample in received(self._subscription.handler):
+        for sample in waiting:
             key = str(sample.key_expr)
             if wanted is not None and not wanted(key):
                 continue
+            if key != self._key and self._keys is not None:
+                self._key, self._owner = key, self._keys.whose(key)
             try:
                 message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), self._kind)
-                if self._keys is not None and (robot := getattr(message, "robot", "")) != self._keys.whose(key):
+                if self._keys is not None and (robot := getattr(message, "robot", "")) != self._owner:
                     raise messages.Malformed(
-                        f"{self._kind.__name__.lower()} of '{robot}' on the key of '{self._keys.whose(key)}'"
+                        f"{self._kind.__name__.lower()} of '{robot}' on the key of '{self._owner}'"
                     )
                 if check is not None:
                     check(message)
@@ -164,23 +180,26 @@ class Inbox(Generic[M]):
 class CallbackQueue(Generic[T]):
     """A queue of rare items, filled by the receiving thread, emptied by polling.
 
-    Polling an empty one costs a tenth of polling an empty ring channel. Frequent items belong into a ring channel: each
-    item here costs the receiving thread a wait for the interpreter's lock.
+    Polling an empty one costs a tenth of polling an empty ring channel, and a look at `waiting` a tenth of that.
+    Frequent items belong into a ring channel: each item here costs the receiving thread a wait for the interpreter's
+    lock.
     """
+
+    waiting: deque[T]  # queued items
 
     def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
         """Keeps the newest `depth` items that are `wanted`. `callback` is the one to declare."""
-        self._items: deque[T] = deque(maxlen=depth)
+        self.waiting = deque(maxlen=depth)
         self._wanted = wanted
         self.callback = Callback(self._append, indirect=False)
 
     def try_recv(self) -> T | None:
         """See `Polled`."""
-        return self._items.popleft() if self._items else None
+        return self.waiting.popleft() if self.waiting else None
 
     def _append(self, item: T) -> None:
         if self._wanted(item):
-            self._items.append(item)
+            self.waiting.append(item)
 
 
 class ImmediateSubscriber:
@@ -191,17 +210,19 @@ class ImmediateSubscriber:
     The callback runs in the receiving thread: it must be quick, and must not query this session.
     """
 
+    waiting: deque[messages.Stop]  # to be polled
+
     def __init__(
         self, session: zenoh.Session, key: str, obey: Callable[[messages.Stop], object], depth: int = 256
     ) -> None:
         """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
-        self._waiting: deque[messages.Stop] = deque(maxlen=depth)
+        self.waiting = deque(maxlen=depth)
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
         """See `Polled`."""
-        return self._waiting.popleft() if self._waiting else None
+        return self.waiting.popleft() if self.waiting else None
 
     def close(self) -> None:
         """Ends the subscription."""
@@ -214,7 +235,7 @@ class ImmediateSubscriber:
         try:
             self._obey(stop)
         finally:  # not before: a loop that polls in between would take it for obeyed already
-            self._waiting.append(stop)
+            self.waiting.append(stop)
 
 
 # ---------------------------------------------------------------------- queries
@@ -227,10 +248,12 @@ class Orders(Generic[M]):
     """
 
     malformed: int  # refused payloads
+    waiting: deque[zenoh.Query]  # queued
 
     def __init__(self, session: zenoh.Session, key: str, kind: type[M]) -> None:
         self._kind, self.malformed = kind, 0
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
+        self.waiting = self._queries.waiting
         self._queryable = session.declare_queryable(key, self._queries.callback, complete=True)
 
     def read(self) -> Iterator[tuple[zenoh.Query, M]]:
@@ -264,11 +287,14 @@ class LastValue:
     """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
     not; polled by `answer` from the control loop, so it costs no thread."""
 
+    waiting: deque[zenoh.Query]  # queued
+
     def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
         self.key = key
         self.mime = mime
         self._payload: bytes | None = None
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
+        self.waiting = self._queries.waiting
         self._queryable = session.declare_queryable(key, self._queries.callback)
 
     def hold(self, payload: bytes) -> None:
@@ -311,8 +337,11 @@ class AliveWatch:
     a robot counts as lost. A token on many keys at once (`park/**`) belongs to no robot and is left out.
     """
 
+    waiting: deque[zenoh.Sample]  # queued changes
+
     def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
         self.handler = CallbackQueue[zenoh.Sample](TOKEN_CHANGES, lambda sample: "*" not in str(sample.key_expr))
+        self.waiting = self.handler.waiting
         self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.callback, history=True)
 
     def changes(self) -> Iterator[tuple[str, bool]]:

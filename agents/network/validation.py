@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Array
-from agents.network.messages import Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
+from agents.network.messages import STILL, Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
 
 FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
@@ -178,10 +178,12 @@ def _refuse_stamp(stamp: float, now: float) -> None:
 
 
 def _refuse_place(position: Vector, reach: Vector) -> None:
-    if not all(abs(value) <= limit for value, limit in zip(position, reach, strict=True)):
+    (x, y, z), (far_x, far_y, far_z) = position, reach
+    if not (abs(x) <= far_x and abs(y) <= far_y and abs(z) <= far_z):
         raise Malformed(f"position {position} is outside the arena")
 
 
 def _refuse_motion(velocity: Vector | None, yaw: float | None) -> None:
-    if not _within(velocity or (), MAX_SPEED) or not abs(yaw or 0.0) <= MAX_YAW:
+    x, y, z = velocity or STILL
+    if not (abs(x) <= MAX_SPEED and abs(y) <= MAX_SPEED and abs(z) <= MAX_SPEED and abs(yaw or 0.0) <= MAX_YAW):
         raise Malformed(f"velocity {velocity} or yaw {yaw} is impossible")

@@ -309,20 +309,22 @@ class Runtime:
         agent = self.agent
         health = agent.health
         health.offline_since = self._cut_off_since(t)
-        for _, there in self._conductor.changes():
+        for _, there in self._conductor.changes() if self._conductor.waiting else ():
             health.conductor_lost_since = np.inf if there else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
-        self._apply_stops()
+        if self._estop.waiting:
+            self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
                 self._body.locate(row, taken, position, yaw)
         for row, orders in enumerate(self._orders):
-            for query, order in orders.read():
+            for query, order in orders.read() if orders.waiting else ():
                 self._obey(row, query, order, t)
         for last in self._last:
-            last.answer()
+            if last.waiting:
+                last.answer()
 
     def _cut_off_since(self, t: float) -> float:
         """Time [s] since which no router answers; infinity while one does."""
@@ -463,9 +465,9 @@ class Runtime:
         if self._ranges is not None:
             state = replace(state, rays=replace_rows(state.rays, self._ranges.read(self._utc, t), self._from_world))
         transmission = self.agent.transmit(t, state)
-        for row in transmission.rows:
+        for row in transmission.rows.tolist():
             if row not in self._retired:
-                self._send_pose(int(row), transmission, float(state.yaw[row]), t)
+                self._send_pose(row, transmission, float(state.yaw[row]), t)
         actions = self.agent.act(t, state, transmission)
         self._act(actions)
         if self._retired or not self.agent.lifecycle.all_running:
@@ -474,8 +476,10 @@ class Runtime:
         if not begun and self.agent.decisions:
             counts.begin()
         counts.ticks += 1
-        counts.interventions += actions.changed
-        counts.avoided += actions.avoided
+        if some(actions.changed):
+            counts.interventions += actions.changed
+        if some(actions.avoided):
+            counts.avoided += actions.avoided
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot

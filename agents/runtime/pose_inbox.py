@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from enum import Enum
-from functools import partial
 from math import inf, nan
 from typing import Final, NamedTuple, Protocol
 
@@ -53,6 +52,7 @@ class NeighbourSubscription:
     # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
     # longest delay of a network; else 0
     behind: float
+    tokens: Collection[zenoh.Sample]  # queued for `token_changes`, nearly always none
 
     def __init__(
         self,
@@ -74,6 +74,8 @@ class NeighbourSubscription:
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
+        self.tokens = self._alive.waiting
+        self._now = 0.0  # of the last poll (UTC [s])
         self._seq, self._stamp = 0, 0.0
         self._life: str | None = None  # session of the robot's process, as far as it is known
         self._past: set[str] = set()
@@ -89,14 +91,21 @@ class NeighbourSubscription:
         """Samples that were refused."""
         return self._poses.malformed
 
-    def new_poses(self, now: float) -> Iterator[ReceivedPose]:
+    def new_poses(self, now: float) -> Iterable[ReceivedPose]:
         """Poses received until `now` (UTC [s]), oldest first, without invalid and known ones.
 
         A new session of the robot resets the order of poses, as does a clock that was set back in one session.
         """
+        self._now = now
+        received = self._poses.read_samples(self._check)
+        return self._newer(received, now) if received else ()
+
+    def _check(self, pose: messages.Pose) -> None:
+        validation.check_pose(pose, now=self._now, reach=self._reach)
+
+    def _newer(self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float) -> Iterator[ReceivedPose]:
         before = self._received_at  # poses that waited while this process stood still count as one reception
-        check = partial(validation.check_pose, now=now, reach=self._reach)
-        for pose, sample in self._poses.read_samples(check):
+        for pose, sample in received:
             life = _session_of(sample)
             if life in self._past or (self._owned and life not in (None, self._life)):
                 self.stale += 1
@@ -207,14 +216,14 @@ class ModelledInbox:
         """Samples that were refused."""
         return sum(sender.malformed for sender in self.senders)
 
-    def receive(self, t: float, utc: float, start: Array, own: Collection[str] = ()) -> PoseTable | None:
+    def receive(self, t: float, utc: float, start: Callable[[], Array], own: Collection[str] = ()) -> PoseTable | None:
         """Poses that got through until `t` [s] of a clock that was 0 at `utc` [s]; None without any.
 
-        `start` (E,) is the common start [s], `own` are robots of this process. `extra` of the poses is the time of
-        measurement, see `ReceivedPose.measured`, on that clock.
+        `start` tells a modelled channel the common start (E,) [s], `own` are robots of this process. `extra` of the
+        poses is the time of measurement, see `ReceivedPose.measured`, on that clock.
         """
         for sender in self.senders:
-            for change in sender.token_changes():
+            for change in sender.token_changes() if sender.tokens else ():
                 self.changed = True
                 if change is TokenChange.APPEARED:
                     self._states.mark_alive(sender.links)
@@ -236,9 +245,10 @@ class ModelledInbox:
             poses = _table(arrived, t, utc)
             if self._channel.ideal:
                 return poses
+            begun = start()
             for at in range(len(arrived)):  # the queue of a link counts one sample after the other
                 one = poses.take(np.array([at]))
-                self._channel.send(one, start=start[one.link], now=t)
+                self._channel.send(one, start=begun[one.link], now=t)
         return self._channel.due(t)
 
     def _begin(self, sender: NeighbourSubscription) -> None:
@@ -249,18 +259,16 @@ class ModelledInbox:
 
 def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> PoseTable:
     """Poses that arrived at `t` [s], each with its link; times on the clock that was 0 at `utc` [s]."""
-    poses = [received.pose for _, received in arrived]
-    return PoseTable(
-        np.array([link for link, _ in arrived]),
-        np.array([pose.seq for pose in poses]),
-        np.array([pose.stamp - utc for pose in poses]),
-        np.full(len(poses), t),
-        np.array([pose.position for pose in poses]),
-        np.array([pose.velocity or messages.STILL for pose in poses]),
-        np.array([nan if pose.yaw is None else pose.yaw for pose in poses]),
-        np.array([received.size for _, received in arrived]),
-        np.array([[received.measured - utc] for _, received in arrived]),
-    )
+    whole = np.array([(link, received.pose.seq, received.size) for link, received in arrived])
+    real = np.array([
+        (
+            received.pose.stamp - utc, t, *received.pose.position, *(received.pose.velocity or messages.STILL),
+            nan if received.pose.yaw is None else received.pose.yaw, received.measured - utc,
+        )
+        for _, received in arrived
+    ])  # fmt: skip
+    link, seq, size = whole.T
+    return PoseTable(link, seq, real[:, 0], real[:, 1], real[:, 2:5], real[:, 5:8], real[:, 8], size, real[:, 9:])
 
 
 class PoseInbox(ModelledInbox):
@@ -293,14 +301,14 @@ class PoseInbox(ModelledInbox):
         )  # fmt: skip
         self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
         self.received = [0] * len(agent.assignment.names)
+        self._behind = [0.0] * len(self.senders)
 
     def deliver(self, t: float, utc: float) -> None:
         """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the agent and to telemetry."""
-        behind = [sender.behind for sender in self.senders]
-        start = self._lifecycle.start_at[self._assignment.links.receiver]
-        got = self.receive(t, utc, start, self._assignment.names)
-        for sender, before in zip(self.senders, behind, strict=True):
-            if sender.behind != before:
+        got = self.receive(t, utc, self._start, self._assignment.names)
+        if (behind := [sender.behind for sender in self.senders]) != self._behind:
+            self._behind = behind
+            for sender in self.senders:
                 self._neighbours.mark_clock_lag(sender.links, sender.behind)
         if got is None:
             return
@@ -313,3 +321,6 @@ class PoseInbox(ModelledInbox):
                 messages.PoseReceipt(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
             )
             self.received[row] += 1
+
+    def _start(self) -> Array:
+        return self._lifecycle.start_at[self._assignment.links.receiver]

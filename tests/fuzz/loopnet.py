@@ -70,19 +70,19 @@ class Channel:
 
     def __init__(self, key: str, *, asked: bool = False, depth: int = 64) -> None:
         self.key, self.asked, self.expression = key, asked, zenoh.KeyExpr(key)
-        self._waiting: deque[Sample] = deque(maxlen=depth)
+        self.waiting: deque[Sample] = deque(maxlen=depth)
         self.handler = self
         self.obey: Callable[[Sample], object] = lambda _sample: None
 
     def try_recv(self) -> Sample | None:
-        return self._waiting.popleft() if self._waiting else None
+        return self.waiting.popleft() if self.waiting else None
 
     def add(self, sample: Sample) -> None:
-        self._waiting.append(sample)
+        self.waiting.append(sample)
         self.obey(sample)
 
     def undeclare(self) -> None:
-        self._waiting.clear()
+        self.waiting.clear()
 
     close = undeclare
 
@@ -90,13 +90,15 @@ class Channel:
 def typed_orders(channel: Channel, kind: type[messages.Message]) -> pubsub.Orders[Any]:
     """Orders of a kind that wait in a channel."""
     orders = Orders.__new__(Orders)
-    orders._kind, orders._queries, orders.malformed = kind, channel, 0  # type: ignore[assignment]
+    orders._kind, orders._queries, orders.waiting, orders.malformed = kind, channel, channel.waiting, 0  # type: ignore[assignment]
     orders.close = channel.close  # type: ignore[method-assign]
     return orders
 
 
 class Mute:
     """The end of a key that speaks, a token, a last value: nobody listens."""
+
+    waiting = ()
 
     def put(self, payload: bytes, **_: object) -> None:
         assert isinstance(payload, bytes)

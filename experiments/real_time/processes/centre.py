@@ -132,7 +132,7 @@ class CentreProcess:
             self._begun = begun
             if isfinite(begun):  # decisions fall on the same instants as those of the robots
                 self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
-        received = self._poses.receive(t, self._utc, np.full(len(self._names), begun))
+        received = self._poses.receive(t, self._utc, lambda: np.full(len(self._names), begun))
         if received is not None:
             assert received.extra is not None
             self.centre.receive(replace(received, stamp=received.extra[:, 0]))

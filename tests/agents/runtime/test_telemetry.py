@@ -23,6 +23,7 @@ class Taken:
 
     def __init__(self) -> None:
         self.states: list[messages.State] = []
+        self.waiting: list[object] = []
 
     def put(self, payload: bytes) -> None:
         self.states.append(messages.decode(payload, messages.JSON, messages.State))
