@@ -44,14 +44,50 @@ S = TypeVar("S", bound=msgspec.Struct)
 M = TypeVar("M", State, SentPose, Status)
 
 
-def common_start(events: Iterable[Event], statuses: Iterable[Status], announced: float | None) -> float | None:
-    """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
-    said = next((each.stamp for each in events if each.kind == "start" and math.isfinite(each.stamp)), announced)
-    return min((each.started for each in statuses if each.started > 0.0), default=None) if said is None else said
-
-
 class NotStarted(RecordingError):
     """The recording of a run that ended before its common start, so that there is nothing to show."""
+
+
+@dataclass(frozen=True)
+class AboutRun:
+    """Case, seed, clock and experiment of a recording, and its common start, if that was announced."""
+
+    case: str
+    seed: int
+    clock: str  # "real" or "virtual"
+    announced: float | None  # [s] UTC
+    experiment: Experiment
+
+    @classmethod
+    def of(cls, records: Records) -> AboutRun:
+        """What `records`, whose messages were read, say.
+
+        Raises:
+            RecordingError: If there is nothing of the kind in it.
+        """
+        about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
+        attached = next((record.data for record in records.attachments if record.name == JSON), b"")
+        try:
+            announced = float(about["started"]) if "started" in about else None
+            experiment = msgspec.json.decode(attached, type=Experiment)
+            return cls(about["case"], int(about["seed"]), about["clock"], announced, experiment)
+        except (KeyError, ValueError, RecursionError) as error:
+            text = f"holds no experiment that this version of zenpark can read ({error})"
+            raise RecordingError(f"{records.path}: {text}") from None
+
+    def start(self, events: Iterable[Event], statuses: Iterable[Status], path: Path) -> float:
+        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot.
+
+        Raises:
+            NotStarted: If no robot had started.
+        """
+        said = (each.stamp for each in events if each.kind == "start" and math.isfinite(each.stamp))
+        start = next(said, self.announced)
+        if start is None:
+            start = min((each.started for each in statuses if each.started > 0.0), default=None)
+        if start is None:
+            raise NotStarted(f"{path}: no robot had started when the recording ended; there is nothing to show")
+        return start
 
 
 @dataclass(frozen=True)
@@ -91,22 +127,14 @@ def read(path: Path) -> Playback:
     content = _Content(Records(path))
     messages = content.fill()
     records = content.records
-    about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
-    attached = next((record.data for record in records.attachments if record.name == JSON), b"")
-    try:
-        case, seed, clock = about["case"], int(about["seed"]), about["clock"]
-        announced = float(about["started"]) if "started" in about else None
-        experiment = msgspec.json.decode(attached, type=Experiment)
-    except (KeyError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
-    start = content.start(announced)
-    if start is None:
-        raise NotStarted(f"{path}: no robot had started when the recording ended; there is nothing to show")
+    about = AboutRun.of(records)
+    experiment = about.experiment
+    start = about.start(content[Event], content[Status], path)
     length = content.length(start, experiment.duration_s)
     if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
         raise NotStarted(f"{path}: the run ended before the common start; there is nothing to show")
     with np.errstate(all="ignore"):  # numbers that no robot can have are in the file, not of our making
-        trace = _trace(content, experiment, (start, length), (case, seed, clock))
+        trace = _trace(content, about, (start, length))
     return Playback(trace, start, records.complete, messages)
 
 
@@ -142,10 +170,6 @@ class _Content:
             self[Status][:] = [right.status(status) for status in self[Status]]
             self[SentGoal][:] = [replace(goal, pose=right(goal.robot, goal.pose)) for goal in self[SentGoal]]
         return count
-
-    def start(self, announced: float | None) -> float | None:
-        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
-        return common_start(self[Event], self[Status], announced)
 
     def length(self, start: float, duration: float) -> float:
         """Length of the run from the common start on [s], at most `duration`."""
@@ -187,8 +211,9 @@ class _Content:
 _Sink = tuple[Codec[Any], Callable[[Any], None]]
 
 
-def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], about: tuple[str, int, str]) -> Trace:
+def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trace:
     """The trace of a run by its common start, UTC, and its length [s]."""
+    experiment = about.experiment
     robots = tuple(experiment.robots)
     rate, (start, duration) = experiment.rates.state_hz, run
     time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
@@ -206,11 +231,11 @@ def _trace(content: _Content, experiment: Experiment, run: tuple[float, float], 
     plan = Plan(experiment)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
-        case=about[0],
+        case=about.case,
         experiment=experiment,
-        seed=about[1],
+        seed=about.seed,
         robots=robots,
-        clock=about[2],
+        clock=about.clock,
         time=time,
         sent=_sent(poses, start, duration),
         received=_received(states, plan, start, duration),

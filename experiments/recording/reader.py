@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -64,13 +64,8 @@ class Records:
         Raises:
             RecordingError: If the file cannot be read, or is no MCAP file.
         """
-        try:
-            with self.path.open("rb") as file:
-                if (magic := file.read(len(MCAP0_MAGIC))) != MCAP0_MAGIC:
-                    raise RecordingError(_stranger(self.path, magic))
-                yield from self._walk(file, self.path.stat().st_size)
-        except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be read: {error.strerror}") from error
+        with self._opened() as (file, size):
+            yield from self._walk(file, size)
 
     def chunks(self) -> Iterator[tuple[bytes, dict[int, list[int]]]]:
         """Content of the file in pieces, each with the places in it where the records of messages begin, by channel.
@@ -81,11 +76,17 @@ class Records:
         Raises:
             RecordingError: As `messages`.
         """
+        with self._opened() as (file, size):
+            yield from self._pieces(file, size)
+
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[BinaryIO, int]]:
+        """The file behind its first mark, and its size [bytes]."""
         try:
             with self.path.open("rb") as file:
                 if (magic := file.read(len(MCAP0_MAGIC))) != MCAP0_MAGIC:
                     raise RecordingError(_stranger(self.path, magic))
-                yield from self._pieces(file, self.path.stat().st_size)
+                yield file, self.path.stat().st_size
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be read: {error.strerror}") from error
 
@@ -202,14 +203,15 @@ def recover(source: Path, target: Path) -> Recovered:
     messages = sum(1 for _ in records.messages())
     robots = tuple(dict.fromkeys(_robot(channel) for channel in records.channels.values()))
     if not records.complete:
-        _write(source, target)
+        _write(records, target)
     return Recovered(messages, tuple(robot for robot in robots if robot), records.complete)
 
 
-def _write(source: Path, target: Path) -> None:
+def _write(records: Records, target: Path) -> None:
+    """Write all that was read."""
     try:
         with target.open("xb") as file:
-            _copy(Records(source), Writer(file, chunk_size=CHUNK_BYTES))
+            _copy(records, Writer(file, chunk_size=CHUNK_BYTES))
     except FileExistsError:
         raise RecordingError(f"{target}: exists already; recover under another name") from None
     except RecordingError:
@@ -221,27 +223,18 @@ def _write(source: Path, target: Path) -> None:
 
 
 def _copy(records: Records, writer: Writer) -> None:
-    channels: dict[int, int] = {}
+    header = records.header
+    writer.start(header.profile if header else "", header.library if header else "zenpark")
     schemas = {0: 0}  # MCAP's own mark for: none
-
-    def channel_of(message: Message) -> int:
-        if message.channel not in channels:
-            old = records.channels[message.channel]
-            if old.schema_id not in schemas and (schema := records.schemas.get(old.schema_id)):
-                schemas[old.schema_id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channels[message.channel] = writer.register_channel(
-                old.topic, old.message_encoding, schemas.get(old.schema_id, 0), old.metadata
-            )
-        return channels[message.channel]
-
-    begun = False
-    for message in records.messages():
-        if not begun:
-            _start(records, writer)
-            begun = True
-        writer.add_message(channel_of(message), message.logged, message.data, message.published, message.sequence)
-    if not begun:
-        _start(records, writer)
+    for old, schema in records.schemas.items():
+        schemas[old] = writer.register_schema(schema.name, schema.encoding, schema.data)
+    channels = {
+        old: writer.register_channel(each.topic, each.message_encoding, schemas.get(each.schema_id, 0), each.metadata)
+        for old, each in records.channels.items()
+    }
+    for message in Records(records.path).messages():
+        channel = channels[message.channel]
+        writer.add_message(channel, message.logged, message.data, message.published, message.sequence)
     for attachment in records.attachments:
         writer.add_attachment(
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
@@ -249,11 +242,6 @@ def _copy(records: Records, writer: Writer) -> None:
     for metadata in records.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _start(records: Records, writer: Writer) -> None:
-    header = records.header
-    writer.start(header.profile if header else "", header.library if header else "zenpark")
 
 
 def _robot(channel: Channel) -> str:

@@ -19,7 +19,7 @@ from experiments.definition.experiment import Experiment
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
 from experiments.recording.ros2 import viewers
-from experiments.recording.ros2.cdr import POSE_STAMPED, POSE_STAMPED_SCHEMA, Unencodable, codec, pose_stamped
+from experiments.recording.ros2.cdr import Unencodable, codec
 from experiments.recording.ros2.viewers import Draw
 from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPICS, Message
 
@@ -133,7 +133,7 @@ class Recording:
             for topic in TOPICS
             for made in [codec(topic.recorded)]
         }
-        self._drawn = _Written(DRAWN, POSE_STAMPED, POSE_STAMPED_SCHEMA, _drawing())
+        self._drawn = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA, viewers.pose)
         self._frames = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA, viewers.transform)
         self._scene = _Written(
             SCENE, viewers.MARKERS, viewers.MARKERS_SCHEMA, lambda drawn: viewers.markers(self._scene_at, drawn)
@@ -290,19 +290,6 @@ class _Written:
     kind: str  # the ROS 2 type
     schema: str
     encode: Callable[[Any], bytes]
-
-
-def _drawing() -> Callable[[State], bytes]:
-    """Encoder from a state to the pose that a viewer draws."""
-    encode = pose_stamped(viewers.FRAME)
-
-    def drawn(state: State) -> bytes:
-        place = state.position if state.true_position is None else state.true_position
-        yaw = state.yaw if state.true_yaw is None else state.true_yaw
-        assert place is not None
-        return encode(state.stamp, place, yaw or 0.0, state.attitude)
-
-    return drawn
 
 
 class _Unbuffered:

@@ -23,10 +23,10 @@ from agents.decision.lifecycle import Phase
 from agents.network.messages import Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.recording.clocks import Correction
-from experiments.recording.playback import NotStarted, common_start
+from experiments.recording.playback import AboutRun
 from experiments.recording.reader import PAYLOAD, RecordingError, Records
 from experiments.recording.ros2.cdr import Undecodable, codec
-from experiments.recording.topics import JSON, METADATA, TOPICS, SentPose
+from experiments.recording.topics import TOPICS, SentPose
 from experiments.recording.trace import ROUNDING_S
 
 BATCH: Final = 200  # pieces of the file that are taken apart at once
@@ -118,18 +118,10 @@ def read(path: Path) -> Tracks:
                 sent.setdefault(robot, []).append(_gathered(flat, starts + PAYLOAD + _stamp_of_pose(robot), 1)[:, 0])
             elif kind in rare:
                 rare[kind] += [_decoded(path, kind, data, at) for at in places]
-    about_run = next((each.metadata for each in records.metadata if each.name == METADATA), {})
-    attached = next((each.data for each in records.attachments if each.name == JSON), b"")
-    try:
-        case, clock = about_run["case"], about_run["clock"]
-        announced = float(about_run["started"]) if "started" in about_run else None
-        experiment = msgspec.json.decode(attached, type=Experiment)
-    except (KeyError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: holds no experiment that this version of zenpark can read ({error})") from None
+    run = AboutRun.of(records)
+    experiment = run.experiment
     events, statuses = sorted(rare[Event], key=lambda event: event.stamp), rare[Status]
-    start = common_start(events, statuses, announced)
-    if start is None:
-        raise NotStarted(f"{path}: no robot had started when the recording ended; there is nothing to show")
+    start = run.start(events, statuses, path)
     right = Correction(rare[HostClock]) if rare[HostClock] else None
     robots = tuple(experiment.robots)
     tracks = tuple(
@@ -142,7 +134,7 @@ def read(path: Path) -> Tracks:
     reports = tuple(msgspec.structs.replace(each, stamp=each.stamp - start) for each in rare[WorldState])
     there = [track.time for track in tracks if len(track.time)]
     return Tracks(
-        case, experiment, clock, robots, tracks, tuple(sorted(said, key=lambda event: event.stamp)), reports,
+        run.case, experiment, run.clock, robots, tracks, tuple(sorted(said, key=lambda event: event.stamp)), reports,
         begin=min([0.0, *(float(time[0]) for time in there)]),
         end=max([0.0, *(float(time[-1]) for time in there)]),
     )  # fmt: skip

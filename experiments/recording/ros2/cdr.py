@@ -18,8 +18,6 @@ from typing import Final, Generic, TypeVar
 import msgspec
 from msgspec import inspect as mi
 
-from agents.network.messages import Setpoint, Vector
-
 PACKAGE: Final = "zenpark_msgs"
 LITTLE_ENDIAN: Final = b"\0\1\0\0"  # the encapsulation header of plain CDR; alignment counts from behind it
 FIELD: Final = re.compile(r"[a-z](_?[a-z0-9])*")  # what ROS allows as the name of a field
@@ -281,37 +279,3 @@ class _Writer:
 def _text(value: str) -> bytes:
     encoded = value.encode()
     return _COUNT.pack(len(encoded) + 1) + encoded + b"\0"
-
-
-POSE_STAMPED: Final = "geometry_msgs/msg/PoseStamped"
-POSE_STAMPED_SCHEMA: Final = SEPARATOR.join(
-    [
-        "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
-        "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
-        "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
-        "MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
-        "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n",
-        "MSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n",
-    ]
-)
-
-
-def pose_stamped(frame_id: str) -> Callable[[float, Vector, float, Setpoint | None], bytes]:
-    """The encoder of `geometry_msgs/msg/PoseStamped` for one frame.
-
-    Returns:
-        A function of the UTC stamp [s], the position [m], the yaw [rad] and the attitude (quaternion w, x, y, z), which
-        if known stands for the yaw; it raises `Unencodable`.
-    """
-    text = _text(frame_id)
-    layout = struct.Struct(f"<4siI{len(text)}s{-len(text) % 8}x7d")  # the frame is constant, so the layout is too
-
-    def encode(stamp: float, position: Vector, yaw: float, attitude: Setpoint | None) -> bytes:
-        try:
-            seconds, nanoseconds = divmod(round(stamp * 1e9), 1_000_000_000)
-            w, *turned = attitude or (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
-            return layout.pack(LITTLE_ENDIAN, seconds, nanoseconds, text, *position, *turned, w)
-        except (struct.error, TypeError, ValueError, OverflowError) as error:
-            raise Unencodable(f"{POSE_STAMPED}: {error}") from None
-
-    return encode

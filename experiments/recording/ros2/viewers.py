@@ -13,13 +13,25 @@ from functools import cache
 from typing import Final
 
 from agents.network.messages import Setpoint, State, Vector
-from experiments.recording.ros2.cdr import LITTLE_ENDIAN, POSE_STAMPED_SCHEMA, SEPARATOR, Unencodable
+from experiments.recording.ros2.cdr import LITTLE_ENDIAN, SEPARATOR, Unencodable
 
 FRAME: Final = "map"  # the arena, as RViz and Nav2 name the fixed frame; the ROS 2 bridge says the same
 
 TF: Final = "tf2_msgs/msg/TFMessage"
 MARKERS: Final = "visualization_msgs/msg/MarkerArray"
-_POSE: Final = POSE_STAMPED_SCHEMA.split(SEPARATOR)  # Header, Time, Pose, Point, Quaternion behind the message itself
+POSE: Final = "geometry_msgs/msg/PoseStamped"
+_HEADER: Final = (
+    "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
+    "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
+)
+_POINT: Final = (
+    "MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n",
+)
+_QUATERNION: Final = "MSG: geometry_msgs/Quaternion\nfloat64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
+POSE_SCHEMA: Final = SEPARATOR.join(
+    ["std_msgs/Header header\ngeometry_msgs/Pose pose\n", *_HEADER, *_POINT, _QUATERNION]
+)
 _VECTOR: Final = "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 TF_SCHEMA: Final = SEPARATOR.join(
     [
@@ -28,7 +40,8 @@ TF_SCHEMA: Final = SEPARATOR.join(
         "geometry_msgs/Transform transform\n",
         "MSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
         _VECTOR,
-        *(part for part in _POSE[1:] if not part.startswith(("MSG: geometry_msgs/Pose\n", "MSG: geometry_msgs/Point"))),
+        *_HEADER,
+        _QUATERNION,
     ]
 )
 MARKERS_SCHEMA: Final = SEPARATOR.join(
@@ -40,7 +53,9 @@ MARKERS_SCHEMA: Final = SEPARATOR.join(
         "std_msgs/ColorRGBA[] colors\nstring texture_resource\nsensor_msgs/CompressedImage texture\n"
         "visualization_msgs/UVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\n"
         "visualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n",
-        *_POSE[1:],
+        *_HEADER,
+        *_POINT,
+        _QUATERNION,
         _VECTOR,
         "MSG: std_msgs/ColorRGBA\nfloat32 r\nfloat32 g\nfloat32 b\nfloat32 a\n",
         "MSG: builtin_interfaces/Duration\nint32 sec\nuint32 nanosec\n",
@@ -138,29 +153,35 @@ def markers(stamp: float, drawn: Sequence[Marker]) -> bytes:
 
 
 @cache
-def _transform_layout(robot: str) -> tuple[struct.Struct, bytes]:
-    """Layout of the transform of a robot; its name and that of the frame are constant."""
+def _layout(counts: int, *texts: str) -> tuple[struct.Struct, bytes]:
+    """Layout of a stamped place and attitude behind `counts` numbers; the texts of its header are constant."""
     out = _Cdr()
-    out.numbers("I", 1)
-    out.header(0, 0, FRAME)
-    out.text(robot)
-    names = bytes(out.data[12:])
-    return struct.Struct(f"<4sIII{len(names)}s{-(12 + len(names)) % 8}x7d"), names
+    out.numbers("I", *[0] * (counts + 2))
+    for text in texts:
+        out.text(text)
+    behind = bytes(out.data[4 * (counts + 2) :])
+    return struct.Struct(f"<4s{counts}IiI{len(behind)}s{-len(out.data) % 8}x7d"), behind
 
 
-def transform(state: State) -> bytes:
-    """The `TFMessage` of a robot: from the arena to its body, whose frame has the robot's name.
-
-    Raises:
-        Unencodable: If a number is none of its type.
-    """
-    layout, names = _transform_layout(state.robot)
+def _stamped(kind: str, state: State, counts: Sequence[int], *texts: str) -> bytes:
+    """A message that is a robot's place, true if known, else as measured, and its attitude, if known, else its yaw."""
+    layout, behind = _layout(len(counts), *texts)
     place = state.position if state.true_position is None else state.true_position
     yaw = state.yaw if state.true_yaw is None else state.true_yaw
     half = 0.5 * (yaw or 0.0)
     w, *turned = state.attitude or (math.cos(half), 0.0, 0.0, math.sin(half))
     assert place is not None
     try:
-        return layout.pack(LITTLE_ENDIAN, 1, *_moment(state.stamp), names, *place, *turned, w)
-    except (struct.error, OverflowError, ValueError) as error:
-        raise Unencodable(f"{TF}: {error}") from None
+        return layout.pack(LITTLE_ENDIAN, *counts, *_moment(state.stamp), behind, *place, *turned, w)
+    except (struct.error, TypeError, OverflowError, ValueError) as error:
+        raise Unencodable(f"{kind}: {error}") from None
+
+
+def pose(state: State) -> bytes:
+    """The `PoseStamped` of a robot in the arena; raises `Unencodable`."""
+    return _stamped(POSE, state, (), FRAME)
+
+
+def transform(state: State) -> bytes:
+    """The `TFMessage` of a robot, from the arena to its body, whose frame has its name; raises `Unencodable`."""
+    return _stamped(TF, state, (1,), FRAME, state.robot)

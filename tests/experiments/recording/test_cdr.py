@@ -13,14 +13,12 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agents.network.messages import Event, Pose, PoseReceipt, State, Status
+from experiments.recording.ros2 import viewers
 from experiments.recording.ros2.cdr import (
-    POSE_STAMPED,
-    POSE_STAMPED_SCHEMA,
     Codec,
     Undecodable,
     Unencodable,
     codec,
-    pose_stamped,
 )
 from experiments.recording.topics import SentPose
 
@@ -329,29 +327,33 @@ def test_an_empty_struct_is_no_message():
         codec(msgspec.defstruct("Nothing", []))
 
 
+def drawn(stamp, position=(0.0, 0.0, 0.0), yaw=0.0, attitude=None):
+    return viewers.pose(State("CF01", 1, stamp, "running", position, yaw=yaw, attitude=attitude))
+
+
 @pytest.mark.slow
-@given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10), st.text("abcdefgh/", max_size=9))
-def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw, frame):
-    data = pose_stamped(frame)(stamp, position, yaw, None)
+@given(st.floats(0, 2**31 - 1), vector, st.floats(-10, 10))
+def test_pose_stamped_is_what_rosbags_writes(stamp, position, yaw):
+    data = drawn(stamp, position, yaw)
     store = get_typestore(Stores.ROS2_HUMBLE)
-    theirs = store.deserialize_cdr(data, POSE_STAMPED)
+    theirs = store.deserialize_cdr(data, viewers.POSE)
     assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == round(stamp * 1e9)
-    assert theirs.header.frame_id == frame
+    assert theirs.header.frame_id == viewers.FRAME
     assert (theirs.pose.position.x, theirs.pose.position.y, theirs.pose.position.z) == position
     turn = theirs.pose.orientation
     assert (turn.x, turn.y) == (0.0, 0.0)
     assert math.remainder(2.0 * math.atan2(turn.z, turn.w) - yaw, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
-    assert bytes(store.serialize_cdr(theirs, POSE_STAMPED)) == data
+    assert bytes(store.serialize_cdr(theirs, viewers.POSE)) == data
 
 
 def test_an_attitude_stands_for_the_yaw():
-    data = pose_stamped("park")(1.0, (0.0, 0.0, 0.0), 3.0, (0.1, 0.2, 0.4, 0.8))
-    turn = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, POSE_STAMPED).pose.orientation
+    data = drawn(1.0, yaw=3.0, attitude=(0.1, 0.2, 0.4, 0.8))
+    turn = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, viewers.POSE).pose.orientation
     assert (turn.w, turn.x, turn.y, turn.z) == (0.1, 0.2, 0.4, 0.8)
 
 
 def test_the_schema_of_pose_stamped_is_the_standard_one():
-    own = get_types_from_msg(POSE_STAMPED_SCHEMA, POSE_STAMPED)
+    own = get_types_from_msg(viewers.POSE_SCHEMA, viewers.POSE)
     store = get_typestore(Stores.ROS2_HUMBLE)
     empty = get_typestore(Stores.EMPTY)
     empty.register(own)
@@ -362,4 +364,4 @@ def test_the_schema_of_pose_stamped_is_the_standard_one():
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, 2.0**31, -(2.0**32)])
 def test_a_stamp_that_ros_cannot_hold_is_refused(stamp):
     with pytest.raises(Unencodable, match="PoseStamped"):
-        pose_stamped("park")(stamp, (0.0, 0.0, 0.0), 0.0, None)
+        drawn(stamp)
