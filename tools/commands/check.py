@@ -24,6 +24,7 @@ from tools.commands.options import (
     check_bodies,
     example,
     print_json,
+    warn,
 )
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def preflight(
 
     from agents.runtime.command_line import Interrupts
     from experiments.file.document import chosen, load
-    from experiments.real_time.conductor.conduct import RunOptions
+    from experiments.real_time.conductor.conduct import RunOptions, Supervision
     from experiments.real_time.conductor.emergency import Emergency
     from experiments.real_time.conductor.preflight import Trials, check_robots
     from experiments.recording.run_folder import new_folder, remove_unused
@@ -153,10 +154,7 @@ def preflight(
                 folder,
                 options,
                 Trials(hop=hop, stop=stop, sticks=sticks),
-                show=shown(quiet=as_json),
-                interrupted=interrupted,
-                emergency=emergency,
-                tell=lambda lines: print(*lines, sep="\n", file=sys.stderr) if lines else None,
+                Supervision(shown(quiet=as_json), interrupted, emergency, tell=warn),
             )
             ended = interrupted()
     finally:

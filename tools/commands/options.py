@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
@@ -126,6 +127,12 @@ def with_options(command: Callable[..., int]) -> Callable[..., int]:
     called.__dict__["__signature__"] = signature.replace(parameters=[*own, *more])
     called.__annotations__ = {each.name: each.annotation for each in (*own, *more)}
     return called
+
+
+def warn(lines: Sequence[str]) -> None:
+    """Print notes for the user on standard error."""
+    for line in lines:
+        print(f"zenpark: {line}", file=sys.stderr)
 
 
 def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included

@@ -28,6 +28,7 @@ from tools.commands.options import (
     check_bodies,
     example,
     print_json,
+    warn,
 )
 from tools.commands.results import figure, write_figures_of_merit, write_report
 
@@ -194,7 +195,7 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
         former = Path(unpacked)
         origin = bundle.unpack(Path(asked.file), former)
         if origin.made_by is not None:
-            _warn([f"{asked.file}: {each}" for each in provenance().differences(origin.made_by)])
+            warn([f"{asked.file}: {each}" for each in provenance().differences(origin.made_by)])
         again = msgspec.structs.replace(
             origin,
             command=f"./zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
@@ -226,7 +227,7 @@ def _report_failures(runs: Sequence[Run]) -> int:
     from experiments.report import verdict
 
     found = verdict.failures([case for each in runs for case in each.metrics.values()])
-    _warn([finding.text for finding in found])
+    warn([finding.text for finding in found])
     return FAILED if found else 0
 
 
@@ -266,7 +267,7 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
         The run, none if it was ended at once; the reason of an emergency stop, else empty; the exit code.
     """
     from agents.runtime.command_line import Interrupts
-    from experiments.real_time.conductor.conduct import conduct
+    from experiments.real_time.conductor.conduct import Supervision, conduct
     from experiments.real_time.conductor.emergency import Emergency
     from experiments.run import read_back
     from tools.progress import shown
@@ -274,16 +275,8 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     emergency = Emergency()
     with Interrupts() as interrupted:
         try:
-            flown = conduct(
-                read,
-                folder,
-                options,
-                show=shown(quiet=quiet),
-                interrupted=interrupted,
-                emergency=emergency,
-                tell=_warn,
-            )
-            runs = [read_back(folder, *flown)]
+            user = Supervision(shown(quiet=quiet), interrupted, emergency, tell=warn)
+            runs = [read_back(folder, *conduct(read, folder, options, user))]
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
@@ -307,11 +300,6 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
         _print(runs, summary, page)
     if show.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
-
-
-def _warn(lines: Sequence[str]) -> None:
-    for line in lines:
-        print(f"zenpark: {line}", file=sys.stderr)
 
 
 def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:

@@ -26,9 +26,8 @@ from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
-from experiments.real_time.conductor.conduct import RunOptions, conduct
+from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
 from experiments.real_time.conductor.conductor import RunFailed
-from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.conductor.run_view import Progress
 from experiments.real_time.conductor.support import StandInError
 from experiments.real_time.hosts.hosts import HostError
@@ -95,10 +94,9 @@ def main() -> int:
                 load(request.file, *request.changes),
                 Path(request.folder),
                 RunOptions(cases=[request.case], bodies=request.bodies, here=True),
-                show=EventLines(),
-                interrupted=over.is_set,
-                emergency=Emergency(),
-                launching=partial(CabledLauncher, request.cables, request.switches),
+                Supervision(
+                    EventLines(), over.is_set, launching=partial(CabledLauncher, request.cables, request.switches)
+                ),
             )
     except EXPLAINED as error:
         print(f"zenpark: {error}", file=sys.stderr)

@@ -49,28 +49,25 @@ class RunOptions:
     identity: str = "operator"  # whose certificate the conductor shows, in a lab: an operator's
 
 
-def conduct(
-    read: Document,
-    folder: Path,
-    staging: RunOptions,
-    *,
-    show: Shown,
-    interrupted: Callable[[], bool],
-    emergency: Emergency,
-    launching: Callable[[Path], Launcher] = Launcher,
-    tell: Callable[[Sequence[str]], None] = lambda _: None,
-) -> tuple[dict[str, Path], list[str]]:
+@dataclass(frozen=True)
+class Supervision:
+    """How a user follows and ends a run."""
+
+    show: Shown  # shows the progress
+    interrupted: Callable[[], bool]  # whether the user wants to end: all robots land, and what was recorded is kept
+    emergency: Emergency = field(default_factory=Emergency)  # receives emergency stops, which end the run as well
+    tell: Callable[[Sequence[str]], None] = lambda _: None  # receives notes for the user before the start
+    launching: Callable[[Path], Launcher] = Launcher  # makes the launcher of the processes, by the folder of their logs
+
+
+def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision) -> tuple[dict[str, Path], list[str]]:
     """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
         read: The experiment.
         folder: For recordings and logs; it exists.
         staging: Options that the file leaves open.
-        show: Shows the progress.
-        interrupted: Whether the user wants to end: all robots land, and what was recorded is kept.
-        emergency: Receives emergency stops; after one no further case begins.
-        launching: Makes the launcher of the processes, given the folder of their logs.
-        tell: Receives notes for the user before the start.
+        user: After an interrupt or an emergency stop no further case begins.
 
     Returns:
         The recordings of the cases that have begun, and notes for the reader.
@@ -86,21 +83,10 @@ def conduct(
     """
     results: dict[str, CaseResult] = {}
     embodied = embody(read, staging)
-    with (
-        staged(
-            read,
-            embodied,
-            folder,
-            staging,
-            interrupted=interrupted,
-            emergency=emergency,
-            launching=launching,
-            tell=tell,
-        ) as stage,
-        show,
-    ):
+    emergency = user.emergency
+    with staged(read, embodied, folder, staging, user) as stage, user.show as show:
         for name in embodied:
-            if interrupted() or emergency:
+            if user.interrupted() or emergency:
                 break
             results[name] = Conductor(stage.context(name), show).run()
     unflown = ", ".join(name for name in embodied if name not in results)
@@ -140,11 +126,7 @@ def staged(
     embodied: Mapping[str, Experiment],
     folder: Path,
     staging: RunOptions,
-    *,
-    interrupted: Callable[[], bool],
-    emergency: Emergency,
-    launching: Callable[[Path], Launcher] = Launcher,
-    tell: Callable[[Sequence[str]], None] = lambda _: None,
+    user: Supervision,
 ) -> Iterator[Stage]:
     """Put routers and hosts up for some cases, list the run on this machine, and listen for emergency stops.
 
@@ -170,8 +152,8 @@ def staged(
         "run", read.experiment.title or read.path.stem, endpoints,
         folder=folder, realm=network.realm, identity=staging.identity, robots=hardware(embodied.values()),
     )  # fmt: skip
-    with run_registry.registered(me) as unlisted, launching(folder / "logs") as launcher:
-        tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
+    with run_registry.registered(me) as unlisted, user.launching(folder / "logs") as launcher:
+        user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         routers = make_routers(listening, network.routers) if own_router else []
         for router in routers:
             router.start(launcher, rights)
@@ -180,7 +162,9 @@ def staged(
         # a mesh has no members yet: only the session of each case receives stops there
         keys = Keys(network.realm)
         stops = (
-            nullcontext() if meshed else emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
+            nullcontext()
+            if meshed
+            else user.emergency.throughout(endpoints, keys, staging.identity, starting=own_router)
         )
 
         def context(name: str) -> CaseContext:
@@ -192,10 +176,10 @@ def staged(
                 endpoints=endpoints,
                 launcher=launcher,
                 hosts=hosts,
-                interrupted=interrupted,
+                interrupted=user.interrupted,
                 rights=rights,
                 identity=staging.identity,
-                emergency=emergency,
+                emergency=user.emergency,
             )
 
         stage = Stage(context)

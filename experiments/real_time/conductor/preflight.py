@@ -28,12 +28,11 @@ from experiments.file.document import Document, write_json
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.case_processes import CaseProcesses
-from experiments.real_time.conductor.conduct import RunOptions, embody, staged
-from experiments.real_time.conductor.emergency import Emergency
+from experiments.real_time.conductor.conduct import RunOptions, Supervision, embody, staged
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.preflight_checks import DRIVE_M, HOP_M, Check, Observed, RobotChecks, Tried
-from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show, Shown
+from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show
 from experiments.real_time.hosts.launcher import LAND_S
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
@@ -61,15 +60,7 @@ class Trials:
 
 
 def check_robots(
-    read: Document,
-    folder: Path,
-    options: RunOptions,
-    trials: Trials,
-    *,
-    show: Shown,
-    interrupted: Callable[[], bool],
-    emergency: Emergency,
-    tell: Callable[[Sequence[str]], None] = lambda _: None,
+    read: Document, folder: Path, options: RunOptions, trials: Trials, user: Supervision
 ) -> list[RobotChecks]:
     """Check the robots of an experiment before the first flight.
 
@@ -78,10 +69,7 @@ def check_robots(
         folder: Where logs go; it exists.
         options: What the file leaves open.
         trials: What is tried.
-        show: Shows the progress.
-        interrupted: Asked whether the user wants to end: the robot that moves lands.
-        emergency: Hears emergency stops, which end the checks.
-        tell: Takes what the user should know before it begins.
+        user: After an interrupt the robot that moves lands; emergency stops end the checks as well.
 
     Returns:
         The checks of each robot; none if the user ended them before they began.
@@ -90,12 +78,7 @@ def check_robots(
         As `conduct`.
     """
     experiment = alone(next(iter(embody(read, options).values())))
-    with (
-        staged(
-            read, {PREFLIGHT: experiment}, folder, options, interrupted=interrupted, emergency=emergency, tell=tell
-        ) as stage,
-        show,
-    ):
+    with staged(read, {PREFLIGHT: experiment}, folder, options, user) as stage, user.show as show:
         return Inspector(stage.context(PREFLIGHT), show, trials).run()
 
 
