@@ -50,11 +50,37 @@ def test_the_force_is_minus_the_gradient_of_equation_2():
 def test_the_goal_is_shifted_by_h_v_along_the_sum_of_all_forces():
     here = own((TELLO,), [0.0, 0.0, 1.0])
     things = near([0, 0], [[0.3, 0.0], [0.0, 0.3]])
-    goal = np.array([[0.02, 0.01, 1.0]])
+    goal = np.array([[-0.02, -0.01, 1.0]])
     shifted = Potential(velocity=0.2, period_s=0.1).deviate(goal, here, things, 0.01)
-    np.testing.assert_allclose(shifted, [[0.02 - 0.02 / np.sqrt(2), 0.01 - 0.02 / np.sqrt(2), 1.0]], atol=1e-12)
+    np.testing.assert_allclose(shifted, [[-0.02 - 0.02 / np.sqrt(2), -0.01 - 0.02 / np.sqrt(2), 1.0]], atol=1e-12)
     usual = Potential().deviate(goal, here, things, 0.01)  # h = 1/response = 1 s, v = 1 m/s: its limit
-    np.testing.assert_allclose(usual, [[0.02 - 1 / np.sqrt(2), 0.01 - 1 / np.sqrt(2), 1.0]], atol=1e-12)
+    np.testing.assert_allclose(usual, [[-0.02 - 1 / np.sqrt(2), -0.01 - 1 / np.sqrt(2), 1.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("gap", "share"), [(0.25, 1.0), (0.1, 1.0), (0.3 - 1e-9, 0.0), (0.28, 0.28471)])
+def test_the_push_grows_from_nothing_within_a_layer(gap, share):
+    # (1/0.28 - 1/0.3)/0.28² over (1/0.25 - 1/0.3)/0.25²
+    here = own((TELLO,), [0.0, 0.0, 1.0])
+    thing = near([0], [TELLO.radius + gap, 0.0])
+    shifted = Potential(velocity=0.2, period_s=0.1).deviate(np.array([[0.0, 0.0, 1.0]]), here, thing, 0.01)
+    np.testing.assert_allclose(shifted, [[-0.02 * share, 0.0, 1.0]], atol=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("goal", "aside"),
+    [
+        ((0.5, 0.0), -0.05),  # straight ahead: to the right, by a tenth of the pull
+        ((0.5, 0.02), -0.05),  # nearly so
+        ((0.5, 0.03), 0.05),  # to the left is nearer
+        ((0.5, -0.2), -0.05),
+        ((-0.5, 0.1), 0.0),  # away from the thing
+    ],
+)
+def test_a_goal_behind_a_thing_pulls_aside(goal, aside):
+    here = own((TELLO,), [0.0, 0.0, 1.0])
+    thing = near([0], [0.2, 0.0])
+    (x, y, _), *_ = Potential(velocity=0.2, period_s=0.1).deviate(np.array([[*goal, 1.0]]), here, thing, 0.01)
+    np.testing.assert_allclose((x, y), (goal[0] - 0.02, goal[1] + aside), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3, CRAZYFLIE, TELLO])
