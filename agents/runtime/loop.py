@@ -417,12 +417,12 @@ class Runtime:
             self._watchdog.beat()
             if self._watchdog.tripped:
                 self._recover(self._watchdog.forgive())
-            if self._cut_off:
-                self._yield_after_stop()
             wait = zero + self._next - time.monotonic()
             behind = max(0, int(-wait / self._dt))
             if wait > 0.0:
                 time.sleep(wait)
+            if self._cut_off:  # most stops come during that sleep
+                self._yield_after_stop()
             if self._make_sure():
                 continue
             self._counts.missed += behind

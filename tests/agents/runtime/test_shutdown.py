@@ -175,3 +175,27 @@ def test_all_calls_are_made_and_the_last_error_is_raised():
         )
     assert made == ["one", "two", "three"]
     assert str(error.value.__context__) == "one"
+
+
+def test_after_a_stop_that_comes_between_two_ticks_the_next_one_leaves_the_processor_to_others(monkeypatch):
+    body = Airborne()
+    done: list[float] = []  # ticks when the stop came; sleeps and ticks since
+    sleep = loop.time.sleep
+
+    def asleep(seconds: float) -> None:
+        if body.reads and not body.stopped:
+            body.net.deliver(sent("park/estop", messages.Stop("a test", "to see"))[0])
+            done.append(body.reads)
+        elif len(done) == 1:
+            done.extend((seconds, body.reads))
+        sleep(seconds)
+
+    def command(_setpoint: np.ndarray) -> None:
+        if len(done) > 1 or body.reads > 1000:
+            raise OSError("the loop breaks")
+
+    monkeypatch.setattr(loop.time, "sleep", asleep)
+    body.command = command
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body)
+    assert done == [done[0], loop.STOP_YIELD_S, done[0]]
