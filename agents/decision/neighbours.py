@@ -30,7 +30,9 @@ class NeighbourPoses:
 
     def receive(self, received: PoseTable) -> PoseTable:
         """Store poses received on links (H), in order of arrival; returns those that are newer than the known ones."""
-        if some(received.stamp[1:] < received.stamp[:-1]):  # of several on one link the newest stays
+        if len(received.link) > 1 and some(
+            received.stamp[1:] < received.stamp[:-1]
+        ):  # of several on one link the newest stays
             received = received.take(np.argsort(received.stamp, kind="stable"))
         newer = received.stamp > self.stamp[received.link]
         if not every(newer):

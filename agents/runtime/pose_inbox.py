@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from enum import Enum
 from math import inf, nan
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 import msgspec
 import numpy as np
@@ -30,7 +30,7 @@ class TokenChange(Enum):
     NEW_SESSION = 3  # its process is another one than before
 
 
-class ReceivedPose(NamedTuple):
+class ReceivedPose(msgspec.Struct, frozen=True):
     """A valid pose that is newer than those before it."""
 
     pose: messages.Pose
@@ -47,6 +47,7 @@ class NeighbourSubscription:
 
     name: str  # of the robot
     links: Index  # (K,) links with this sender
+    numbers: list[int]  # the same
     lost: int  # lost poses; counted by the caller, which knows from when on they matter
     stale: int  # poses that were dropped: older than a known one, or of a former session
     # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
@@ -70,7 +71,7 @@ class NeighbourSubscription:
         `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s], and
         `depth` of them may wait.
         """
-        self.name, self.links, self._reach, self._rate = name, links, reach, rate
+        self.name, self.links, self.numbers, self._reach, self._rate = name, links, links.tolist(), reach, rate
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
@@ -106,23 +107,26 @@ class NeighbourSubscription:
     def _newer(self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float) -> Iterator[ReceivedPose]:
         before = self._received_at  # poses that waited while this process stood still count as one reception
         for pose, sample in received:
-            life = _session_of(sample)
-            if life in self._past or (self._owned and life not in (None, self._life)):
-                self.stale += 1
-                continue
-            anew = life is not None and self._note_session(life)
-            if pose.stamp <= self._stamp and pose.seq > self._seq:  # its clock was set back
-                self._seq, self._stamp, anew = 0, 0.0, True
-            if pose.stamp <= self._stamp:  # equal: repeated after a reconnection
-                self.stale += pose.stamp < self._stamp
-                continue
-            self._detect_lag(now, now - pose.stamp)
-            since = pose.stamp - self._stamp
-            missed = validation.missed(self._seq, pose.seq, since, self._rate) if self._seq else 0
+            life, anew = _session_of(sample), False
+            if life != self._life and life is not None:
+                if self._owned or life in self._past:
+                    self.stale += 1
+                    continue
+                anew = self._note_session(life)
+            if pose.stamp <= self._stamp:
+                if pose.seq <= self._seq:
+                    self.stale += pose.stamp < self._stamp  # equal: repeated after a reconnection
+                    continue
+                self._seq, self._stamp, anew = 0, 0.0, True  # its clock was set back
+            age, since, missed = now - pose.stamp, pose.stamp - self._stamp, 0
+            if age > LATE_S or self._old:
+                self._detect_lag(now, age)
+            if self._seq and pose.seq != self._seq + 1:
+                missed = validation.missed(self._seq, pose.seq, since, self._rate)
             self._seq, self._stamp = pose.seq, pose.stamp
             # A clock that is behind: a predictor must not extrapolate over that time. A pose from before the last
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
-            slow = self.behind or (pose.stamp < before and now - pose.stamp > LATE_S)
+            slow = self.behind or (pose.stamp < before and age > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
             self._received_at = now
             yield ReceivedPose(pose, len(sample.payload), missed, measured, anew)
@@ -240,7 +244,7 @@ class ModelledInbox:
                 if received.anew:
                     self._begin(sender)
                     arrived = [(link, before) for link, before in arrived if link not in sender.links]
-                arrived += [(link, received) for link in sender.links.tolist()]
+                arrived += [(link, received) for link in sender.numbers]
         if arrived:
             poses = _table(arrived, t, utc)
             if self._channel.ideal:
@@ -267,8 +271,10 @@ def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> Pos
         )
         for _, received in arrived
     ])  # fmt: skip
-    link, seq, size = whole.T
-    return PoseTable(link, seq, real[:, 0], real[:, 1], real[:, 2:5], real[:, 5:8], real[:, 8], size, real[:, 9:])
+    return PoseTable(
+        whole[:, 0], whole[:, 1], real[:, 0], real[:, 1], real[:, 2:5], real[:, 5:8], real[:, 8], whole[:, 2],
+        real[:, 9:],
+    )  # fmt: skip
 
 
 class PoseInbox(ModelledInbox):
@@ -314,8 +320,10 @@ class PoseInbox(ModelledInbox):
             return
         assert got.extra is not None  # the recorded pose keeps its own stamp
         self._neighbours.receive(msgspec.structs.replace(got, stamp=got.extra[:, 0]))
-        columns = (got.link, got.seq, got.stamp, got.arrival, got.position, got.velocity)
-        for link, seq, stamp, arrival, position, velocity in zip(*(c.tolist() for c in columns), strict=True):
+        for link, seq, stamp, arrival, position, velocity in zip(
+            got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.arrival.tolist(), got.position.tolist(),
+            got.velocity.tolist(), strict=True,
+        ):  # fmt: skip
             row, name = self._ends[link]
             self.news[row].append(
                 messages.PoseReceipt(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))

@@ -100,10 +100,10 @@ class SetpointFilter:
             not_finite = ~np.asarray(sane.all(axis=1) | invalid)
             here, yaw = np.where(invalid[:, None], self._centre, position), np.where(invalid, 0.0, yaw)
             safe[invalid | not_finite] = 0.0
+            age = np.where(invalid, 0.0, age)
             stay = not_finite & self._takes_position
             safe[stay, :3] = here[stay]
-        late = np.where(invalid, 0.0, np.maximum(age, 0.0)) if troubled else np.maximum(age, 0.0)
-        self._limit(safe, here, yaw, late)
+        self._limit(safe, here, yaw, age)
         avoided = no_row
         if avoidance is not None:
             wished = _wished(safe, *avoidance)
@@ -111,7 +111,7 @@ class SetpointFilter:
             other &= ~(invalid | not_finite)
             if some(other):
                 again = np.where(other[:, None], wished, safe)
-                self._limit(again, here, yaw, late)
+                self._limit(again, here, yaw, age)
                 again = np.where(other[:, None], again, safe)  # limits twice over may differ in the last bit
                 avoided, safe = np.asarray((np.abs(again - safe) > ROUNDING).any(axis=1)), again
         changed = no_row
@@ -152,7 +152,7 @@ class SetpointFilter:
         beyond a wall, back.
         """
         speed, turn = self._speed[rows, None], self._turn_rate[rows]
-        seconds = (self._closes_s[rows] + age)[:, None]
+        seconds = (self._closes_s[rows] + np.maximum(age, 0.0))[:, None]
         inside = clamp(velocity[:, :3], (self._low[rows] - here) / seconds, (self._high[rows] - here) / seconds)
         velocity[:, :3] = clamp(inside, -speed, speed)
         velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
@@ -163,7 +163,7 @@ class SetpointFilter:
         speed, turn = self._speed[rows], self._turn_rate[rows]
         v = clamp(twist[:, 0], -speed, speed)
         below, above = here - self._low[rows, :2], self._high[rows, :2] - here
-        seconds = self._closes_s[rows] + age
+        seconds = self._closes_s[rows] + np.maximum(age, 0.0)
         if some(np.minimum(below, above) < (speed * seconds)[:, None]):
             moves = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * v[:, None]
             most = np.maximum(np.where(moves > 0.0, above, below), 0.0) / seconds[:, None]
