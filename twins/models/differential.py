@@ -75,13 +75,13 @@ class Differential:
 
     def advance(self) -> None:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
-        wanted = self._wanted.copy()
-        # both wheels are slowed by the same factor, which keeps the curvature
+        wanted = self._wanted
         speed = np.abs(wanted)
         over = np.maximum(speed[0], speed[1]) / self._limit
-        wanted /= np.maximum(over, 1.0)
+        if not every(over <= 1.0):  # both wheels are slowed by the same factor, which keeps the curvature
+            wanted = wanted / np.maximum(over, 1.0)
         self._wheels += clamp(wanted - self._wheels, self._least, self._change)
-        left, right = self._wheels
+        left, right = self._wheels[0], self._wheels[1]
         v = 0.5 * (left + right)
         turn = (right - left) * self._turn
         middle = self.yaw + 0.5 * turn

@@ -45,13 +45,14 @@ class FlightOrders:
 
     def command(self, setpoint: Array) -> None:
         """Set position and yaw, or velocity and yaw rate (n, 4); no effect on rows of NaN, on the ground or landing."""
-        given = self.flying & ~(np.isnan(setpoint[:, 0]) | self.landing)
-        position = given & self._by_position
-        if every(position):
+        unknown = np.isnan(setpoint[:, 0])
+        if every(self.flying) and not (self.any_by_velocity or self.any_climbing or some(unknown)):
             self.target[:], self.yaw_setpoint[:] = setpoint[:, :3], setpoint[:, 3]
-        else:
-            np.copyto(self.target, setpoint[:, :3], where=position[:, None])
-            np.copyto(self.yaw_setpoint, setpoint[:, 3], where=position)
+            return
+        given = self.flying & ~(unknown | self.landing)
+        position = given & self._by_position
+        np.copyto(self.target, setpoint[:, :3], where=position[:, None])
+        np.copyto(self.yaw_setpoint, setpoint[:, 3], where=position)
         if self.any_climbing:
             self._elapsed[given] = np.inf
             self.any_climbing = some(self.climbing)
