@@ -24,7 +24,8 @@ FLAGS = (
     "--ignore-gpu-blocklist",
 )  # fmt: skip
 
-FRAMES = 15
+FRAMES = 5
+SELDOM = "window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 100)"
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
@@ -162,13 +163,15 @@ def _array(value: Any, arrays: list[bytes]) -> Any:
 
 
 @contextmanager
-def opened(address: str, width: int = 900, height: int = 600) -> Iterator[Page]:
-    """A page in a browser of its own."""
+def opened(address: str, width: int = 900, height: int = 600, *, often: bool = False) -> Iterator[Page]:
+    """A page in a browser of its own; it is drawn ten times a second, or as often as the browser can."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
         try:
             page = Page(browser.new_page(viewport={"width": width, "height": height}))
+            if not often:  # without a graphics card it would take all processors from the robots
+                page.page.add_init_script(SELDOM)
             page.page.goto(address, wait_until="commit")
             yield page
         finally:

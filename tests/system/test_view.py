@@ -177,7 +177,7 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
         robots.kill()
 
 
-def test_an_observer_of_a_lab_has_no_buttons_and_shift_s_stops_an_operators_run(tmp_path: Path) -> None:
+def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
@@ -185,6 +185,15 @@ def test_an_observer_of_a_lab_has_no_buttons_and_shift_s_stops_an_operators_run(
     flight = Flight(tmp_path / "run", str(file), "--case", "event", "--no-report", "--set", "duration_s=90")
     flight.until_said("phase conductor: formation")
     endpoint, _, lab = flight.endpoint().partition("#lab=")
+    seen = zenpark("top", "--connect", endpoint, "--lab", lab)  # as an observer
+    assert seen.returncode == 0, seen.stderr
+    title, heads, *rows = seen.stdout.splitlines()
+    assert title.startswith("event: ")
+    assert {row.split()[0] for row in rows[:3]} == {"KH01", "KH02", "CF01"}
+    assert all(row.count("%") == 2 for row in rows[:3]), f"CPU and battery: {heads} {rows}"
+    missing = zenpark("top", "--connect", endpoint)
+    assert missing.returncode == 2
+    assert "--lab" in missing.stderr, missing.stderr
     for identity, buttons in (("observer", 0), ("operator", 1)):
         with (
             viewed("--connect", endpoint, "--lab", lab, "--as", identity) as address,
@@ -263,7 +272,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     moving = threading.Thread(target=move)
     moving.start()
     try:
-        with opened(f"http://127.0.0.1:{server.get_port()}", 480, 320) as page:
+        with opened(f"http://127.0.0.1:{server.get_port()}", 480, 320, often=True) as page:
             page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
             page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
             rates = []

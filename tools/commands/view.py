@@ -177,10 +177,10 @@ class _Top:
 
         stage, rows, where = self._observer.stage, self._rows(), self._watched
         title = stage.title or (where.run.title if where.run is not None else f"realm {where.realm}")
-        if self._observer.case not in ("", UNNAMED):
-            title += f" ({self._observer.case})"
         duration = None if stage.experiment is None else stage.experiment.duration_s
-        title = heading(common_phase([row.phase for row in rows]), self._observer.elapsed, duration, title)
+        phase, case = common_phase([row.phase for row in rows]), self._observer.case
+        phase = f"{case}: {phase}" if case not in ("", UNNAMED) else phase
+        title = heading(phase, self._observer.elapsed, duration, title)
         return lines(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
 
 

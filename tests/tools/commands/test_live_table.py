@@ -74,6 +74,12 @@ def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
     styles = {line.plain[part.start : part.end].strip(): str(part.style) for line in lines("t", [row], [], 140, 10)
               for part in line.spans}  # fmt: skip
     assert styles["2"] == styles["5"] == styles["20 %"] == "yellow"
+    flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01, rate=3.0)
+    held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01, rate=3.0)
+    gone = trends.row("gone-one", STATUS, now=12.0, error=None, rate=0.0, gone="lost", lost=True)
+    styles = {line.plain[part.start : part.end].strip(): str(part.style)
+              for line in lines("t", [flat, held, gone], [], 140, 10) for part in line.spans}  # fmt: skip
+    assert (styles["5 %"], styles["held-one"], styles["gone-one"]) == ("bold red", "yellow", "bold red")
     repeated = msgspec.structs.replace(later, stamp=20.0)
     calm = trends.row("robot-01", repeated, now=20.0, error=0.01, rate=3.0)
     assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
