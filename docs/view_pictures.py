@@ -26,6 +26,8 @@ from experiments.run import simulate
 ROOT = Path(__file__).resolve().parents[1]
 FLAGS = ["--no-sandbox", "--disable-quic", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
          "--ignore-gpu-blocklist"]  # fmt: skip
+OBSTACLES = ["--set", "arena.obstacles.crate={box=[0.3, 0.2], at=[0.75, 0.1], height=0.3}",
+             "--set", "arena.obstacles.post={radius=0.07, at=[-0.85, 0.1], height=0.6}"]  # fmt: skip
 REDRAW_S = 6.0  # without a graphics card
 
 
@@ -73,10 +75,11 @@ def main() -> None:
 def _live(browser: object, target: Path, folder: Path) -> None:
     """A picture of a run in real time."""
     command = [sys.executable, "-m", "tools.guard", "run", "robotic-park", "--case", "event", "--no-report",
-               "--set", "duration_s=90", "--out", str(folder)]  # fmt: skip
+               "--set", "duration_s=90", *OBSTACLES, "--out", str(folder)]  # fmt: skip
     run = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:
         while not (folder / "network.txt").exists():
+            assert run.poll() is None, "the run ended"
             time.sleep(0.5)
         time.sleep(REDRAW_S)
         with _viewing("--connect", f"@{folder}/network.txt") as address:

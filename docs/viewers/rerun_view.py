@@ -17,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 CYLINDER, LINE_STRIP, LINE_LIST = 3, 4, 5  # types of visualization_msgs/Marker
 
 
-EYE = rrb.EyeControls3D(position=(2.2, -2.9, 2.4), look_target=(0.0, 0.0, 0.3), eye_up=(0.0, 0.0, 1.0))
+EYE = np.array([1.5, -2.1, 1.75])  # in half lengths of the arena
 
 
 def rgb(colour: Any) -> list[float]:  # noqa: ANN401 - of a decoder
@@ -31,9 +31,19 @@ def line(marker: Any, points: np.ndarray) -> rr.LineStrips3D:  # noqa: ANN401
     return rr.LineStrips3D(strips, colors=colours, radii=0.5 * marker.scale.x)
 
 
+def half_length(file: str) -> float:
+    """Of the arena, by the first scene of a recording [m]."""
+    with Path(file).open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for *_, scene in reader.iter_decoded_messages(["/scene"]):
+            return max(abs(p.x) for marker in scene.markers if marker.ns == "arena" for p in marker.points)
+    return 1.0
+
+
 def main(file: str, save: str | None) -> None:
     rr.init("zenpark", spawn=save is None)
-    scene = rrb.Spatial3DView(origin="/", contents=["/arena/**"], name=file, eye_controls=EYE)
+    eye = rrb.EyeControls3D(position=half_length(file) * EYE, look_target=(0.0, 0.0, 0.3), eye_up=(0.0, 0.0, 1.0))
+    scene = rrb.Spatial3DView(origin="/", contents=["/arena/**"], name=file, eye_controls=eye)
     blueprint = rrb.Blueprint(scene, rrb.TimePanel(timeline="time"), collapse_panels=True)
     if save is not None:
         rr.save(save, default_blueprint=blueprint)
