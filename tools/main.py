@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated, Final
@@ -107,6 +108,12 @@ UsageError: Final[type[typer.BadParameter]] = typer.BadParameter.__mro__[
 ]  # its own click's, which has no name in typer
 
 
+def _plain(message: str) -> str:
+    """The library's words for a value that an option does not take, in those of our own errors."""
+    found = re.fullmatch(r"Invalid value for '?(.+?)'?: (?:Input should (be .*?)(?:, unable to .*)?|(.*))", message)
+    return message if found is None else f"{found[1]}: {f'must {found[2]}' if found[2] else found[3]}"
+
+
 def _report(message: str, remedy: str = "", problems: Sequence[object] | None = None) -> None:
     """Print an error; where JSON was asked for, on standard output as JSON too."""
     print(f"zenpark: {message}{remedy}", file=sys.stderr)
@@ -120,7 +127,7 @@ def main() -> None:
         sys.exit(app(prog_name="zenpark", standalone_mode=False))
     except UsageError as error:
         words = [] if error.ctx is None else error.ctx.command_path.split()[1:]
-        message = error.format_message()
+        message = _plain(error.format_message())
         if error.ctx is not None and message == error.ctx.get_help():
             print(message)
         else:

@@ -61,6 +61,7 @@ SUBJECTS: Final = (
     *(motion.speeds, motion.rates, motion.ends),
     safety.architecture,
     safety.safety,
+    safety.libraries,
     chance,
 )
 

@@ -68,6 +68,16 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
         yield Claim("note", "separation", message, "", path)
 
 
+def libraries(analysis: Analysis) -> Iterator[Claim]:
+    """Report bodies of robots of this machine whose library is missing."""
+    experiment = analysis.experiment
+    elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
+    for name, robot in experiment.robots.items():
+        if name not in elsewhere and (library := bodies.missing_library(registry.body_name(robot.body))):
+            message = f"the body of {name} needs {library}, which is not installed here"
+            yield Claim("warning", "library", message, "`./zenpark hardware` adds it", ("robots", name, "body"))
+
+
 def architecture(analysis: Analysis) -> Iterator[Claim]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.experiment, ("architecture",)

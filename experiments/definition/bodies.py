@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from typing import Final
 
@@ -30,7 +31,22 @@ PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
     "khepera4": ("khepera4-twin", None, "external"),
     "turtlebot3": ("turtlebot3-twin", None, "external"),
 }
+# the kind that a body drives; those of other distributions, and simulators, drive any
+DRIVES: Final = {
+    **dict.fromkeys(("radio", "usb", "udp"), "crazyflie"),
+    **dict.fromkeys(("khepera4", "kteam"), "khepera4"),
+    **dict.fromkeys(("ros2dds", "rmw"), "turtlebot3"),
+    "tello": "tello",
+    **{twin: kind for kind, (twin, _, _) in PROTOCOL.items()},
+}
+LIBRARIES: Final = {"crazyflie": "cflib", "tello": "djitellopy", "turtlebot3": "rosbags"}  # of `./zenpark hardware`
 BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
+
+
+def missing_library(body: str) -> str:
+    """Name of the library that a body needs and that is not installed here; empty if there is none."""
+    library = LIBRARIES.get(DRIVES.get(body, ""), "")
+    return library if library and importlib.util.find_spec(library) is None else ""
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
+from experiments.definition.bodies import DRIVES
 from experiments.definition.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.file import consistency_formation, consistency_network
 from experiments.file.problems import Fault, after_the_end, unknown_robot
@@ -163,6 +164,10 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
     if body not in bodies:
         yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
+    elif (driven := DRIVES.get(body, robot.kind)) != robot.kind and robot.kind in KINDS:
+        own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
+        hint = f"write kind = '{driven}', or a body of a {robot.kind}: twin, world, {own}"
+        yield Fault((*path, "body"), f"'{body}' drives a {driven}, and {name} is a {robot.kind}", hint)
     if robot.kind in KINDS:
         yield from _hover(experiment, path, robot)
     else:

@@ -107,7 +107,8 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
             archive.extractall(into)  # names with .. or / at the front are made harmless by the library
         sums = (into / "SHA256SUMS").read_text("utf-8")
     except DAMAGED as error:
-        raise RecordingError(f"{bundle}: is no bundle of `./zenpark export RUN --bundle`: {error}") from None
+        why = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{bundle}: is no bundle of `./zenpark export RUN --bundle`: {why}") from None
     for line in sums.splitlines():
         wanted, _, name = line.partition("  ")
         file = into / name

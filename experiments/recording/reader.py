@@ -88,7 +88,9 @@ class Records:
                     raise RecordingError(_stranger(self.path, magic))
                 yield file, self.path.stat().st_size
         except OSError as error:
-            raise RecordingError(f"{self.path}: cannot be read: {error.strerror}") from error
+            raise RecordingError(
+                f"{self.path}: cannot be read: {error.strerror}; give the .mcap file of a run"
+            ) from error
 
     def _pieces(self, file: BinaryIO, size: int) -> Iterator[tuple[bytes, dict[int, list[int]]]]:
         while len(head := file.read(_RECORD.size)) == _RECORD.size:

@@ -135,7 +135,7 @@ def test_robots_hold_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
     watcher.until(lambda: "KH02" in watcher.status["CF01"].missing, "its neighbours know")
     assert (watcher.status["KH02"].phase, watcher.status["KH02"].reason) == ("done", "ordered to leave")
     assert lab.running("KH01", "CF01"), "the others go on"
-    assert lab.zenpark("hold", "KH02").stderr == "KH02: no: no answer\n"
+    assert lab.zenpark("hold", "KH02").stderr.startswith("KH02: no: no answer\n")
     assert "takes part" in lab.change("add", "KH02").done["KH02"], "who was removed may come back"
     watcher.until(lambda: watcher.status["KH02"].pid != before and lab.running("KH02"), "it runs")
     assert "already" in lab.change("add", "KH02").refused["KH02"]

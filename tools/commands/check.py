@@ -57,6 +57,8 @@ def check(
     from experiments.file import document
     from experiments.file.problems import DocumentError
 
+    if plot is not None and plot.suffix not in {".svg", ".pdf", ".png"}:
+        raise typer.BadParameter(f"{plot}: the name must end in .svg, .pdf or .png", param_hint="--plot")
     try:
         given = document.read(file, settings or [])
     except DocumentError as error:
@@ -98,8 +100,6 @@ def _print_fitting(analysed: Mapping[str, Analysis]) -> None:
 def _draw(analysed: Mapping[str, Analysis], file: Path) -> None:
     from experiments.report.trajectories import expected_motion
 
-    if file.suffix not in {".svg", ".pdf", ".png"}:
-        raise typer.BadParameter(f"{file}: the name must end in .svg, .pdf or .png", param_hint="--plot")
     try:
         expected_motion(analysed).savefig(file, dpi=200)
     except OSError as error:
@@ -285,7 +285,9 @@ def explain(
     found = reference.matching(key)
     if not found:
         known = {".".join(entry.words): None for entry in reference.entries()}
-        hint = did_you_mean(key, known) or "`./zenpark explain safety` shows the keys of a table"
+        hint = did_you_mean(key, known)
+        if hint.startswith("known: "):
+            hint = did_you_mean("", dict.fromkeys(entry.words[0] for entry in reference.entries()))
         print(f"zenpark: no key of the experiment file is named {key!r}; {hint}", file=sys.stderr)
         return 2
     if as_json:

@@ -112,6 +112,8 @@ class Operator:
                 print(f"{printable(name)}: {printable(text)}")
             for name, text in refused.items():
                 print(f"{printable(name)}: no: {printable(text)}", file=sys.stderr)
+            if "no answer" in refused.values():
+                print("`./zenpark keys` shows the members", file=sys.stderr)
         return int(bool(refused))
 
     def refuse(self, reason: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -51,6 +52,8 @@ def agent(
     """
     from experiments.real_time.processes.robot import RobotLaunch, fly
 
+    if file == "join" and (wrong := [name for name in names if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)]):
+        raise typer.BadParameter(f"'{wrong[0]}' cannot be a name; use letters, digits and _", param_hint="NAME")
     return fly(
         RobotLaunch(
             file=file,

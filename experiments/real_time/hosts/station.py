@@ -8,7 +8,6 @@ gone, and kills those that are late: a frozen process obeys nothing else.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import platform
 import re
@@ -29,6 +28,7 @@ from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.plugins import registry
 from agents.runtime.lifeline import SILENCE_S
+from experiments.definition.bodies import missing_library
 from experiments.real_time.hosts import certificates
 from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
 from experiments.recording import version
@@ -111,9 +111,8 @@ def _reach(endpoint: str, question: Question) -> Found:
 def devices(bodies: Sequence[str]) -> Iterator[Found]:
     """Needs of the bodies of a host's robots: libraries, radios, serial ports, and the right to use them."""
     words = {registry.body_name(body) for body in bodies}
-    for word, library in (("radio", "cflib"), ("usb", "cflib"), ("tello", "djitellopy")):
-        if word in words and importlib.util.find_spec(library) is None:
-            yield Found(library, False, "is missing: `./zenpark hardware` there adds it")
+    for library in sorted(filter(None, {missing_library(word) for word in words})):
+        yield Found(library, False, "is missing: `./zenpark hardware` there adds it")
     if words & {"radio", "usb"}:
         radios = list(_radios())
         yield from radios or [

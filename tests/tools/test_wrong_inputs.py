@@ -1,0 +1,175 @@
+"""Wrong inputs: each is refused with its place and a remedy, exit code 2, without a traceback, and soon."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.check.safety import libraries
+from experiments.file.document import loads
+from tools.main import main
+
+TRIANGLE = (Path(__file__).parents[2] / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
+LEG = '[[timeline]]\nat_s = 90.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [1.0, 0.0], speed = 0.1 }\n[arena]'
+RADIO = 'body = "radio://0/80/2M/E7E7E7E701"\n'
+START = "start = [-0.6, -0.5]"
+
+# a part of the triangle, what stands there instead; place and remedy that are told
+FILES = (
+    ("duration_s = 15.0", "duration = 15", ":6:1: unknown key", "did you mean 'duration_s'?"),
+    (
+        "duration_s = 15.0",
+        "duration_s = -5",
+        ":6:14: 'duration_s' must be a number > 0, not -5",
+        "from the common start",
+    ),
+    ("duration_s = 15.0", "duration_s = 1e12", ":6:14: ", "must be a number <= 86400"),
+    ('kind = "khepera4" ', 'kind = "kephera" ', ":13:8: no 'kephera' among the kinds", "did you mean 'khepera4'?"),
+    (
+        "threshold = 0.01",
+        "treshold = 0.01",
+        "unknown parameter 'treshold' of 'send-on-delta'",
+        "did you mean 'threshold'?",
+    ),
+    ('"KH01 - KH02"', '"KH01 -> KH02"', ":28:1: 'KH01 -> KH02' is no link", 'write "KH01 > KH02"'),
+    ('"KH01 - KH02"', '"KH01 - KH07"', ":28:1: no robot is called 'KH07'", "did you mean 'KH02'?"),
+    ('"KH01 - KH02"', '"KH01 - KH01"', ":28:1: 'KH01' cannot receive from itself", "name two robots"),
+    ('"KH02 - CF01"', '"CF01 > KH02" = 0.8\n"KH02 - CF01"', "already given by 'CF01 > KH02'", "keep one of the two"),
+    ("hover = 0.6", "hover = 60", ":23:9: 'CF01' cannot hover at 60 m", "use a hover of at most 1.95"),
+    (START, "start = [-6.6, -0.5]", ":14:10: 'KH01' starts outside of the arena", "x lies between -1 and 1"),
+    ('"send-on-delta", threshold', '"relative-control", floor', "decides when the law is computed anew", "[formation]"),
+    ("[arena]", LEG, "this leg begins at 90 s, when the run of 15 s is over", "begin earlier"),
+    ("[robots.KH01]", "[robots.Rób₁]", ":12:10: ", "names are letters, digits and _"),
+    ("[robots.KH01]", '[robots."Röb1"]', ":12:9: 'Röb1' cannot be a name", "use letters, digits and _"),
+    ("[robots.KH01]", '[robots."a/b"]', ":12:9: 'a/b' cannot be a name", "use letters, digits and _"),
+    (
+        "position_sigma = 0.0003",
+        "hover_jitter = 0.02",
+        "'hover_jitter' must be a table",
+        "write hover_jitter = { sigma",
+    ),
+    (START, START + "\n" + RADIO, "'radio' drives a crazyflie, and KH01 is a khepera4", "kteam, khepera4-twin"),
+    ("hover = 0.6", 'hover = 0.6\nbody = "radoi://0"', ":24:8: no 'radoi' among the bodies", "did you mean 'radio'?"),
+)
+
+RUN = "run triangle.toml --virtual --no-report"
+COMMANDS = (
+    (
+        f"{RUN} --set cases.event.trigger.treshold=1",
+        "--set cases.event.trigger.treshold=1: ",
+        "did you mean 'threshold'?",
+    ),
+    (f"{RUN} --set trigger.threshold", "--set trigger.threshold: ", "write, for example, --set formation.gain=2.5"),
+    (f"{RUN} --set =abc", "--set =abc: ", "write, for example, --set formation.gain=2.5"),
+    (f"{RUN} --set cases.evnt.seed=1", "the file has no case 'evnt'", "did you mean 'event'?"),
+    (f"{RUN} --set robots.KH09.hover=1", "no robot is called 'KH09'", "did you mean 'KH02'?"),
+    (f"{RUN} --set robots.KH01.hover=1", "'KH01' is a khepera4, which does not fly", "leave hover out"),
+    (f"{RUN} --set rates.body_hz=1e9", "--set rates.body_hz=1e9: ", "must be a number <= 2000"),
+    (f"{RUN} --set rates.body_hz=nan", "--set rates.body_hz=nan: ", "give a finite number"),
+    (f"{RUN} --set duration_s=0.001", "--set duration_s=0.001: ", "give it 0.02 s or more"),
+    (f"{RUN} --seeds 0", "--seeds: ", "must be greater than or equal to 1"),
+    (f"{RUN} --seeds abc", "--seeds: ", "must be a valid integer"),
+    (f"{RUN} --seed -1", "--seed: ", "must be greater than or equal to 0"),
+    (f"{RUN} --seeds 100000000", "--seeds: ", "must be less than or equal to 100000"),
+    (f"{RUN} --seeds 99999", "--seeds: ", "take fewer --seeds"),
+    (f"{RUN} --case evnt", "no case 'evnt' in this experiment", "did you mean 'event'?"),
+    (f"{RUN} --out full", "full: holds something already", "name a new folder with --out"),
+    (f"{RUN} --out triangle.toml", "triangle.toml: cannot be made", "choose a place that may be written to"),
+    (f"{RUN} --tag a,b", "--tag: ", "a tag is a word without commas"),
+    ("run triangle.toml --seeds 3", "--seeds: needs --virtual", "in real time, run once per --seed"),
+    ("run triangle.toml --pace 2", "--pace: is for --virtual --view", "add both, or leave it out"),
+    ("run triangle.toml --bodies radio", "--bodies radio: is not known", "there are: twin, world, protocol"),
+    ("run triangle.toml --lab nope", "nope is no lab", "`./zenpark cert init"),
+    ("run trianlge", "trianlge: neither a file nor an experiment", "did you mean 'triangle'?"),
+    ("run ./triangle", "./triangle: neither a file nor an experiment", "did you mean 'triangle'?"),
+    ("run nope.zip", "nope.zip: is no bundle", "`./zenpark export RUN --bundle`"),
+    ("run triangle.toml --vitual", "No such option: --vitual", "--virtual"),
+    ("run", "Missing argument 'FILE'", "`./zenpark run --help`"),
+    ("rum", "No such command 'rum'", "Did you mean 'run'?"),
+    ("check full", "full: is a folder", "name a file in it: triangle.toml"),
+    ("check empty.toml", "empty.toml: is empty", "./zenpark new copies an experiment"),
+    ("check utf16.toml", "utf16.toml: is binary, no text", "name an experiment file"),
+    ("check triangle.toml --plot x.doc", "--plot: x.doc", "must end in .svg, .pdf or .png"),
+    ("explain disturbance.hover", "'disturbance.hover'", "did you mean 'disturbance.hover_jitter'?"),
+    ("explain xyzzy", "'xyzzy'", "known: title, robots, "),
+    ("new triangle triangle.toml", "triangle.toml: exists already", "choose another name"),
+    ("new --polygon 2", "--polygon 2: ", "needs 3 robots or more"),
+    ("new --grid 5", "--grid 5: ", "such as 5x8"),
+    ("new triangle nope/x.toml", "nope/x.toml: cannot be written", "choose a place that exists"),
+    ("report nope", "nope: is no folder of a run", "`./zenpark run` prints the folder"),
+    ("report full", "full: holds no recording", "name the folder of a run"),
+    ("report full --width 1", "--width: ", "must be greater than or equal to 2"),
+    ("recover triangle.toml", "triangle.toml: not an MCAP file", "give the .mcap file of a run"),
+    ("recover nope", "nope: cannot be read", "give the .mcap file of a run"),
+    ("export nope", "nope: is no folder of a run", "`./zenpark run` prints the folder"),
+    ("compare nope full", "nope, full: 0 runs there", "name two or more"),
+    ("clean --older -3", "--older: ", "must be greater than or equal to 0"),
+    ("sweep triangle.toml trigger.threshold=lim3", "at lim3: 'threshold' must be a number", "[m]"),
+    ("chaos triangle.toml --kinds fire", "--kinds fire: no such fault", "there are: kill, "),
+    ("bench nope", "no benchmark 'nope'", "there are: start, virtual"),
+    ("import nope.yaml", "nope.yaml: there is no such file", "name an experiment file"),
+    ("cert show nope", "nope is no lab", "`./zenpark cert init nope FILE` makes one"),
+    ("hosts check triangle.toml", "the experiment has no hosts", "[hosts.lab1]"),
+    ("agent triangle.toml KH09", "no robot 'KH09' in this experiment", "did you mean 'KH02'?"),
+    ("agent join ../x", "NAME: '../x' cannot be a name", "use letters, digits and _"),
+    ("centre triangle.toml", "every robot of this experiment decides for itself", 'architecture = "centralised"'),
+    ("world serve triangle.toml", "no robot of this experiment lives in a world", '`body = "world"`'),
+    ("twin nope", "there is no such protocol twin", "known: crazyflie"),
+    ("twin tello --faults {x", "--faults {x: is not JSON", "write an object"),
+    ("router --listen nope", "'nope' is not an endpoint", "write it like tcp/127.0.0.1:7447"),
+    ("router --listen tcp/0.0.0.0:7447", "will not listen on tcp/0.0.0.0:7447", "`./zenpark cert init LAB FILE`"),
+    ("echo park//x", "'park//x' is not a key expression", "Write it like park/*/pose"),
+    ("keys --connect @nope", "nope: cannot be read", "network.txt"),
+)
+
+
+@pytest.fixture
+def refuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """A call of a command that is refused, which returns what is printed; in a folder with some files."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    for name in ("triangle.toml", "full/triangle.toml"):
+        (tmp_path / name).write_text(TRIANGLE, "utf-8")
+    (tmp_path / "empty.toml").touch()
+    (tmp_path / "utf16.toml").write_text(TRIANGLE, "utf-16")
+
+    def call(*words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["zenpark", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        printed = capsys.readouterr()
+        assert ended.value.code == 2, printed
+        assert "Traceback" not in printed.err
+        return printed.err
+
+    return call
+
+
+@pytest.mark.parametrize("row", FILES, ids=[row[1][:30] for row in FILES])
+def test_a_file_is_refused(row: tuple[str, str, str, str], refuse: Callable[..., str]) -> None:
+    part, instead, told, remedy = row
+    assert part in TRIANGLE
+    Path("triangle.toml").write_text(TRIANGLE.replace(part, instead, 1), "utf-8")
+    said = refuse("check", "triangle.toml")
+    assert said.startswith("zenpark: triangle.toml:")
+    assert told in said
+    assert remedy in said
+
+
+@pytest.mark.parametrize(("command", "told", "remedy"), COMMANDS, ids=[row[0] for row in COMMANDS])
+def test_a_command_is_refused(command: str, told: str, remedy: str, refuse: Callable[..., str]) -> None:
+    said = refuse(*command.split())
+    assert told in said
+    assert remedy in said
+
+
+def test_a_missing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    experiment = loads(TRIANGLE.replace("hover = 0.6", "hover = 0.6\n" + RADIO)).experiment
+    (claim,) = libraries(SimpleNamespace(experiment=experiment))
+    assert claim.message == "the body of CF01 needs cflib, which is not installed here"
+    assert claim.remedy == "`./zenpark hardware` adds it"
