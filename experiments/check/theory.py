@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Index, Mask
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, components, reachable
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, components, reachable
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, Severity, join_names
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
@@ -122,7 +122,7 @@ def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         link = int(np.flatnonzero(analysis.standing)[ring.link])
         remedy = "give offsets of one drawing: those around a ring add up to zero"
         yield Claim(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
-    found = conflicts(_by_distance(analysis), np.nan_to_num(analysis.assignment.hover))
+    found = conflicts(analysis.asked.select(_measured(analysis)), np.nan_to_num(analysis.assignment.hover))
     heights = [each for each in found if math.isfinite(each.ceiling)]
     for high in list(dict.fromkeys(each.high for each in heights)):
         lowest = min((each for each in heights if each.high == high), key=lambda each: each.ceiling)
@@ -148,10 +148,6 @@ def _measured(analysis: Analysis) -> Mask:
     """Mask (E,) of the links that stand at the start and ask for a distance."""
     wants = analysis.asked.wants
     return analysis.standing if wants is None else analysis.standing & (wants == BY_DISTANCE)
-
-
-def _by_distance(analysis: Analysis) -> Links:
-    return analysis.asked.select(_measured(analysis))
 
 
 def _inside(analysis: Analysis, conflict: Conflict) -> Index:

@@ -78,9 +78,14 @@ def matching(asked: str) -> list[Entry]:
     parts = [part for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part]
     found = [entry for entry in entries() if _fits(entry, parts)]
     if not found:
-        found = [entry for entry in entries() if len(parts) <= len(entry.words) and _ends(entry, parts)]
+        found = [entry for entry in entries() if entry.words[-len(parts) :] == tuple(parts)]
     below = [each for each in entries() for entry in found if each.key.startswith((f"{entry.key}.", f"{entry.key}("))]
     return found + [each for each in below if each not in found]
+
+
+def _split(key: str) -> list[str]:
+    """Words, names in capitals, and plug-ins in parentheses."""
+    return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
 
 
 def _fits(entry: Entry, parts: Sequence[str]) -> bool:
@@ -95,11 +100,7 @@ def _fits(entry: Entry, parts: Sequence[str]) -> bool:
             return match(later, rest) or (right and match(later, rest[1:]))
         return bool(rest) and rest[0] == first and match(later, rest[1:])
 
-    return match([part for part in re.split(r"\.|(\([^)]*\))", entry.key) if part], parts)
-
-
-def _ends(entry: Entry, parts: Sequence[str]) -> bool:
-    return entry.words[-len(parts) :] == tuple(parts)
+    return match(_split(entry.key), parts)
 
 
 def _walk(node: Mapping[str, Any], definitions: Mapping[str, Any], path: str) -> Iterator[Entry]:
@@ -195,7 +196,7 @@ def written(value: object) -> str:
 
 def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
     """Lines from a ready-made experiment, or else made of the default and the limits."""
-    parts = _parts(key)
+    parts = _split(key)
     found = next((lines for document in _documents() for lines in _occurrences(document, parts, ())), None)
     if found is not None:
         return found
@@ -203,11 +204,6 @@ def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any])
     made = _made(field, definitions) if value in (None, {}, []) else value
     names = dict(_NAMES.values())
     return _lines([(names.get(part, "A"), None) if part.isupper() else (part, None) for part in parts], made)
-
-
-def _parts(key: str) -> list[str]:
-    """Words, names in capitals, and plug-ins in parentheses."""
-    return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
 
 
 @cache

@@ -227,7 +227,7 @@ def _judged(
     except msgspec.ValidationError as error:
         text, _, where = str(error).partition(" - at `")
         for step in re.findall(r"\[(\d+)\]", where):
-            path, value = (*path, int(step)), _item(value, int(step))
+            path, value = (*path, int(step)), value[int(step)] if isinstance(value, list) else None
         if fields is not None:  # a struct's own check can only name its field in words
             named = next(
                 (
@@ -290,10 +290,6 @@ def _plain(annotation: object, note: str) -> tuple[Any, str]:
             note = getattr(meta, "description", None) or note
         annotation = get_args(annotation)[0]
     return annotation, note
-
-
-def _item(value: object, number: int) -> object:
-    return value[number] if isinstance(value, list) else None
 
 
 def _is_struct(annotation: object) -> bool:

@@ -60,7 +60,9 @@ def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
     """
     if trace.contacts is None:
         return clearance.overlaps
-    carried = {name for name in trace.robots if trace.clock == "virtual" or _lives_in_world(trace, name)}
+    robots = trace.experiment.robots
+    in_world = {name for name in trace.robots if registry.body_name(robots[name].body) == bodies.WORLD}
+    carried = {*trace.robots} if trace.clock == "virtual" else in_world
     reported = [
         Collision(each.stamp, each.first, each.second, each.impulse, each.overlap)
         for each in trace.contacts
@@ -68,10 +70,6 @@ def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
     ]
     computed = [each for each in clearance.overlaps if not carried & {each.first, each.second}]
     return tuple(sorted([*reported, *computed], key=lambda each: each.time_s))
-
-
-def _lives_in_world(trace: Trace, name: str) -> bool:
-    return registry.body_name(trace.experiment.robots[name].body) == bodies.WORLD
 
 
 @dataclass(frozen=True)

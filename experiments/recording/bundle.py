@@ -75,7 +75,8 @@ def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
     )
     members = {name: file.read_bytes() for name, file in _files(folder)}
     members |= {f"plugins/{file.name}": file.read_bytes() for file in sorted(_plugins(experiments))}
-    members |= {"README.txt": text.encode(), "requirements.txt": _requirements().encode()}
+    requirements = sorted({f"{each.name}=={each.version}\n" for each in distributions()}, key=str.lower)
+    members |= {"README.txt": text.encode(), "requirements.txt": "".join(requirements).encode()}
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in sorted(members.items()))
     try:
         with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -173,8 +174,3 @@ def _plugins(experiments: list[Experiment]) -> set[Path]:
     """Modules of the plug-ins that the cases choose, but for our own."""
     files = {file for experiment in experiments for file in plugin_files(experiment)}
     return {file for file in files if not any(file.is_relative_to(ROOT / package) for package in PACKAGES)}
-
-
-def _requirements() -> str:
-    """Installed distributions, as pip reads them."""
-    return "".join(sorted({f"{each.name}=={each.version}\n" for each in distributions()}, key=str.lower))

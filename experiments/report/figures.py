@@ -7,7 +7,7 @@ twice; those that draw motions take traces, of one seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agents.arrays import Array
 from experiments.metrics.measure import WINDOW_S
-from experiments.metrics.results import CaseMetrics, RobotMetrics
+from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import LinkErrors, leaders, phase_starts, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
@@ -144,7 +144,8 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     share = 0.8 / max(1, len(grouped))
     for axes, (index, label, unit) in zip(panels, BARS, strict=True):
         for k, (name, runs) in enumerate(grouped.items()):
-            found = [spread([getattr(robot, index) for robot in _same(runs, name)]) for name in names]
+            robots = [robot for run in runs for robot in run.robots]
+            found = [spread([getattr(each, index) for each in robots if each.robot == name]) for name in names]
             x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * share
             _bars(axes, x, found, width=share, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
@@ -363,10 +364,6 @@ def intervals(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     axes.grid()
     legend_above(figure, (list(handles.values()), list(handles)), columns=3)
     return figure
-
-
-def _same(runs: Iterable[CaseMetrics], name: str) -> list[RobotMetrics]:
-    return [robot for run in runs for robot in run.robots if robot.robot == name]
 
 
 def _bars(

@@ -145,7 +145,11 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ],
         "Delay of poses [ms]": [
             ("mean", lambda case: _delay(case, mean_delay), 1000.0),
-            ("longest", lambda case: _delay(case, _longest_delay), 1000.0),
+            (
+                "longest",
+                lambda case: _delay(case, lambda links: _known(max, (each.delay_max for each in links))),
+                1000.0,
+            ),
         ],
         "Share of all ticks [%]": [
             ("Changed by safety", attrgetter("intervened_share"), 100.0),
@@ -173,10 +177,6 @@ def _occurred(table: Table) -> Table:
 def _delay(case: CaseMetrics, what: Callable[[Sequence[Passage]], float | None]) -> float | None:
     """A statistic of the delays of a case; None in virtual time without a modelled network, where they are given."""
     return what(case.passages) if case.clock == "real" or case.modelled else None
-
-
-def _longest_delay(links: Sequence[Passage]) -> float | None:
-    return _known(max, (link.delay_max for link in links))
 
 
 def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:

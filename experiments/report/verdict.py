@@ -44,13 +44,7 @@ def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Robots that did not do their part; nothing else in a report means much before that is known."""
-    found = []
-    for case in cases:
-        more = len(case.failures) - NAMED
-        shown = [*case.failures[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
-        if shown:
-            found.append(Finding("bad", f"Failed in {case.case}: {'; '.join(shown)}."))
-    return found
+    return [Finding("bad", f"Failed in {case.case}: {_first(case.failures)}.") for case in cases if case.failures]
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -94,13 +88,7 @@ def _nothing_lost(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Robots that began late, and messages that could not be read."""
-    found = []
-    for case in cases:
-        more = len(case.troubles) - NAMED
-        shown = [*case.troubles[:NAMED], *([f"{more} more like this"] if more > 0 else [])]
-        if shown:
-            found.append(Finding("bad", f"In {case.case}: {'; '.join(shown)}."))
-    return found
+    return [Finding("bad", f"In {case.case}: {_first(case.troubles)}.") for case in cases if case.troubles]
 
 
 def _modelled(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -317,6 +305,12 @@ def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
     far = max(cases, key=lambda case: case.excursion)
     text = f"{far.excursion_robot} was {number(far.excursion, 100.0)} cm outside the arena in {far.case}."
     return [Finding("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
+
+
+def _first(texts: Sequence[str]) -> str:
+    """The first few texts; the others are counted."""
+    more = len(texts) - NAMED
+    return "; ".join([*texts[:NAMED], *([f"{more} more like this"] if more > 0 else [])])
 
 
 def _list(words: Sequence[str]) -> str:

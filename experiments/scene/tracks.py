@@ -175,7 +175,7 @@ def _states(flat: Bytes, data: bytes, starts: Index, robot: str) -> dict[str, Ar
     body = starts + PAYLOAD
     lengths = np.ascontiguousarray(flat[starts[:, None] + np.arange(1, 9)]).view("<u8")[:, 0].astype(np.intp)
     ends = starts + 9 + lengths
-    where = 4 + _aligned(4 + len(robot.encode()) + 1) + 16  # behind the name, the number and the stamp: the phase
+    where = 4 + -(-(5 + len(robot.encode())) // 8) * 8 + 16  # behind the name, the number and the stamp: the phase
     counts = np.ascontiguousarray(flat[(body + where)[:, None] + np.arange(4)]).view("<u4")[:, 0]
     found = {name: np.full((len(starts), width), nan) for name, width in _FIELDS.items()}
     found["phase"] = np.zeros((len(starts), 1))
@@ -199,10 +199,6 @@ def _states(flat: Bytes, data: bytes, starts: Index, robot: str) -> dict[str, Ar
             value = getattr(state, name)
             found[name][row] = nan if value is None else value
     return found
-
-
-def _aligned(size: int) -> int:
-    return -(-size // 8) * 8
 
 
 @lru_cache(256)

@@ -176,7 +176,8 @@ def combination(
         (first, compared_with[first], others),
         *((name, changed[name], values) for name in names),
     ):
-        mine = {axis.path: paths[axis][1] for axis in given if _is_for(paths[axis], name, experiment)}
+        own = [axis for axis in given if paths[axis][2] in (None, name) and _has(experiment, paths[axis][0])]
+        mine = {axis.path: paths[axis][1] for axis in own}
         yield Cell(name, mine, experiment, reference, digest(experiment))
 
 
@@ -192,12 +193,6 @@ def _of_trigger(parsed: _Parsed) -> bool:
     """Whether it changes the triggers of all cases."""
     path, _, case = parsed
     return case is None and any(group_of(path[:end]) == TRIGGERS for end in range(1, len(path) + 1))
-
-
-def _is_for(parsed: _Parsed, case: str, experiment: Experiment) -> bool:
-    """Whether a case has it."""
-    path, _, of = parsed
-    return of in (None, case) and _has(experiment, path)
 
 
 def wrong(place: str, message: str, hint: str) -> DocumentError:

@@ -320,13 +320,12 @@ class Logbook:
         first = self._mine.start
         for touch in self._log.touches:
             if first <= touch.first < first + rows:
-                other = names[touch.second - first] if touch.second >= 0 else self._obstacle(-1 - touch.second)
+                other = (
+                    names[touch.second - first] if touch.second >= 0 else (*self._scene.names, WALL)[-1 - touch.second]
+                )
                 yield messages.Contact(
                     EPOCH + touch.time, names[touch.first - first], other, float(touch.impulse), float(touch.overlap)
                 )
-
-    def _obstacle(self, k: int) -> str:
-        return self._scene.names[k] if k < len(self._scene.names) else WALL
 
     def _world(self) -> Iterator[messages.WorldState]:
         """Reports of a world at 1 Hz; none where robots are alone in an empty place."""

@@ -70,7 +70,8 @@ class Injector:
             self.second = self._again(victim)
         if how.clock is not None:
             name, direction = how.clock
-            switch = self._switch(name.format("+".join(self._companions(victim))))
+            companions = [robot for robot, group in self._groups.items() if group == self._groups.get(victim)]
+            switch = self._switch(name.format("+".join(companions)))
             switch.write(direction * size + (switch.read() if kind == "clock" else 0.0))
             return f"{direction * size:+g} s"
         if kind == "disk":
@@ -142,10 +143,6 @@ class Injector:
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (full, resource.RLIM_INFINITY))
             return f"at {full} bytes"
         return "no recorder"
-
-    def _companions(self, victim: str) -> list[str]:
-        """The robots of a victim's process."""
-        return [name for name, group in self._groups.items() if group == self._groups.get(victim)]
 
     def _running(self, role: str) -> list[int]:
         """The processes of a role, or of a robot."""

@@ -189,9 +189,7 @@ def _tools(park: Park, notes: list[str]) -> None:
         notes.append(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
     away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
     if away:
-        notes.append(
-            f"{shorten_names(away)} {_is(away)} real, but no address of a kind that is known is given: twins instead"
-        )
+        notes.append(f"{shorten_names(away)}: real robots without an address of a kind that is known; twins instead")
     if len(away) < sum(robot.place != "virtual" for robot in park.robots):
         notes.append("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):
@@ -274,7 +272,3 @@ def _most(what: str, given: Sequence[float], default: float, notes: list[str]) -
             f"{what}: {', '.join(f'{each:g}' for each in sorted(counted))} s among the robots; all get {value:g}"
         )
     return value
-
-
-def _is(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"

@@ -94,7 +94,8 @@ class Conductor:
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
-                    self._view.report("ready", "conductor", f"{self._count('ready')} robots after {ready:.2f} s")
+                    count = sum(view.reached("ready") for view in self._robots.values())
+                    self._view.report("ready", "conductor", f"{count} robots after {ready:.2f} s")
                     if self._take_off():
                         start = self._start()
                         self._walk(start)
@@ -335,9 +336,6 @@ class Conductor:
         return list(refused)
 
     # ------------------------------------------------------------------ words
-
-    def _count(self, phase: str) -> int:
-        return sum(view.reached(phase) for view in self._robots.values())
 
     def _why(self, name: str) -> str:
         status = self._robots[name].status
