@@ -31,7 +31,7 @@ class Residuals:
     value: Array  # (M,) how far each is off [m]
     tail: Index  # (M,) row i
     head: Index  # (M,) row j, −1 for anchors
-    slope: Array  # (M, 2) derivative of the value by x and y of row i; that by row j is its negative
+    slope: Array  # (M, 3) derivative of the value by the place of row i; that by row j is its negative
 
     def jacobian(self, rows: Index, count: int) -> Array:
         """Derivatives (M, 2 R) of all values by x and y of `rows` (R,), of `count` robots."""
@@ -41,24 +41,24 @@ class Residuals:
         for end, sign in ((self.tail, 1.0), (self.head, -1.0)):
             at = column[end]
             moves = at >= 0
-            slopes[number[moves], at[moves]] = sign * self.slope[moves]
+            slopes[number[moves], at[moves]] = sign * self.slope[moves, :2]
         return slopes.reshape(len(self.value), -1)
 
-    def normal(self, rows: Index, count: int) -> tuple[Array, Array]:
-        """JᵀJ (2 R, 2 R) and Jᵀ value (2 R,) of the `jacobian` J, which need not be made for it: it is nearly empty."""
+    def normal(self, rows: Index, count: int, axes: int) -> tuple[Array, Array]:
+        """JᵀJ (axes·R, axes·R) and Jᵀ value (axes·R,) of the Jacobian J, which need not be made: it is nearly empty."""
         column = np.full(count + 1, -1)
         column[rows] = np.arange(len(rows))
-        square = np.zeros((len(rows), len(rows), 2, 2))
-        slope = np.zeros((len(rows), 2))
-        outer = self.slope[:, :, None] * self.slope[:, None, :]
+        square = np.zeros((len(rows), len(rows), axes, axes))
+        slope, own = np.zeros((len(rows), axes)), self.slope[:, :axes]
+        outer = own[:, :, None] * own[:, None, :]
         ends = ((column[self.tail], 1.0), (column[self.head], -1.0))
         for one, sign in ends:
             moves = one >= 0
-            np.add.at(slope, one[moves], sign * (self.value[:, None] * self.slope)[moves])
+            np.add.at(slope, one[moves], sign * (self.value[:, None] * own)[moves])
             for other, against in ends:
                 both = moves & (other >= 0)
                 np.add.at(square, (one[both], other[both]), sign * against * outer[both])
-        size = 2 * len(rows)
+        size = axes * len(rows)
         return square.transpose(0, 2, 1, 3).reshape(size, size), slope.ravel()
 
 
@@ -90,14 +90,14 @@ def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residua
 
 def _of_lengths(apart: Array, links: Links, at: Index) -> Residuals:
     length = np.sqrt(np.einsum("ek,ek->e", apart[at], apart[at]) + TINY)
-    return Residuals(length - links.distance[at], links.receiver[at], links.sender[at], apart[at, :2] / length[:, None])
+    return Residuals(length - links.distance[at], links.receiver[at], links.sender[at], apart[at] / length[:, None])
 
 
 def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residuals:
     """Three equations of each link: its vector (K, 3) and the derivative of that (K, 3, 3)."""
     return Residuals(
         value.reshape(-1), np.repeat(links.receiver[at], 3), np.repeat(links.sender[at], 3),
-        slope[:, :, :2].reshape(-1, 2),
+        slope.reshape(-1, 3),
     )  # fmt: skip
 
 
@@ -119,14 +119,14 @@ def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
     )
     ring = np.flatnonzero(anchors.distance > 0.0)
     length = np.sqrt(norm(away[ring]) ** 2 + TINY)
-    direction = np.einsum("ak,akl->al", away[ring] / length[:, None], matrix[ring])[:, :2]
+    direction = np.einsum("ak,akl->al", away[ring] / length[:, None], matrix[ring])
     on = np.flatnonzero(anchors.distance == 0.0)
     tail = np.concatenate([anchors.row[ring], np.repeat(anchors.row[on], 3)])
     return Residuals(
         np.concatenate([length - anchors.distance[ring], away[on].reshape(-1)]),
         tail,
         np.full(len(tail), -1),
-        np.concatenate([direction, matrix[on][:, :, :2].reshape(-1, 2)]),
+        np.concatenate([direction, matrix[on].reshape(-1, 3)]),
     )
 
 
@@ -156,11 +156,9 @@ def find_shapes(links: Links, guesses: Iterable[Array], moves: Mask, anchors: An
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.
     """
-    found = []
+    found, free = [], np.column_stack([moves, moves, np.zeros_like(moves)])
     for guess in guesses:
-        position = _fitted(links, anchors, guess, np.flatnonzero(moves))
-        error = Mixed().error(position, position[links.sender], links)
-        found.append(Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position)))
+        found.append(fitted_shape(links, anchors, guess, free))
         if found[-1].worst < ENOUGH:
             break
     return found
@@ -189,17 +187,25 @@ def unfold_distances(links: Links, height: Array) -> Array:
     return np.column_stack([np.zeros((rows, 2 - plane.shape[1])), plane, height])
 
 
-def _fitted(links: Links, anchors: Anchors | None, guess: Array, rows: Index) -> Array:
-    """Least squares of the residuals over x and y of `rows`, by Levenberg's and Marquardt's method."""
+def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask) -> Shape:
+    """Least squares of the residuals from a guess (N, 3) [m], by Levenberg's and Marquardt's method.
+
+    `free` (N, 3) are the coordinates that may change.
+    """
+    axes = 3 if free[:, 2].any() else 2
+    rows = np.flatnonzero(free.any(axis=1))
+    own = free[rows, :axes].ravel()
     position, damping = guess.copy(), 1e-3
     now = residuals(links, anchors, position)
     for _ in range(200):
-        normal, slope = now.normal(rows, len(guess))
-        step = np.linalg.solve(normal + damping * np.eye(len(slope)), -slope).reshape(-1, 2)
+        normal, slope = now.normal(rows, len(guess), axes)
+        step = np.zeros(len(slope))
+        step[own] = np.linalg.solve(normal[np.ix_(own, own)] + damping * np.eye(int(own.sum())), -slope[own])
         tried = position.copy()
-        tried[rows, :2] += step
-        then = residuals(links, anchors, tried)
-        before, after = float(now.value @ now.value), float(then.value @ then.value)
+        tried[rows, :axes] += step.reshape(-1, axes)
+        with np.errstate(over="ignore", invalid="ignore"):  # too far a step is no better, whatever it comes to
+            then = residuals(links, anchors, tried)
+            before, after = float(now.value @ now.value), float(then.value @ then.value)
         if after < before:
             position, damping, now = tried, max(damping / 10.0, 1e-10), then
         else:
@@ -208,7 +214,8 @@ def _fitted(links: Links, anchors: Anchors | None, guess: Array, rows: Index) ->
         least = SLOWLY * before if small else 1e-9 * before
         if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < least:
             break
-    return position
+    error = Mixed().error(position, position[links.sender], links)
+    return Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position))
 
 
 @dataclass(frozen=True)

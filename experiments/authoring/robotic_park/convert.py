@@ -189,7 +189,8 @@ def _tools(park: Park, notes: list[str]) -> None:
         notes.append(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
     away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
     if away:
-        notes.append(f"{shorten_names(away)}: real robots without an address of a kind that is known; twins instead")
+        verb = "is" if len(away) == 1 else "are"
+        notes.append(f"{shorten_names(away)} {verb} real, but without an address of a known kind: twins instead")
     if len(away) < sum(robot.place != "virtual" for robot in park.robots):
         notes.append("real robots keep their addresses; try the file with --virtual or --bodies twin first")
     if any(robot.external for robot in park.robots):

@@ -8,19 +8,18 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, norm
+from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
+from agents.formation.anchors import Anchors
+from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links
 from experiments.authoring.robotic_park.file import CENTRAL, Park, Pose, Relation, Robot
-from experiments.check.realisation import ENOUGH
+from experiments.check.realisation import ENOUGH, Shape, fitted_shape
 
-ROUNDS: Final = 300
-FOUND: Final = 1e-9  # [m] nearer is arithmetic
 MET: Final = 1e-3  # [m] and those with three: no further beginnings are drawn
 BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
 DRAWN: Final = 4  # beginnings before the random ones
 ATTEMPTS: Final = 40  # random beginnings
 SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
-TINY: Final = 1e-12
 SHAPE_MET: Final = 0.01  # [m] a larger error is another shape
 LOWEST: Final = 0.3  # [m] of a drone
 ALOFT: Final = 0.7  # [m] where drones hover whose pose has no height, as in the authors' files
@@ -29,51 +28,23 @@ MOVED: Final = 0.02  # [m] a height that is another than at the start
 SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 
-@dataclass(frozen=True)
-class ShapeTargets:
-    """Links of N robots, and distances that they keep to points."""
-
-    pairs: Index  # (M, 2) i, j
-    distance: Array  # (M,) ‖p_i − p_j‖ [m]; NaN where a relative position is asked for
-    relative: Array  # (M, 3) p_i − p_j [m]
-    row: Index  # (A,) robots that keep a distance to a point
-    point: Array  # (A, 3) [m]
-    radius: Array  # (A,) [m]
-
-    def without_points(self) -> ShapeTargets:
-        """The same without distances to points."""
-        return replace(self, row=self.row[:0], point=self.point[:0], radius=self.radius[:0])
-
-
-@dataclass(frozen=True)
-class FoundShape:
-    """Places (N, 3) [m], how far the worst link misses what it asks for, and how far the worst point [m]."""
-
-    position: Array
-    links: float
-    points: float
-
-    @property
-    def worst(self) -> float:
-        """The larger of the two [m]."""
-        return max(self.links, self.points)
-
-
-def find_shape(wanted: ShapeTargets, start: Array, climbs: Mask) -> FoundShape:
-    """Best places for the targets.
+def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mask) -> Shape:
+    """Best places for what links and anchors ask for.
 
     A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
     begin at the starts, at a dome above them and at starts that are moved at random (always the same ones): a single
     beginning ends in a local minimum for about two of three of the shapes in space that the authors fly.
 
     Args:
-        wanted: Links and points.
+        wanted: Links, with what they ask for.
+        anchors: Distances to points.
         start: (N, 3) [m].
         climbs: (N,) robots whose height may be another; the others keep theirs.
     """
-    best: FoundShape | None = None
+    best: Shape | None = None
     for number, (guess, free) in enumerate(_beginnings(start, climbs), 1):
-        found = _fitted(wanted, guess, free)
+        level = np.ones_like(free)
+        found = fitted_shape(wanted, anchors, guess, np.column_stack([level, level, free]))
         if best is None or round(found.worst, 4) < round(best.worst, 4):
             best = found
         if best.worst <= (ENOUGH if number < DRAWN else MET):
@@ -105,52 +76,6 @@ def _beginnings(start: Array, climbs: Mask) -> Iterator[tuple[Array, Mask]]:
         yield moved, climbs
 
 
-def _fitted(wanted: ShapeTargets, guess: Array, climbs: Mask) -> FoundShape:
-    """Least squares by Levenberg's and Marquardt's method."""
-    free = np.ones_like(guess, dtype=bool)
-    free[~climbs, 2] = False
-    position, damping = guess.copy(), 1e-3
-    value, slope = _residuals(wanted, position)
-    for _ in range(ROUNDS):
-        jacobian = slope.reshape(len(value), -1)[:, free.ravel()]
-        normal = jacobian.T @ jacobian + damping * np.eye(int(free.sum()))
-        tried = position.copy()
-        tried[free] -= np.linalg.solve(normal, jacobian.T @ value)
-        with np.errstate(over="ignore", invalid="ignore"):  # too far a step is no better, whatever it comes to
-            then, steeper = _residuals(wanted, tried)
-            before, after = float(value @ value), float(then @ then)
-        if after < before:
-            position, value, slope, damping = tried, then, steeper, max(damping / 10.0, 1e-10)
-        else:
-            damping *= 10.0
-        if damping > 1e9 or before < FOUND**2 or 0.0 <= before - after < 1e-10 * before:
-            break
-    off, lengths = np.abs(value), int(np.isfinite(wanted.distance).sum())
-    points = slice(lengths, lengths + len(wanted.row))
-    return FoundShape(position, float(np.delete(off, points).max(initial=0.0)), float(off[points].max(initial=0.0)))
-
-
-def _residuals(wanted: ShapeTargets, position: Array) -> tuple[Array, Array]:
-    """Equations (K,) and their slope (K, N, 3): distances to robots, then to points, then relative positions."""
-    rows = len(position)
-    place = np.concatenate([position, wanted.point])  # a point is a robot that does not move
-    by_distance, by_place = np.flatnonzero(np.isfinite(wanted.distance)), np.flatnonzero(np.isnan(wanted.distance))
-    to_point = np.column_stack([wanted.row, rows + np.arange(len(wanted.row))])
-    i, j = np.concatenate([wanted.pairs[by_distance], to_point]).T
-    length = norm(place[i] - place[j]) + TINY
-    direction = [(place[i] - place[j]) / length[:, None], np.tile(np.eye(3), (len(by_place), 1))]
-    k, m = wanted.pairs[by_place].T
-    value = [
-        length - np.concatenate([wanted.distance[by_distance], wanted.radius]),
-        (position[k] - position[m] - wanted.relative[by_place]).ravel(),
-    ]
-    tail, head = np.concatenate([i, np.repeat(k, 3)]), np.concatenate([j, np.repeat(m, 3)])
-    slope = np.zeros((len(tail), len(place), 3))
-    slope[np.arange(len(tail)), tail] = np.concatenate(direction)
-    slope[np.arange(len(tail)), head] = -np.concatenate(direction)
-    return np.concatenate(value), slope[:, :rows]
-
-
 @dataclass(frozen=True)
 class Heights:
     """Start and goal of N robots."""
@@ -173,24 +98,24 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     start = _starts(park, notes)
     start[~flies, 2] = 0.0
     start[flies & (start[:, 2] < LOWEST), 2] = ALOFT
-    wanted = _wanted(park, start, flies)
-    plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted.pairs) == 0, (0.0, 0.0, 0.0))
-    if not len(wanted.pairs):
+    wanted, anchors = _wanted(park, start, flies)
+    plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted) == 0, (0.0, 0.0, 0.0))
+    if not len(wanted):
         return plain
     given = any(origin_of(park, robot, relation) for robot, task in park.tasks for relation in task.relations)
-    found, anchored = find_shape(wanted, start, flies), len(wanted.row) > 0
+    found, anchored = find_shape(wanted, anchors, start, flies), anchors is not None
     missed = found.worst
     if anchored and missed > SHAPE_MET:
-        found, anchored = find_shape(wanted.without_points(), start, flies), False
-        if found.links <= SHAPE_MET:
+        found, anchored = find_shape(wanted, None, start, flies), False
+        if found.worst <= SHAPE_MET:
             notes.append(
                 "distances to the origin: no shape was found that meets them and those between robots; the best one"
                 f" misses by {1e3 * missed:.0f} mm, so those to the origin are left out"
             )
-    if found.links > SHAPE_MET:
+    if found.worst > SHAPE_MET:
         notes.append(
             f"the distances: no shape was found that meets them, even in space; the best one misses by"
-            f" {1e3 * found.links:.0f} mm, so drones hold the heights at which they start"
+            f" {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
         )
         return plain
     shape, lift = found.position, 0.0
@@ -238,7 +163,8 @@ def _starts(park: Park, notes: list[str]) -> Array:
     return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 
 
-def _wanted(park: Park, start: Array, flies: Mask) -> ShapeTargets:
+def _wanted(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
+    """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     pairs, distance, relative = [], [], []
     anchored, point, radius = [], [], []
@@ -256,11 +182,13 @@ def _wanted(park: Park, start: Array, flies: Mask) -> ShapeTargets:
                 anchored.append(i)
                 point.append(origin_of(park, robot, relation) or (0.0, 0.0, 0.0))
                 radius.append(relation.values[0])
-    return ShapeTargets(
-        np.array(pairs, dtype=np.intp).reshape(-1, 2),
-        np.array(distance, dtype=float),
-        np.array(relative, dtype=float).reshape(-1, 3),
-        np.array(anchored, dtype=np.intp),
-        np.array(point, dtype=float).reshape(-1, 3),
-        np.array(radius, dtype=float),
-    )
+    lengths, blank = np.array(distance, dtype=float), np.full((len(pairs), 3), np.nan)
+    ends = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    wants = np.where(np.isnan(lengths), BY_RELATIVE, BY_DISTANCE)
+    vectors = np.array(relative, dtype=float).reshape(-1, 3)
+    asked = Links(ends[:, 0], ends[:, 1], lengths, np.ones(len(ends)), vectors, blank, wants)
+    count = len(anchored)
+    if not count:
+        return asked, None
+    one, zero, point_of = np.ones(count), np.zeros(count), np.array(point, dtype=float)
+    return asked, Anchors(np.array(anchored), point_of, np.zeros((count, 3)), one, zero, np.array(radius), one)
