@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
     from tools.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
     from tools.reliability.chaos_round import Say, Setting
-    from tools.reliability.fault_script import Fault, Round
+    from tools.reliability.fault_script import Fault
 
 app: Final = typer.Typer()
 
@@ -24,36 +24,24 @@ BARREN: Final = 3  # rounds without any fault, and it gives up
 
 
 def run(
-    setting: Setting, rounds: Sequence[Round], *, interrupted: Callable[[], bool], say: Say
+    setting: Setting, script: Sequence[Fault], *, interrupted: Callable[[], bool], say: Say
 ) -> tuple[list[FaultResult], list[RoundResult]]:
-    """Run all rounds, and more for faults that had no time in theirs."""
+    """Run rounds until all faults are done; those that had no time in theirs come again."""
     from tools.reliability.chaos_round import ChaosRound
-    from tools.reliability.fault_script import Fault
+    from tools.reliability.fault_script import take_round
 
-    waiting, left = list(rounds), list[Fault]()
+    waiting = list(script)
     outcomes: list[FaultResult] = []
     ends: list[RoundResult] = []
     barren = 0
-    while (waiting or left) and not interrupted() and barren < BARREN:
-        if not waiting:
-            waiting, left = again(left), []
-        flown = ChaosRound(setting, waiting.pop(0), len(ends) + 1, interrupted, say)
+    while waiting and not interrupted() and barren < BARREN:
+        chosen = take_round(waiting, setting.experiment.duration_s)
+        flown = ChaosRound(setting, chosen, len(ends) + 1, interrupted, say)
         ends.append(flown.run())
         outcomes += flown.outcomes
-        left += ends[-1].left
+        waiting += ends[-1].left
         barren = 0 if flown.outcomes else barren + 1
     return outcomes, ends
-
-
-def again(faults: Sequence[Fault]) -> list[Round]:
-    """Faults that had no time, in rounds of their own: those that need a stage of their own on that."""
-    from tools.reliability.fault_script import Round
-
-    rounds = []
-    for stage in dict.fromkeys(fault.properties.stage for fault in faults):
-        those = [fault for fault in faults if fault.properties.stage == stage]
-        rounds.append(Round(sorted(those, key=lambda fault: fault.kind == "conductor"), stage))
-    return rounds
 
 
 # pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
@@ -94,19 +82,19 @@ def chaos(
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
     experiment = chosen(read, [name])[name]
-    rounds = script(list(experiment.robots), experiment.duration_s, faults, seed, _kinds(kinds or []))
+    planned = script(list(experiment.robots), faults, seed, _kinds(kinds or []))
     folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
     read.keep(folder / SOURCE)
-    (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(rounds), indent=1))
+    (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(planned), indent=1))
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    say(f"{faults} faults in {len(rounds)} rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
+    say(f"{faults} faults in rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
     setting = Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
     with Interrupts() as interrupted:
-        outcomes, ends = run(setting, rounds, interrupted=interrupted, say=say)
-    result = ChaosResult(read.experiment.title, seed, rounds, outcomes, ends)
+        outcomes, ends = run(setting, planned, interrupted=interrupted, say=say)
+    result = ChaosResult(read.experiment.title, seed, planned, outcomes, ends)
     words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))

@@ -18,7 +18,7 @@ from experiments.recording.reader import RecordingError, recover
 from experiments.report import style
 from experiments.report.page import Finding, Section, Table, date_of, numbered, render
 from experiments.report.page import Row as Line
-from tools.reliability.fault_script import FAULT_KINDS, KINDS, Fault, Round
+from tools.reliability.fault_script import FAULT_KINDS, KINDS, Fault
 
 
 class FaultResult(msgspec.Struct, frozen=True):
@@ -101,7 +101,7 @@ class ChaosResult(msgspec.Struct, frozen=True):
 
     experiment: str
     seed: int
-    script: list[Round]
+    script: list[Fault]
     outcomes: list[FaultResult]
     rounds: list[RoundResult]
 
@@ -139,7 +139,7 @@ def table(result: ChaosResult) -> Table:
 def findings(result: ChaosResult) -> list[Finding]:
     """The verdict."""
     done, rounds = len(result.outcomes), result.rounds
-    wanted = sum(len(each.faults) for each in result.script)
+    wanted = len(result.script)
     found = [Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds")]
     nearest = min((each.nearest_m for each in rounds), default=float("inf"))
     found.append(Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"))

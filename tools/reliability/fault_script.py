@@ -15,7 +15,6 @@ Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 FORM_S: Final = 15.0  # a formation needs so long to come together: a round gets about the faults that it has time for
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
 LAST_S: Final = 6.0  # before the end of the run nothing new begins
-CONDUCTOR_AFTER: Final = 3  # faults before the death of the launcher, after which no other is possible
 
 
 @dataclass(frozen=True)
@@ -141,14 +140,11 @@ class Round(msgspec.Struct, frozen=True):
     stage: Stage = "plain"
 
 
-def script(
-    robots: Sequence[str], duration_s: float, count: int, seed: int, kinds: Sequence[str] = KINDS
-) -> list[Round]:
-    """Rounds with `count` faults, each kind as often as any other; the same seed gives the same script.
+def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = KINDS) -> list[Fault]:
+    """`count` faults, each kind as often as any other; the same seed gives the same script.
 
     Args:
         robots: Possible victims.
-        duration_s: Of a round [s].
         count: How many faults.
         seed: Of all choices.
         kinds: Which there are.
@@ -156,40 +152,23 @@ def script(
     random = np.random.default_rng(seed)
     deck = [kinds[place % len(kinds)] for place in range(count)]
     random.shuffle(deck)
-    rounds = []
-    while deck:
-        rounds.append(_deal(deck, robots, duration_s, random))
-    return rounds
+    return [_fault(kind, round(float(random.uniform(*GAP_S)), 2), robots, random) for kind in deck]
 
 
-def _deal(deck: list[str], robots: Sequence[str], duration_s: float, random: np.random.Generator) -> Round:
-    """Take the faults of one round off the deck."""
-    stage = FAULT_KINDS[deck[0]].stage
-    t, faults = FORM_S, list[Fault]()
-    dealt: list[str] = []
-    while True:
-        fitting = (k for k, kind in enumerate(deck) if _fits(kind, dealt, stage))
-        place = next(fitting, None)
-        if place is None:
-            if faults:
-                break
-            place = 0  # a fault that fits nowhere has a round of its own
-        kind = deck.pop(place)
-        dealt.append(kind)
-        gap = round(float(random.uniform(*GAP_S)), 2)
-        faults.append(_fault(kind, gap, robots, random))
-        t += gap + FAULT_KINDS[kind].lasts_s + FAULT_KINDS[kind].heals_s
-        if kind == "conductor" or t > duration_s - LAST_S:
+def take_round(waiting: list[Fault], duration_s: float) -> Round:
+    """Take the faults of a round of `duration_s` [s] off the list, one or more; the death of the launcher ends it."""
+    stage = waiting[0].properties.stage
+    t, taken = FORM_S, list[Fault]()
+    for fault in list(waiting):
+        kind = fault.properties
+        alike = sum(other.kind == fault.kind for other in taken)
+        if alike < kind.most and kind.never != stage and kind.stage in ("plain", stage):
+            taken.append(fault)
+            waiting.remove(fault)
+            t += fault.after_s + kind.lasts_s + kind.heals_s
+        if t > duration_s - LAST_S:
             break
-    return Round(faults, stage)
-
-
-def _fits(kind: str, dealt: Sequence[str], stage: Stage) -> bool:
-    """Whether a kind may come next in a round."""
-    nature = FAULT_KINDS[kind]
-    if dealt.count(kind) >= nature.most or nature.never == stage or nature.stage not in ("plain", stage):
-        return False
-    return kind != "conductor" or len(dealt) >= CONDUCTOR_AFTER
+    return Round(sorted(taken, key=lambda fault: fault.kind == "conductor"), stage)
 
 
 def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
