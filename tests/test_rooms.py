@@ -43,7 +43,8 @@ experiments.sweep experiments.view
 tools.live_table
 tools.progress tools.completion
 tools.commands
-tools.reliability tools.bench
+tools.reliability
+tools.bench
 tools.main
 tools.guard
 """

@@ -7,13 +7,12 @@ busy machine as well; it is taken for each pose sent, because a robot that misse
 
 from __future__ import annotations
 
-import resource
 import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
@@ -23,46 +22,29 @@ from experiments.real_time.conductor.run_view import Progress
 from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.launcher import Launcher
 from tools.bench.measuring import Figure, fly
+from tools.reliability.run_process import Usage, usage_of
 
 FLIGHT_S: Final = 20.0
-
-
-class Spent(NamedTuple):
-    """CPU time and memory of a process at one moment."""
-
-    at: float  # [s, monotonic]
-    cpu_s: float  # since it began [s]
-    rss_mb: float  # memory that it has [MB]
-
-    @classmethod
-    def of(cls, pid: int) -> Spent:
-        """Resources of another process on this machine, now."""
-        cpu_s = time.clock_gettime(~pid << 3 | 2)  # clock_getcpuclockid(3): exact, where /proc counts in 10 ms
-        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
-        return cls(time.monotonic(), cpu_s, pages * resource.getpagesize() / 1e6)
 
 
 class Meter:
     """Measures processes, by the names of their robots, from the first measurement to the last."""
 
     def __init__(self) -> None:
-        self.first: dict[str, Spent] = {}
-        self.last: dict[str, Spent] = {}
+        self.first: dict[str, tuple[float, Usage]] = {}  # with its time [s, monotonic]
+        self.last: dict[str, tuple[float, Usage]] = {}
 
     def measure(self, pids: Mapping[str, int]) -> None:
         """Measure now; processes that have ended are left out."""
         for name, pid in pids.items():
-            try:
-                spent = Spent.of(pid)
-            except OSError:
-                continue
-            self.first.setdefault(name, spent)
-            self.last[name] = spent
+            if (usage := usage_of(pid)) is not None:
+                self.last[name] = time.monotonic(), usage
+                self.first.setdefault(name, self.last[name])
 
     def shares(self) -> dict[str, float]:
         """CPU time of each process over wall time [%]."""
-        pairs = ((name, self.first[name], last) for name, last in self.last.items())
-        return {name: 100.0 * (b.cpu_s - a.cpu_s) / (b.at - a.at) for name, a, b in pairs if b.at > a.at}
+        pairs = ((name, *self.first[name], *last) for name, last in self.last.items())
+        return {name: 100.0 * (b.cpu_s - a.cpu_s) / (end - begin) for name, begin, a, end, b in pairs if end > begin}
 
 
 def process() -> Iterator[Figure]:
@@ -117,9 +99,9 @@ def process() -> Iterator[Figure]:
         ratio,
         "× bare process, each pose",
     )
-    memory = max(spent.rss_mb for spent in bare.last.values())
+    memory = max(usage.rss_mb for _, usage in bare.last.values())
     yield Figure("process", "largest resident memory of a bare process", memory, "MB", 1.0, "yardstick")
-    larger = max(spent.rss_mb for spent in robots.last.values())
+    larger = max(usage.rss_mb for _, usage in robots.last.values())
     yield Figure("process", "largest resident memory of a robot", larger, "MB", larger / memory, "× bare process")
     missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
     yield Figure("process", "missed deadlines", missed, "%", missed, "× 1 %")

@@ -7,15 +7,18 @@ import subprocess
 import sys
 import time
 
-from tools.bench.process import Meter, Spent
+from tools.bench.process import Meter
+from tools.reliability.run_process import usage_of
 
 
 def test_what_another_process_spends_is_read_exactly() -> None:
-    before = Spent.of(os.getpid())
+    before = usage_of(os.getpid())
     begun = time.process_time()
     while time.process_time() < begun + 0.05:
         pass
-    after = Spent.of(os.getpid())
+    after = usage_of(os.getpid())
+    assert before is not None
+    assert after is not None
     assert 0.05 <= after.cpu_s - before.cpu_s <= time.process_time() - begun + 0.01
     assert after.rss_mb > 1.0
 
