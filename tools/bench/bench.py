@@ -18,7 +18,6 @@ BENCHMARKS: Final = {  # module, which has a function of the benchmark's name
     "start": "measuring",  # time until a command answers
     "virtual": "measuring",  # the reference experiment in virtual time
     "process": "process",  # CPU and memory of robot processes
-    "encounters": "encounters",  # collisions with and without avoidance
     "safety": "reactions",  # reaction times
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,7 +20,6 @@ from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, Experiment, Leg, Rates, Robot, Start
 from experiments.virtual_time.simulation import Log, simulate
-from tools.bench.measuring import Figure
 
 CIRCLE: Final = 0.8  # [m] robots begin about here and want to go to the other side
 SCATTER: Final = 0.35  # [m] on each axis
@@ -28,7 +27,6 @@ ARRIVED: Final = 0.05  # [m] nearer than this to its goal at the end a robot has
 SPEED: Final = {"twist": 0.2, "velocity": 0.4, "position": 0.4}  # [m/s] of the plans
 PATIENCE: Final = 3.0  # times the time that the way would take alone; avoiding each other takes up to 2.6 of them
 IN_THE_AIR: Final = 0.5  # [m] height of drones among themselves
-EACH: Final = 50  # encounters of each pair of kinds and each direction: a thousand in all
 BATCH: Final = 100  # encounters that are flown side by side
 ANGLES: Final = (math.pi, 0.5 * math.pi)  # head-on, and across
 PAIRS: Final = tuple(itertools.combinations_with_replacement(KINDS, 2))
@@ -65,22 +63,6 @@ class Outcome:
             f"{int(self.collided.sum())} collisions in {many} encounters, closest {self.gap.min():+.3f} m; "
             f"{int(self.arrived.sum())} arrived; avoidance acted on {self.avoided.mean():.0%} of the ticks"
         )
-
-
-def encounters() -> Iterator[Figure]:
-    """A thousand random encounters with the barrier, with the potential, and with nothing."""
-    free = 0.0
-    for name in (None, "potential", "barrier"):
-        found = Outcome.joined(list(random_pairs(name, EACH).values()))
-        share = 100.0 * float(found.collided.mean())
-        free = free or share
-        count = len(found.gap)
-        label = f"collisions in {count}, avoidance: {name or 'none'}"
-        yield Figure("encounters", label, float(found.collided.sum()), "", share / free, "× none")
-        gap = 100.0 * float(found.gap.min())
-        yield Figure("encounters", f"closest in {count}, avoidance: {name or 'none'}", gap, "cm", gap / 5.0, "× margin")
-        arrived = 100.0 * float(found.arrived.mean())
-        yield Figure("encounters", f"arrived, avoidance: {name or 'none'}", arrived, "%", arrived / 100.0, "× all")
 
 
 def encounter(
@@ -144,7 +126,7 @@ def meet(experiment: Experiment, seeds: Sequence[int]) -> Outcome:
     return Outcome.joined(_outcome(experiment, simulate(experiment, batch)) for batch in batches)
 
 
-def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: Any) -> dict[str, Outcome]:  # noqa: ANN401
+def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: Any) -> dict[str, Outcome]:
     """Encounters of all pairs of kinds, head-on and across: `each` of either; further settings as of `encounter`.
 
     With 50 of each it is a thousand: 10 pairs, 2 directions.

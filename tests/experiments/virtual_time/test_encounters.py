@@ -7,13 +7,13 @@ import pytest
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Channel, Start
 from experiments.virtual_time.simulation import simulate
-from tools.bench.encounters import ANGLES, Outcome, encounter, meet, random_pairs
+from tests.experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
 
 pytestmark = pytest.mark.slow
 
 POTENTIAL = {"kind": "potential", "hears": "all"}
 BARRIER = {"kind": "barrier", "hears": "all"}
-SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))  # `./zenpark bench encounters` has them all
+SOME = (("khepera4", "turtlebot3"), ("tello", "tello"))
 FOUR = ("khepera4", "turtlebot3", "crazyflie", "tello")
 
 
