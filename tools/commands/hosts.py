@@ -336,7 +336,7 @@ def put(name: str, host: Host) -> str:
     Raises:
         HostError: If there is no place for it, or it cannot be made ready there.
     """
-    from experiments.real_time.hosts.hosts import HostError
+    from experiments.real_time.hosts.hosts import HostError, run_script
     from experiments.recording import version
 
     place = PurePosixPath(host.zenpark.removeprefix("~/"))
@@ -346,59 +346,16 @@ def put(name: str, host: Host) -> str:
         raise HostError(f"{name}: this zenpark is no checkout, which is what can be copied; start ./zenpark of one")
     wanted = [*version.PACKAGES, *FILES, *sorted(path.name for path in version.ROOT.glob("requirements*.lock"))]
     names = [each for each in wanted if (version.ROOT / each).exists()]
-    output = deliver(
+    output = run_script(
         name,
         host,
-        PUT_ZENPARK,
-        [place.parent, *names],
+        (PUT_ZENPARK, place.parent, *names),
         packed(version.ROOT, names),
         limit_s=INSTALL_S,
         late=f"not ready after {INSTALL_S / 60:g} minutes; start {place} there by hand",
-        failed="not installed",
+        failed="not installed: ",
     )
     return f"{output.strip()} ({version.digest()[: version.SHOWN]}) installed"
-
-
-def deliver(
-    name: str, host: Host, script: str, words: Sequence[object], cargo: bytes, *, limit_s: float, late: str, failed: str
-) -> str:
-    """Let a script unpack a tar on a host; return its output.
-
-    Args:
-        name: Of the host.
-        host: Has an address.
-        script: For the plain shell there, which finds the cargo on its standard input.
-        words: Of the script, from $0 on.
-        cargo: A compressed tar.
-        limit_s: It must be over within this [s].
-        late: Message if it is not.
-        failed: Message before the reason if it cannot be done.
-
-    Raises:
-        HostError: If it was not done.
-    """
-    import subprocess
-
-    from experiments.real_time.hosts import ssh
-    from experiments.real_time.hosts.hosts import HostError
-
-    assert host.address is not None
-    try:
-        done = subprocess.run(
-            ssh.script(host.address, script, list(map(str, words))),
-            input=cargo,
-            capture_output=True,
-            check=False,
-            timeout=limit_s,
-        )
-    except subprocess.TimeoutExpired:
-        raise HostError(f"{name}: {late}") from None
-    errors = done.stderr.decode(errors="replace").strip()
-    if done.returncode == ssh.BROKEN:
-        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, errors)}")
-    if done.returncode != 0:
-        raise HostError(f"{name}: {failed}: {errors or 'without a message'}")
-    return done.stdout.decode(errors="replace")
 
 
 def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
@@ -476,7 +433,7 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
     """
     from agents.network.lab import AUTHORITY
     from experiments.real_time.hosts import certificates
-    from experiments.real_time.hosts.hosts import HostError
+    from experiments.real_time.hosts.hosts import HostError, run_script
 
     if trouble := list(certificates.ended(folder, robots)):
         raise HostError("\n".join(f"{name}: {each}" for each in trouble))
@@ -485,15 +442,14 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
         raise HostError(f"{name}: '{host.lab}' names no folder of its own; write lab = \"zenpark-lab\"")
     # the key before its certificate: a process that reads them in between finds that they do not fit, and tries again
     files = [f"{AUTHORITY}.pem", *(f"{robot}.{end}" for robot in robots for end in ("key", "pem"))]
-    output = deliver(
+    output = run_script(
         name,
         host,
-        PUT_CERTIFICATES,
-        [place, *files],
+        (PUT_CERTIFICATES, place, *files),
         packed(folder, files, mode=0o600),
         limit_s=SEND_S,
         late=f"has not taken its certificates in {SEND_S:g} s; is it overloaded?",
-        failed="certificates not put there",
+        failed="certificates not put there: ",
     )
     removed = output.split()
     more = f"; removed {', '.join(removed)}" if removed else ""

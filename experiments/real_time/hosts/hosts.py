@@ -11,6 +11,7 @@ import os
 import secrets
 import select
 import shutil
+import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -39,6 +40,38 @@ STATION: Final = "host-"  # prefix of the process of the connection to a host
 
 class HostError(RuntimeError):
     """Hosts that cannot take part, with reason and remedy."""
+
+
+def run_script(
+    name: str, host: Host, script: Sequence[object], given: bytes, *, limit_s: float, late: str, failed: str = ""
+) -> str:
+    """Run a script in the plain shell of a host; return its output.
+
+    Args:
+        name: Of the host.
+        host: Has an address.
+        script: Its text, and its words from $0 on.
+        given: What it finds on its standard input.
+        limit_s: It must be over within this [s].
+        late: Message if it is not.
+        failed: Before the reason if it fails.
+
+    Raises:
+        HostError: If it was not done.
+    """
+    assert host.address is not None
+    text, *words = map(str, script)
+    try:
+        command = ssh.script(host.address, text, words)
+        done = subprocess.run(command, input=given, capture_output=True, check=False, timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        raise HostError(f"{name}: {late}") from None
+    errors = done.stderr.decode(errors="replace").strip()
+    if done.returncode == ssh.BROKEN:
+        raise HostError(f"{name}: {ssh.explained(host.address, host.zenpark, errors)}")
+    if done.returncode:
+        raise HostError(f"{name}: {failed}{errors or 'without a message'}")
+    return done.stdout.decode(errors="replace")
 
 
 class Station:

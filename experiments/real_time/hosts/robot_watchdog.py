@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 from typing import Final
 
 from bridges.turtlebot3 import watchdog
-from experiments.real_time.hosts import ssh
-from experiments.real_time.hosts.hosts import HostError
+from experiments.definition.experiment import Host
+from experiments.real_time.hosts.hosts import run_script
 
 INSTALL_S: Final = 120.0
 FOLDER: Final = "zenpark-watchdog"  # in the home folder on the robot
@@ -80,7 +79,7 @@ def install(robot: str, *, namespace: str, domain: int, silence_s: float) -> lis
     Raises:
         HostError: If the robot cannot be reached, has no ROS 2, or the watchdog does not come up.
     """
-    return _run(robot, PUT, [FOLDER, namespace, str(domain), f"{silence_s:g}"])
+    return _run(robot, PUT, FOLDER, namespace, str(domain), f"{silence_s:g}")
 
 
 def remove(robot: str) -> list[str]:
@@ -89,18 +88,9 @@ def remove(robot: str) -> list[str]:
     Raises:
         HostError: As `install`.
     """
-    return _run(robot, REMOVE, [FOLDER])
+    return _run(robot, REMOVE, FOLDER)
 
 
-def _run(robot: str, text: str, words: list[str]) -> list[str]:
-    command = ssh.script(robot, text, words)
-    try:
-        done = subprocess.run(command, input=FILE.read_bytes(), capture_output=True, timeout=INSTALL_S, check=False)
-    except subprocess.TimeoutExpired:
-        raise HostError(f"{robot}: did not answer within {INSTALL_S:g} s; try it by hand: ssh {robot}") from None
-    errors = done.stderr.decode(errors="replace").strip()
-    if done.returncode == ssh.BROKEN:
-        raise HostError(f"{robot}: {ssh.explained(robot, '', errors)}")
-    if done.returncode:
-        raise HostError(f"{robot}: {errors}")
-    return done.stdout.decode(errors="replace").splitlines()
+def _run(robot: str, *script: str) -> list[str]:
+    late = f"did not answer within {INSTALL_S:g} s; try it by hand: ssh {robot}"
+    return run_script(robot, Host(address=robot), script, FILE.read_bytes(), limit_s=INSTALL_S, late=late).splitlines()
