@@ -9,6 +9,7 @@ import platform
 import shutil
 import socket
 import subprocess
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -74,10 +75,10 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 @cache
-def digest(root: Path = ROOT) -> str:
-    """SHA-256 over names and contents of all modules, in hexadecimal; other files are not code."""
+def digest(root: Path = ROOT, packages: Sequence[str] = PACKAGES) -> str:
+    """SHA-256 over names and contents of all modules of some packages, in hexadecimal; other files are not code."""
     total = hashlib.sha256()
-    for file in sorted(file for name in PACKAGES for file in (root / name).rglob("*.py")):
+    for file in sorted(file for name in packages for file in (root / name).rglob("*.py")):
         content = file.read_bytes()
         total.update(f"{file.relative_to(root).as_posix()}\0{len(content)}\0".encode() + content)
     return total.hexdigest()

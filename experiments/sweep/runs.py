@@ -23,6 +23,8 @@ from experiments.file.structure import plugin_files
 from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
 from experiments.metrics.signals import LinkErrors, integrals, leaders, transmission_gaps, transmissions
 from experiments.recording.trace import Trace
+from experiments.recording.version import ROOT
+from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import Log, simulate
@@ -94,8 +96,10 @@ def code_of(experiment: Experiment) -> str:
     engine = registry.split(experiment.world.engine)[0]
     with suppress(PackageNotFoundError):
         engine += version(engine)
-    others = sorted(_file_digest(file) for file in files if file.parent.parent != _root())
-    return hashlib.sha256(":".join((_own_digest(), np.__version__, engine, *others)).encode()).hexdigest()[:20]
+    others = sorted(_file_digest(file) for file in files if file.parent.parent != ROOT)
+    return hashlib.sha256(
+        ":".join((digest_of_code(packages=PACKAGES), np.__version__, engine, *others)).encode()
+    ).hexdigest()[:20]
 
 
 def figures_of(log: Log, experiment: Experiment) -> list[Figures]:
@@ -150,17 +154,6 @@ def _mean(values: Sequence[float]) -> float | None:
     """Mean of the known values; None without any."""
     known = [value for value in values if math.isfinite(value)]
     return statistics.fmean(known) if known else None
-
-
-@cache
-def _root() -> Path:
-    return Path(__file__).resolve().parents[2]
-
-
-@cache
-def _own_digest() -> str:
-    files = sorted(file for package in PACKAGES for file in (_root() / package).rglob("*.py"))
-    return hashlib.sha256(":".join([version("zenpark"), *map(_file_digest, files)]).encode()).hexdigest()
 
 
 @cache
