@@ -103,7 +103,7 @@ class Acting:
             ):  # fmt: skip
                 button = gui.add_button(text, icon=icon)
                 button.on_click(partial(self._give, messages.Order(what)))  # type: ignore[arg-type]
-            drag = gui.add_checkbox("Drag the leaders' targets", initial_value=False)
+            drag = gui.add_checkbox("Drag targets", initial_value=False, hint="Of the leaders.")
             drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
     def set_stage(self, stage: Stage) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -24,8 +24,8 @@ FLAGS = (
     "--ignore-gpu-blocklist",
 )  # fmt: skip
 
-FRAMES = 5
-SELDOM = "window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 100)"
+FRAMES = 4
+SELDOM = "window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 250)"
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
@@ -163,8 +163,13 @@ def _array(value: Any, arrays: list[bytes]) -> Any:
 
 
 @contextmanager
-def opened(address: str, width: int = 900, height: int = 600, *, often: bool = False) -> Iterator[Page]:
-    """A page in a browser of its own; it is drawn ten times a second, or as often as the browser can."""
+def opened(
+    address: str | Callable[[], str], width: int = 900, height: int = 600, *, often: bool = False
+) -> Iterator[Page]:
+    """A page in a browser of its own; it is drawn four times a second, or as often as the browser can.
+
+    An address may be waited for while the browser starts.
+    """
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
@@ -172,7 +177,7 @@ def opened(address: str, width: int = 900, height: int = 600, *, often: bool = F
             page = Page(browser.new_page(viewport={"width": width, "height": height}))
             if not often:  # without a graphics card it would take all processors from the robots
                 page.page.add_init_script(SELDOM)
-            page.page.goto(address, wait_until="commit")
+            page.page.goto(address if isinstance(address, str) else address(), wait_until="commit")
             yield page
         finally:
             browser.close()

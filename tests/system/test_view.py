@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,6 @@ class ViewProcess(Started):
         self.port = int(free_endpoint(preferred_port=0).rpartition(":")[2])
         super().__init__("tools.guard", "view", *map(str, arguments), "--port", str(self.port))
 
-    @property
     def address(self) -> str:
         """Of the page, when it is there."""
         assert self.process.stdout is not None
@@ -44,16 +44,16 @@ class ViewProcess(Started):
 
 
 @contextmanager
-def viewed(*arguments: object) -> Iterator[str]:
-    """The address of a page, while its process runs."""
+def viewed(*arguments: object) -> Iterator[ViewProcess]:
+    """A page, while its process runs."""
     process = ViewProcess(*arguments)
     try:
-        yield process.address
+        yield process
     finally:
         assert process.end() == 0
 
 
-KINDS = {"turtlebot3": 1, "khepera4": 3, "crazyflie": 3}  # robots of the reference experiment
+KINDS = ("turtlebot3", "khepera4", "crazyflie")  # of the reference experiment
 
 
 def places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.ndarray:
@@ -80,29 +80,36 @@ def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
     park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"]
     (tmp_path / "event.json").write_bytes(document.write_json(park))
     names, robots = list(park.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *park.robots)
+
+    def taken_off(view: ViewProcess) -> str:
+        watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
+        assert all(watcher.order(name, messages.Order("takeoff")).ok for name in names)
+        return view.address()
+
     try:
-        with announced(watcher, park, "event"), viewed("--connect", router.endpoint) as address:
-            watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
-            assert all(watcher.order(name, messages.Order("takeoff")).ok for name in names)
-            with opened(address, 480, 360) as page:
-                watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in names), "airborne")
-                page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
-                before, colours = places(page), page.nodes["/case/links"]["colors"]
-                at = time.time() + 0.2
-                assert all(watcher.order(name, messages.Order("start", at=at)).ok for name in names)
-                watcher.until(lambda: watcher.phase("TB01") == "running", "begun")
-                assert watcher.order("TB01", messages.Order("go", goal=(-0.4, 0.8))).ok
-                page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
-                page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
-                page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
-                page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
-                page.button("EMERGENCY STOP").click()
-                page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
-                watcher.until(
-                    lambda: all(watcher.status[name].reason.startswith("emergency stop by operator") for name in names),
-                    "their statuses say so",
-                )
-                assert page.hosts == {address.removeprefix("http://")}
+        with (
+            announced(watcher, park, "event"),
+            viewed("--connect", router.endpoint) as view,
+            opened(partial(taken_off, view), 480, 360) as page,
+        ):
+            watcher.until(lambda: all(watcher.phase(name) == "airborne" for name in names), "airborne")
+            page.until(lambda: np.all(places(page)[:, 2] > -1.0), "seen")
+            before, colours = places(page), page.nodes["/case/links"]["colors"]
+            at = time.time() + 0.2
+            assert all(watcher.order(name, messages.Order("start", at=at)).ok for name in names)
+            watcher.until(lambda: watcher.phase("TB01") == "running", "begun")
+            assert watcher.order("TB01", messages.Order("go", goal=(-0.4, 0.8))).ok
+            page.until(lambda: np.all(np.linalg.norm(places(page) - before, axis=1) > 0.01), "all move")
+            page.until(lambda: page.nodes["/case/links"]["colors"] != colours, "links change colour")
+            page.until(lambda: np.all(places(page, "goals/{}")[:, 2] > -1.0), "ghosts stand at the goals")
+            page.until(lambda: page.page.get_by_text("event: formation").count(), "case and phase")
+            page.button("EMERGENCY STOP").click()
+            page.until(lambda: page.page.get_by_text("stopped: CF01, CF02").count(), "answers are shown")
+            watcher.until(
+                lambda: all(watcher.status[name].reason.startswith("emergency stop by operator") for name in names),
+                "their statuses say so",
+            )
+            assert page.hosts == {f"127.0.0.1:{view.port}"}
     finally:
         robots.kill()
 
@@ -129,8 +136,8 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
     try:
         with (
             announced(watcher, convoy, "event"),
-            viewed("--connect", router.endpoint) as address,
-            opened(address, 900, 600) as page,
+            viewed("--connect", router.endpoint) as view,
+            opened(view.address, 900, 600) as page,
         ):
             watcher.until(lambda: all(watcher.phase(name) == "ready" for name in names), "ready")
             at = time.time() + 0.2
@@ -139,7 +146,7 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
             page.until(lambda: everywhere(lambda status: status.phase == "running"), "running")
 
             page.page.locator(".mantine-Notification-closeButton").click()  # it says that there is no graphics card
-            page.page.get_by_label("Drag the leaders' targets").check()
+            page.page.get_by_label("Drag targets").check()
             page.until(lambda: "/targets/TB01" in page.nodes, "the target is shown")
             start = np.array(convoy.robots["TB01"].start[:2])
             square = np.array([*start + 0.255 * acting.HANDLE * 3.0 / 2.5, 0.0])  # by which it is dragged in the plane
@@ -196,8 +203,8 @@ def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_pa
     assert "--lab" in missing.stderr, missing.stderr
     for identity, buttons in (("observer", 0), ("operator", 1)):
         with (
-            viewed("--connect", endpoint, "--lab", lab, "--as", identity) as address,
-            opened(address, 640, 480) as page,
+            viewed("--connect", endpoint, "--lab", lab, "--as", identity) as view,
+            opened(view.address, 640, 480) as page,
         ):
             page.until(lambda: "/case/robots/khepera4/body" in page.nodes, "drawn")
             page.until(lambda: np.all(page.positions("/case/robots/khepera4/body")[:, 2] > -1.0), "seen")
@@ -216,7 +223,7 @@ def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_pa
 def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> None:
     run = simulate(document.load("robotic-park", "duration_s=6", "timeline=[]"), cases=["event"], folder=tmp_path)
     trace = run.traces["event"]
-    with viewed(tmp_path) as address, opened(address, 640, 480) as page:
+    with viewed(tmp_path) as view, opened(view.address, 640, 480) as page:
         assert places(page, root="/case0").shape == trace.true_position[0].shape
         time_box = page.page.locator("input[type=text]").nth(0)
         for t in (4.0, 0.5, 2.5):
@@ -230,7 +237,7 @@ def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> 
         page.button("Play").click()
         before = places(page, root="/case0")
         page.until(lambda: np.any(places(page, root="/case0") != before), "it plays")
-        assert page.hosts == {address.removeprefix("http://")}
+        assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 
 def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
