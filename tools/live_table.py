@@ -170,7 +170,7 @@ def totals(rows: Sequence[Row], shown: int) -> Row:
         cpu=sum(cpu.values()) if cpu else None,
         battery=min((row.battery for row in rows if row.battery is not None), default=None),
         sent=sum(row.sent or 0 for row in rows),
-        note=f"{notable} need attention" if notable else "largest error, lowest battery",
+        note=f"{notable} need{'s' * (notable == 1)} attention" if notable else "largest error, lowest battery",
         growing=frozenset().union(*(row.growing for row in rows)),
     )
 

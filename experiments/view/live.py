@@ -36,9 +36,9 @@ LOOPBACK: Final = "127.0.0.1"
 FOV: Final = 0.8  # [rad] upright
 ASPECT: Final = 1.2  # width over height of a page that is not known yet
 FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
-FREE: Final = (-0.92, 0.92)  # of a page from its middle to its edges, where the arena is shown: lowest, highest
+FREE: Final = np.array([-0.92, 0.92])  # of a page from its middle to its edges, where the arena is shown
 PHONE: Final = 0.7  # width over height of a page whose panel is below, not beside
-ABOVE: Final = (0.24, 0.96)  # as `FREE`, of such a page
+ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
 
 
 def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
@@ -75,13 +75,16 @@ def standpoint(size: Sequence[float] | Array, aspect: float) -> tuple[Array, Arr
     away = FROM / norm(FROM)
     right = np.array([-away[1], away[0], 0.0]) / norm(away[:2])
     corners = np.array(list(product((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0)))) * size
-    near, over, up = corners @ away, corners @ right, corners @ np.cross(away, right)
-    low, high = np.tan(0.5 * FOV) * np.array(ABOVE if aspect < PHONE else FREE)
-    wide = (near + np.abs(over) / (np.tan(0.5 * FOV) * aspect * FREE[1])).max()
-    tall = ((up + high * near).max() - (up + low * near).min()) / (high - low)
-    distance = max(wide, tall)
-    shift = 0.5 * ((up - high * (distance - near)).max() + (up - low * (distance - near)).min())
-    at = shift * np.cross(away, right)
+    near, reach = corners @ away, np.tan(0.5 * FOV)
+    sides = ((right, aspect * reach * FREE), (np.cross(away, right), reach * (ABOVE if aspect < PHONE else FREE)))
+    distance = max(
+        ((corners @ side + high * near).max() - (corners @ side + low * near).min()) / (high - low)
+        for side, (low, high) in sides
+    )
+    at = np.zeros(3)
+    for side, (low, high) in sides:
+        beyond = (corners @ side - high * (distance - near)).max(), (corners @ side - low * (distance - near)).min()
+        at += 0.5 * sum(beyond) * side
     return at + distance * away, at
 
 
