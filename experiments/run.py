@@ -21,7 +21,7 @@ from experiments.definition import standby
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import refusal
 from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
@@ -208,7 +208,7 @@ def _refuse_too_much(experiment: Experiment, seeds: int) -> None:
         hint = (
             "take fewer --seeds (`./zenpark sweep` runs any number, cell by cell), a lower rates.state_hz or duration_s"
         )
-        raise DocumentError([Problem("--seeds" if seeds > 1 else "duration_s", 0, 0, message, hint)])
+        raise refusal("--seeds" if seeds > 1 else "duration_s", message, hint)
 
 
 def _pass_progress(progress: Progress, case: str, duration_s: float, elapsed: float) -> None:

@@ -22,7 +22,7 @@ from experiments.authoring.layouts import Layout, LayoutError
 from experiments.catalogue import index
 from experiments.check.ideal_run import closed_shares
 from experiments.file import catalogue as entries
-from experiments.file.problems import DocumentError, Problem, refusal
+from experiments.file.problems import refusal
 
 PREFIX: Final = {"crazyflie": "CF", "tello": "DT", "khepera4": "KH", "turtlebot3": "TB"}
 LAWS: Final = ("distance", "displacement")
@@ -161,7 +161,7 @@ def generate(
         numbers = [int(jump) for jump in jumps.split(",")]
     except ValueError:
         hint = "give whole numbers, such as 1,2"
-        raise DocumentError([Problem(f"--jumps {jumps}", 0, 0, "are no jumps", hint)]) from None
+        raise refusal(f"--jumps {jumps}", "are no jumps", hint) from None
     try:
         made = layout(what, size, wanted, numbers)
         text = experiment_file(made, wanted)

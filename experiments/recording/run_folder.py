@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from experiments.file.document import Document
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import refusal
 from experiments.recording.version import Provenance
 
 RUNS: Final = Path("runs")
@@ -75,9 +75,9 @@ def new_folder(read: Document, out: str | None, what: str = "") -> Path:
         taken = any(folder.iterdir())
     except OSError as error:
         hint = "choose a place that may be written to with --out"
-        raise DocumentError([Problem(str(folder), 0, 0, f"cannot be made: {error.strerror}", hint)]) from None
+        raise refusal(str(folder), f"cannot be made: {error.strerror}", hint) from None
     if taken:
-        raise DocumentError([Problem(str(folder), 0, 0, "holds something already", "name a new folder with --out")])
+        raise refusal(str(folder), "holds something already", "name a new folder with --out")
     return folder
 
 

@@ -22,7 +22,8 @@ from typing import Any, Final
 
 from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
-from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of, wrong
+from experiments.file.problems import refusal
+from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of
 from experiments.sweep.store import Store
 from experiments.sweep.sweep import SweepRunner, folder_of, origin
 from experiments.sweep.table import MEANS, RATIOS, CellRow, words_of
@@ -110,18 +111,18 @@ def wish_of(text: str) -> Wish:
     place = f'--optimize "{text}"'
     first, *rest = (part.strip() for part in text.split(","))
     if not first or _LIMIT.fullmatch(first):
-        raise wrong(
+        raise refusal(
             place, "it does not say what is to be least", 'write, for example, --optimize "messages, iae<=1.01"'
         )
     limits = []
     for part in rest:
         found = _LIMIT.fullmatch(part)
         if not found:
-            raise wrong(place, f"'{part}' is no limit", "write one as iae<=1.01")
+            raise refusal(place, f"'{part}' is no limit", "write one as iae<=1.01")
         limits.append(Limit(_known(found[1], place), float(found[2])))
     least = _known(first, place)
     if not limits:
-        raise wrong(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
+        raise refusal(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
     return Wish(least, tuple(limits))
 
 
@@ -166,16 +167,16 @@ def tune(
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
     tuning = seeds_of(words.get("tuning"), FIRST_TUNING, TUNING)
     if len(tuning) < FEWEST:
-        raise wrong(words["tuning"], f"{len(tuning)} seeds are too few to tune on", f"give at least {FEWEST}")
+        raise refusal(words["tuning"], f"{len(tuning)} seeds are too few to tune on", f"give at least {FEWEST}")
     if both := sorted(set(seeds) & set(tuning)):
         hint = "name others with tuning=1001:1060: what is tuned on a seed must not be reported on it"
-        raise wrong(words.get("tuning", "seeds="), f"seed {both[0]} is to be tuned and reported on", hint)
+        raise refusal(words.get("tuning", "seeds="), f"seed {both[0]} is to be tuned and reported on", hint)
     for axis in axes:
         if axis.span is None and len(axis.values) > 1:
-            raise wrong(axis.argument, "the search needs a range", f"write {axis.path}=LOW:HIGH:log (or lin)")
+            raise refusal(axis.argument, "the search needs a range", f"write {axis.path}=LOW:HIGH:log (or lin)")
     spans = [axis for axis in axes if axis.span is not None]
     if not spans:
-        raise wrong("--optimize", "there is nothing to change", "add a range: trigger.threshold=0.002:0.05:log")
+        raise refusal("--optimize", "there is nothing to change", "add a range: trigger.threshold=0.002:0.05:log")
     fixed = [f"{axis.path}={axis.values[0]}" for axis in axes if axis.span is None]
     read = load(file, *settings, *fixed)
     reference = compared(read)
@@ -185,7 +186,7 @@ def tune(
     }
     if not ranges:
         hint = "choose a case that has it"
-        raise wrong(spans[0].argument, f"no case that is looked at has it; the reference '{reference}' is not", hint)
+        raise refusal(spans[0].argument, f"no case that is looked at has it; the reference '{reference}' is not", hint)
     cma = _library()
     folder = Path(out) if out is not None else folder_of(read, spans, "optimize")
     tried: list[CellRow] = []
@@ -284,7 +285,7 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
 def _known(name: str, place: str) -> str:
     known = (*MEANS, *(name for name in ("f", "acquired")))
     if name.lower() not in known:
-        raise wrong(place, f"no index is called '{name}'", did_you_mean(name, known))
+        raise refusal(place, f"no index is called '{name}'", did_you_mean(name, known))
     return {"f": "f_hz", "acquired": "acquired_s"}.get(name.lower(), name.lower())
 
 

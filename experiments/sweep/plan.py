@@ -26,7 +26,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen
 from experiments.file.overrides import parse
-from experiments.file.problems import DocumentError, Path, Problem
+from experiments.file.problems import DocumentError, Path, Problem, refusal
 from experiments.file.structure import group_of
 from experiments.sweep.runs import digest
 
@@ -101,11 +101,11 @@ def arguments(given: Sequence[str]) -> tuple[list[Axis], dict[str, str]]:
     for argument in given:
         path, equals, text = (part.strip() for part in argument.partition("="))
         if not equals or not path:
-            raise wrong(argument, "this is not of the form PATH=VALUES", HOW)
+            raise refusal(argument, "this is not of the form PATH=VALUES", HOW)
         if not argument.isprintable():
-            raise wrong(argument, "this holds characters that are no text", "leave them out")
+            raise refusal(argument, "this holds characters that are no text", "leave them out")
         if path in words or path in (axis.path for axis in axes):
-            raise wrong(argument, f"'{path}' is given twice", "give all its values at once, with commas")
+            raise refusal(argument, f"'{path}' is given twice", "give all its values at once, with commas")
         if path in ("seeds", "tuning"):
             words[path] = argument
         else:
@@ -124,12 +124,12 @@ def seeds_of(argument: str | None, first: int, count: int = SEEDS) -> tuple[int,
     word, _, text = argument.partition("=")
     found = _SEEDS.fullmatch(text)
     if found is None:
-        raise wrong(argument, f"'{text}' names no seeds", f"write {word}=50, or {word}=101:150")
+        raise refusal(argument, f"'{text}' names no seeds", f"write {word}=50, or {word}=101:150")
     begin, end = (first, first + int(found[1]) - 1) if found[2] is None else (int(found[1]), int(found[2]))
     if not 0 < end - begin + 1 <= MOST_SEEDS:
-        raise wrong(argument, f"these are {max(0, end - begin + 1)} seeds", f"give 1 to {MOST_SEEDS} of them")
+        raise refusal(argument, f"these are {max(0, end - begin + 1)} seeds", f"give 1 to {MOST_SEEDS} of them")
     if end >= 2**32:
-        raise wrong(argument, f"there is no seed {end}", "seeds are below 4294967296")
+        raise refusal(argument, f"there is no seed {end}", "seeds are below 4294967296")
     return tuple(range(begin, end + 1))
 
 
@@ -150,7 +150,7 @@ def cells(read: Document, file: str, settings: Sequence[str], axes: Sequence[Axi
     compared(read)
     names, order = list(chosen(read, cases)), list(read.cases())
     if (count := math.prod(len(axis.values) for axis in axes)) > MOST_CELLS:
-        raise wrong(axes[0].argument, f"these are {count} combinations of values", f"give at most {MOST_CELLS}")
+        raise refusal(axes[0].argument, f"these are {count} combinations of values", f"give at most {MOST_CELLS}")
     found: dict[tuple[str, str], Cell] = {}
     for values in itertools.product(*(axis.values for axis in axes)):
         for cell in combination(read, file, settings, dict(zip(axes, values, strict=True)), names):
@@ -195,43 +195,38 @@ def _of_trigger(parsed: _Parsed) -> bool:
     return case is None and any(group_of(path[:end]) == TRIGGERS for end in range(1, len(path) + 1))
 
 
-def wrong(place: str, message: str, hint: str) -> DocumentError:
-    """An argument that cannot be understood."""
-    return DocumentError([Problem(place, 0, 0, message, hint)])
-
-
 def compared(read: Document) -> str:
     """The case that ratios are taken over."""
     if not read.experiment.cases:
         hint = 'add one above what it is to be compared with: [cases.periodic] with trigger = "periodic"'
-        raise wrong(str(read.path), "there is no case in it to compare with", hint)
+        raise refusal(str(read.path), "there is no case in it to compare with", hint)
     return next(iter(read.cases()))
 
 
 def _axis(argument: str, path: str, text: str) -> Axis:
     if not text:
-        raise wrong(argument, "there is no value in it", HOW)
+        raise refusal(argument, "there is no value in it", HOW)
     found = _RANGE.fullmatch(text)
     if found is None:
         if ":" in text and _NUMBER.match(text):
-            raise wrong(argument, f"'{text}' is no range", HOW)
+            raise refusal(argument, f"'{text}' is no range", HOW)
         values = [part.strip() for part in _parts(text)]
         if "" in values:
-            raise wrong(argument, "a value is missing between two commas", HOW)
+            raise refusal(argument, "a value is missing between two commas", HOW)
         if len(set(values)) < len(values):
-            raise wrong(argument, "a value is given twice", "give each once")
+            raise refusal(argument, "a value is given twice", "give each once")
         return Axis(argument, path, tuple(values), None)
     whole = all(part.strip().lstrip("+-").isdigit() for part in (found[1], found[2]))
     try:
         span = Span(float(found[1]), float(found[2]), "log" if found[3] == "log" else "lin", whole)
     except ValueError:
-        raise wrong(argument, f"'{found[1]}:{found[2]}' are no two numbers", HOW) from None
+        raise refusal(argument, f"'{found[1]}:{found[2]}' are no two numbers", HOW) from None
     if not (math.isfinite(span.low) and math.isfinite(span.high) and span.low < span.high):
-        raise wrong(argument, f"from {span.low:g} to {span.high:g} is no range", "the lower end comes first")
+        raise refusal(argument, f"from {span.low:g} to {span.high:g} is no range", "the lower end comes first")
     if span.scale == "log" and span.low <= 0.0:
-        raise wrong(argument, "a logarithmic range cannot reach zero", "begin above zero, or write lin for equal steps")
+        raise refusal(argument, "a logarithmic range cannot reach zero", "begin above 0, or write lin for equal steps")
     if found[4] and not 2 <= int(found[4][:9]) <= MOST_CELLS:
-        raise wrong(argument, f"{found[4]} values make no range", f"give 2 to {MOST_CELLS}")
+        raise refusal(argument, f"{found[4]} values make no range", f"give 2 to {MOST_CELLS}")
     shares = np.linspace(0.0, 1.0, int(found[4])).tolist() if found[4] else []
     return Axis(argument, path, tuple(dict.fromkeys(map(span.at, shares))), span)
 
@@ -261,7 +256,7 @@ def _parsed(axis: Axis, value: str, read: Document) -> _Parsed:
         override = parse(f"{axis.path}={value}", {"cases": read.experiment.cases})
     except DocumentError as error:
         (problem,) = error.problems
-        raise wrong(axis.argument, problem.message, problem.hint.replace("--set ", "")) from None
+        raise refusal(axis.argument, problem.message, problem.hint.replace("--set ", "")) from None
     return override.path, override.value, override.case
 
 

@@ -16,7 +16,7 @@ from typing import Final, Self
 
 import msgspec
 
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import refusal
 from experiments.sweep.runs import Figures, WorkResult
 
 RUNS: Final = "runs.jsonl"
@@ -61,12 +61,14 @@ class Store:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._file = self._path.open("ab")
         except OSError as error:
-            raise _unusable(self._folder, f"cannot be written: {error.strerror}", "choose a place with --out") from None
+            raise refusal(
+                str(self._folder), f"cannot be written: {error.strerror}", "choose a place with --out"
+            ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._file.close()
-            raise _unusable(self._folder, "another sweep is at work in it", "wait for it, or choose --out") from None
+            raise refusal(str(self._folder), "another sweep is at work in it", "wait for it, or choose --out") from None
         self._read()
         return self
 
@@ -117,7 +119,7 @@ class Store:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise _unusable(self._path, f"cannot be written: {error.strerror}", "make room, then go on") from None
+            raise refusal(str(self._path), f"cannot be written: {error.strerror}", "make room, then go on") from None
         self._keep(line)
 
     def _read(self) -> None:
@@ -136,7 +138,3 @@ class Store:
         key = (line.cell, line.code)
         self._runs.setdefault(key, {}).update({run.seed: run for run in line.runs})
         self._failed.setdefault(key, {}).update(line.failed)
-
-
-def _unusable(path: Path, message: str, hint: str) -> DocumentError:
-    return DocumentError([Problem(str(path), 0, 0, message, hint)])

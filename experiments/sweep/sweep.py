@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Final
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, load
+from experiments.file.problems import refusal
 from experiments.recording.run_folder import RUNS
 from experiments.sweep import table
-from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of, wrong
+from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of
 from experiments.sweep.runs import Figures, code_of
 from experiments.sweep.store import Store, StoreOrigin
 from experiments.sweep.table import CellRow
@@ -97,10 +98,10 @@ def sweep(
     read = load(file, *settings)
     axes, words = arguments(given)
     if "tuning" in words:
-        raise wrong(words["tuning"], "there is nothing to tune", 'add --optimize "messages, iae<=1.01"')
+        raise refusal(words["tuning"], "there is nothing to tune", 'add --optimize "messages, iae<=1.01"')
     for axis in axes:
         if not axis.values:
-            raise wrong(axis.argument, "how many values?", f"write {axis.argument}12; only --optimize needs no number")
+            raise refusal(axis.argument, "how many values?", f"write {axis.argument}12; --optimize needs no number")
     seeds = seeds_of(words.get("seeds"), read.experiment.seed)
     plan = cells(read, str(file), settings, axes, cases)
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")

@@ -161,16 +161,16 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     Raises:
         DocumentError: If there is none, or a name means none.
     """
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
 
     known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}
     for name in only:
         if name not in known:
             hint = f"there are: {', '.join(sorted(known))}"
-            raise DocumentError([Problem(f"--on {name}", 0, 0, "is neither a host nor a tag", hint)])
+            raise refusal(f"--on {name}", "is neither a host nor a tag", hint)
     if not hosts:
         hint = 'add one: [hosts.lab1] with address = "user@machine" and robots = ["..."]'
-        raise DocumentError([Problem("[hosts]", 0, 0, "the experiment has no hosts: all robots run here", hint)])
+        raise refusal("[hosts]", "the experiment has no hosts: all robots run here", hint)
     return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
 
 

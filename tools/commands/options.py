@@ -181,7 +181,7 @@ def session(
 def check_bodies(bodies: str | None) -> None:
     """Raises DocumentError for a word behind `--bodies` that there is not."""
     from experiments.definition.bodies import BODIES
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
 
     if bodies not in (None, *BODIES):
-        raise DocumentError([Problem(f"--bodies {bodies}", 0, 0, "is not known", f"there are: {', '.join(BODIES)}")])
+        raise refusal(f"--bodies {bodies}", "is not known", f"there are: {', '.join(BODIES)}")

@@ -79,11 +79,11 @@ def report(
 
 def _refuse_labels(labels: Sequence[str], runs: Sequence[str]) -> None:
     """Raise DocumentError unless each run has a label."""
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
 
     if len(labels) != len(runs):
         message = f"{len(labels)} labels for {len(runs)} runs"
-        raise DocumentError([Problem("--label", 0, 0, message, "give one for each run, in their order")])
+        raise refusal("--label", message, "give one for each run, in their order")
 
 
 def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:

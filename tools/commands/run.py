@@ -75,7 +75,7 @@ def run(
     ] = None,
 ) -> int:
     """Run an experiment: one process per robot, or in virtual time; a bundle repeats its run."""
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording import bundle
     from experiments.recording.run_folder import RunOrigin
@@ -99,7 +99,7 @@ def run(
         return _run(origin, options, show)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
         hint = "unpack it, and run its experiment file with other options"
-        raise DocumentError([Problem(file, 0, 0, "a bundle repeats its own run, and takes no options of it", hint)])
+        raise refusal(file, "a bundle repeats its own run, and takes no options of it", hint)
     return _repeat(origin, show, lab, identity)
 
 
@@ -233,14 +233,14 @@ def _report_failures(runs: Sequence[Run]) -> int:
 
 def _refuse_view(show: _Shown, *, virtual: bool, seeds: int) -> None:
     """Raise DocumentError for a view that there cannot be, before anything is started."""
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
 
     if show.pace is not None and not (virtual and show.view):
-        raise DocumentError([Problem("--pace", 0, 0, "is for --virtual --view", "add both, or leave it out")])
+        raise refusal("--pace", "is for --virtual --view", "add both, or leave it out")
     if show.view:
         viewing.require_viser()
         if seeds > 1:
-            raise DocumentError([Problem("--seeds", 0, 0, "one run is viewed", "leave out --view or --seeds")])
+            raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
 def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch) -> list[Run]:
@@ -304,14 +304,14 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
 
 def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
     """Raises DocumentError for options that do not go together."""
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
 
     if seeds > 1 and not virtual:
-        raise DocumentError([Problem("--seeds", 0, 0, "needs --virtual", "in real time, run once per --seed")])
+        raise refusal("--seeds", "needs --virtual", "in real time, run once per --seed")
     check_bodies(options.bodies)
     for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
-            raise DocumentError([Problem(option, 0, 0, "is for real time", "leave out --virtual")])
+            raise refusal(option, "is for real time", "leave out --virtual")
 
 
 def sound(read: Document, *, seeds: int, as_json: bool) -> bool:

@@ -124,14 +124,14 @@ def defaults(experiment: Experiment) -> list[str]:
 def _kinds(given: Sequence[str]) -> list[str]:
     """The kinds that were asked for, all without any."""
     from agents.plugins.registry import did_you_mean
-    from experiments.file.problems import DocumentError, Problem
+    from experiments.file.problems import refusal
     from tools.reliability.fault_script import KINDS
 
     words = [word for part in given for word in part.split(",") if word]
     for word in words:
         if word not in KINDS:
             hint = f"{did_you_mean(word, KINDS)} there are: {', '.join(KINDS)}"
-            raise DocumentError([Problem(f"--kinds {word}", 0, 0, "no such fault", hint)])
+            raise refusal(f"--kinds {word}", "no such fault", hint)
     return words or list(KINDS)
 
 

@@ -26,7 +26,7 @@ from experiments.definition import endpoints as reach
 from experiments.definition.bodies import choose_bodies
 from experiments.definition.experiment import Experiment
 from experiments.file.document import Document, chosen
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import refusal
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import Emergency
@@ -105,7 +105,7 @@ def embody(read: Document, staging: RunOptions) -> dict[str, Experiment]:
     """
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
-        raise DocumentError([Problem("--bodies protocol", 0, 0, "protocol twins cannot be seen from hosts", hint)])
+        raise refusal("--bodies protocol", "protocol twins cannot be seen from hosts", hint)
     embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
     if staging.here:
         embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
@@ -219,7 +219,7 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
             stop = lab_options(other.endpoints[0]) if len(other.endpoints) == 1 else mesh_file
             what = f"{', '.join(taken)} ({me.robots[taken[0]]}) is in another run, {other.words}"
             hint = f"end that one first: Ctrl-C in its terminal (pid {other.pid}), or `./zenpark estop {stop}`"
-            raise DocumentError([Problem(file, 0, 0, what, hint)])
+            raise refusal(file, what, hint)
         if same := sorted(me.robots.keys() & other.robots.keys()):
             notes.append(f"another run is up with robots of these names ({', '.join(same)}): {other.words}")
     return notes

@@ -38,7 +38,7 @@ from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, refusal
 from experiments.real_time.processes.joining import Launch, joined
 
 REPORT_S: Final = 1.0
@@ -208,7 +208,7 @@ def serve(launch: Launch) -> int:
     guided = Plan(experiment).guided
     if not guided:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
-        raise DocumentError([Problem(launch.file, 0, 0, "every robot of this experiment decides for itself", hint)])
+        raise refusal(launch.file, "every robot of this experiment decides for itself", hint)
     over = threading.Event()
     with joined(
         experiment,

@@ -31,7 +31,7 @@ from agents.runtime.lifeline import Lifeline
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import structure
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, refusal
 from experiments.real_time.processes.joining import Launch
 from twins.devices.device import Device, DeviceRequest, Faults
 
@@ -121,7 +121,7 @@ def stand_in(launch: TwinLaunch) -> int:
     known = registry.names(registry.DEVICES)
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
-        raise DocumentError([Problem(launch.file, 0, 0, f"{', '.join(names)} cannot share a protocol twin", hint)])
+        raise refusal(launch.file, f"{', '.join(names)} cannot share a protocol twin", hint)
     request = DeviceRequest(
         bodies.body_request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults)
     )
@@ -154,7 +154,7 @@ def by_hand(
     word = f"{kind}-twin"
     if word not in (known := registry.names(registry.DEVICES)):
         hint = registry.did_you_mean(kind, [name.removesuffix("-twin") for name in known])
-        raise DocumentError([Problem(f"zenpark twin {kind}", 0, 0, "there is no such protocol twin", hint)])
+        raise refusal(f"zenpark twin {kind}", "there is no such protocol twin", hint)
     hover = 0.8 if KINDS[kind].flies else None
     robots = {
         f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings)

@@ -43,7 +43,7 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import chosen_case
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, refusal
 from experiments.real_time.processes import joining
 from experiments.real_time.processes.joining import Launch
 
@@ -94,7 +94,7 @@ def fly(launch: RobotLaunch) -> int:
         unknown = [name for name in names if name not in experiment.robots]
         if unknown:
             hint = registry.did_you_mean(unknown[0], experiment.robots)
-            raise DocumentError([Problem(file, 0, 0, f"no robot '{unknown[0]}' in this experiment", hint)])
+            raise refusal(file, f"no robot '{unknown[0]}' in this experiment", hint)
         endpoints = router_endpoints(experiment, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
         return _run(experiment, launch, endpoints)
 
@@ -143,7 +143,7 @@ def read_experiment(fd: int = 0, limit_s: float = EXPERIMENT_S) -> str:
         if not data:
             break
     hint = "a robot with FILE - reads the experiment there, as JSON in one line"
-    raise DocumentError([Problem("standard input", 0, 0, f"no experiment came within {limit_s:g} s", hint)])
+    raise refusal("standard input", f"no experiment came within {limit_s:g} s", hint)
 
 
 def _ranging(robot: Robot) -> Ranging:

@@ -27,7 +27,7 @@ from agents.plugins import registry
 from agents.runtime import command_line
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
-from experiments.file.problems import DocumentError, Problem
+from experiments.file.problems import DocumentError, refusal
 from experiments.real_time.processes.joining import Launch, joined
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
@@ -203,7 +203,7 @@ def serve(launch: WorldLaunch) -> int:
     robots = experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
         hint = 'give robots `body = "world"` (or start it all with `./zenpark run FILE --bodies world`)'
-        raise DocumentError([Problem(launch.file, 0, 0, "no robot of this experiment lives in a world", hint)])
+        raise refusal(launch.file, "no robot of this experiment lives in a world", hint)
     if launch.engine is not None:
         changed = msgspec.structs.replace(experiment.world, engine=launch.engine)
         experiment = msgspec.structs.replace(experiment, world=changed)
