@@ -55,12 +55,9 @@ def number_faults(value: object, path: Path = ()) -> Iterator[Fault]:
         yield Fault(path, f"'{_name(path)}' has more digits than a 64-bit integer holds", "give a smaller number")
 
 
-def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment, path: Path = ()) -> list[Fault]:
-    """All faults of type, range and key; empty if `msgspec.convert` takes the document.
-
-    A part of one may be looked at by itself: `path` is where it stands in the whole.
-    """
-    found = _table(document, struct, path)
+def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experiment) -> list[Fault]:
+    """All faults of type, range and key; empty if `msgspec.convert` takes the document."""
+    found = _table(document, struct, ())
     strayed = {str(fault.path[-1]) for fault in found if "belongs at the top" in fault.hint}
     return [
         fault for fault in found if fault.path or not any(f"'{key}' is missing" == fault.message for key in strayed)
@@ -309,14 +306,13 @@ def _in(path: Path) -> str:
 OBJECT: Final = "write an object, '{\"name\": value}'"
 
 
-def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = None, path: Path = ()) -> dict[str, Any]:
+def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = None) -> dict[str, Any]:
     """JSON object of a command-line flag.
 
     Args:
-        flag: Such as "--obstacle".
+        flag: Such as "--faults".
         text: Its value.
         struct: Its type; None: any object.
-        path: Where it would stand in an experiment file, if it could.
 
     Raises:
         DocumentError: If it is no JSON, no object, or not what it must be.
@@ -329,7 +325,7 @@ def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = Non
         raise refusal(place, f"is not JSON: {why}", OBJECT) from None
     if not isinstance(value, dict):
         raise refusal(place, "is no JSON object", OBJECT)
-    found = [] if struct is None else faults(value, struct, path)
+    found = [] if struct is None else faults(value, struct)
     if found:
         raise DocumentError([Problem(place, 0, 0, fault.message, fault.hint) for fault in found])
     return value

@@ -23,6 +23,7 @@ from agents.arrays import Array
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.report.style import INK, PAPER
+from experiments.scene.models import circle
 from twins import scene as outlines
 from twins.scene import Scene
 
@@ -176,8 +177,7 @@ def _ring(scene: Scene, k: int, pose: Array) -> Array:
     outline = scene.outline[k]
     if outline is not None:
         return outlines.corners(outline, pose)
-    angle = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
-    return np.asarray(pose[:2] + scene.radius[k] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return np.asarray(pose[:2] + circle(float(scene.radius[k]), ROUND))
 
 
 def _loop(axes: Axes3D, ring: Array, z: float = 0.0, **style: object) -> None:

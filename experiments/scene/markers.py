@@ -11,6 +11,7 @@ from agents.network.messages import Vector
 from experiments.definition.experiment import Experiment
 from experiments.recording.ros2.viewers import CYLINDER, LINE_LIST, LINE_STRIP, TEXT, Draw, Marker
 from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, Stage, link_colours
+from twins.scene import corners
 
 EDGE: Final = (90, 94, 102)
 OBSTACLE: Final = (168, 172, 180)
@@ -57,15 +58,14 @@ def _robots(stage: Stage) -> list[Marker]:
 
 def _obstacles(stage: Stage, since: float) -> list[Marker]:
     scene, made = stage.scene, []
-    for number, pose in enumerate(scene.at(since).tolist()):
+    for number, pose in enumerate(scene.at(since)):
         low, high = float(scene.bottom[number]), min(float(scene.top[number]), HIGH_M)
         outline = scene.outline[number]
         if outline is None:
-            wide, at = 2.0 * float(scene.radius[number]), (pose[0], pose[1], 0.5 * (low + high))
+            wide, at = 2.0 * float(scene.radius[number]), (float(pose[0]), float(pose[1]), 0.5 * (low + high))
             made.append(Marker("obstacles", CYLINDER, (wide, wide, high - low), OBSTACLE, 0.85, position=at))
             continue
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        ring = [(pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y) for x, y in outline.tolist()]
+        ring = corners(outline, pose).tolist()
         if scene.closed[number]:
             ring.append(ring[0])
         points = [(x, y, z) for (ax, ay), (bx, by) in pairwise(ring)

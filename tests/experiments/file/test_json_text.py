@@ -7,8 +7,6 @@ from experiments.file.structure import OBJECT, parse_object
 from twins.devices.device import Faults
 from twins.scene import Obstacle
 
-PLACE = ("arena", "obstacles", "box")
-
 
 def test_an_object_is_read():
     assert parse_object("--device", '{"rc_hz": 20.0}') == {"rc_hz": 20.0}
@@ -24,15 +22,11 @@ def test_an_object_is_read():
         ('{"radius": }', f"is not JSON: invalid character (byte 11)\n  {OBJECT}"),
         ("[" * 6000, f"is not JSON: maximum recursion depth exceeded while deserializing an object\n  {OBJECT}"),
         ('{"radius": -1}', "'radius' must be a number > 0, not -1\n  of a cylinder [m]"),
-        (
-            '{"radius": 0.1, "plan": "dance"}',
-            "no 'dance' among the planners\n  known: circle, hold, lemniscate, line, waypoints",
-        ),
     ],
 )
 def test_what_is_wrong_is_said_with_the_remedy(text, why):
     with pytest.raises(DocumentError) as refused:
-        parse_object("--obstacle", text, Obstacle, PLACE)
+        parse_object("--obstacle", text, Obstacle)
     assert str(refused.value).endswith(f": {why}")
     assert str(refused.value).startswith("--obstacle ")
 
