@@ -21,6 +21,7 @@ Wait = Annotated[float, Meta(gt=0, le=60)]
 # second of cflib's maintainers (issue 258), with which a queue on board grows to seconds
 PACKETS_PER_RADIO: Final = 250.0
 MEASURED_SHARE: Final = 0.7  # of the measured exchanges per second: full packets are slower than those without content
+SETPOINT_PACKETS: Final = 2  # of one setpoint, each of which is answered: its trajectory, and the start of that
 DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
     re.compile(r"radio://[0-9A-Za-z]+/([0-9]|[1-9][0-9]|1[01][0-9]|12[0-5])/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?(\?.*)?"),
@@ -61,9 +62,7 @@ class Outside(Part, frozen=True, tag_field="system", tag="external"):
 class CrazyflieSettings(Part, frozen=True):
     """CrazyflieSettings of one Crazyflie."""
 
-    # `position` and `velocity` stream setpoints, `high-level` sends the planner on board to each new goal
-    control: Literal["position", "velocity", "high-level"] = "position"
-    stream_hz: Rate = 20.0  # rate of streamed setpoints
+    stream_hz: Rate = 10.0  # largest rate of setpoints
     log_hz: Rate = 20.0  # rate of the pose; a log period is a multiple of 10 ms
     status_hz: Rate = 5.0  # rate of battery and supervisor
     multiranger: bool = False  # has a Multi-ranger deck
@@ -85,12 +84,15 @@ class CrazyflieSettings(Part, frozen=True):
     @property
     def up_hz(self) -> float:
         """Packets per second to the drone."""
-        return self.stream_hz + (self.positioning.rate_hz if isinstance(self.positioning, Outside) else 0.0)
+        return SETPOINT_PACKETS * self.stream_hz + (
+            self.positioning.rate_hz if isinstance(self.positioning, Outside) else 0.0
+        )
 
     @property
     def down_hz(self) -> float:
         """Packets per second from the drone."""
-        return self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
+        ranges_hz = self.ranges_hz if self.multiranger else 0.0
+        return self.log_hz + self.status_hz + ranges_hz + SETPOINT_PACKETS * self.stream_hz
 
     @property
     def packets_hz(self) -> float:

@@ -13,12 +13,16 @@ from struct import Struct
 from typing import Final
 
 VERSION: Final = 12  # the first with a supervisor port
+RELATIVE_YAW: Final = 10  # the first with `HighLevel.START_2`
 PARAM_READ, PARAM_WRITE = 1, 2  # channels of `Port.PARAM`
 NULL: Final = (15, 3)  # port and channel of a packet without content
 VERSIONS: Final = 1  # channel of `Port.PLATFORM` on which a drone says its versions,
 FIRMWARE: Final = 1  # and the question for that of its firmware, which is a text such as "2025.02"
 MTU: Final = 30  # [bytes] of payload
-TRAJECTORIES: Final = 10  # that may be defined
+TRAJECTORIES: Final = 10  # that may be defined,
+IN_MEMORY: Final = 1  # in their only place,
+UNCOMPRESSED, COMPRESSED = 0, 1  # of these kinds
+MEMORY_WRITE: Final = 2  # channel of `Port.MEMORY`
 GREETING: Final = b"Bitcraze Crazyflie".ljust(MTU, b"\0")  # how a Crazyflie is told from a boot loader
 LOG_PAYLOAD: Final = 26  # [bytes] of values in one packet of a log block
 LOG_BLOCKS: Final = 16

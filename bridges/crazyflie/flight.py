@@ -1,8 +1,7 @@
 """Flight phases of one Crazyflie: take-off, setpoints, landing and stop, in the order that the firmware requires.
 
-Take-offs and landings are computed by the planner on board. Between them setpoints are streamed by default: without
-setpoints the firmware levels out after 0.5 s and cuts the motors after 2 s: no failure here leaves a robot in the air.
-While the radio stutters, the planner on board holds the place instead: then no gap cuts the motors.
+Take-off and setpoints are trajectories that end on the floor (`trajectory`): no failure here leaves a robot in the air,
+and none cuts its motors there. The order to land replaces them by the firmware's own landing, which stops the motors.
 
 Flags of the supervisor, not answers to commands, tell whether a drone flies: answers may be lost, or wait behind logs.
 """
@@ -16,19 +15,19 @@ from enum import Enum
 from typing import Final
 
 from agents.body.interface import UNANSWERED
-from agents.body.kinds import CRAZYFLIE
-from agents.protocols.crazyflie import CrazyflieSettings
+from agents.protocols.crazyflie import SETPOINT_PACKETS, CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, Status
 from bridges.crazyflie.link import CrazyflieLink
 from bridges.crazyflie.telemetry import Telemetry
+from bridges.crazyflie.trajectory import HOLD_S, SINK, Target
 
-CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
-GENTLE: Final = 0.15  # [m/s] mean speed of a landing after a gap of the radio: never 0.5 m/s, at the floor neither
+CLIMB: Final = 0.4  # [m/s] mean speed of take-offs
+DESCENT: Final = 0.2  # [m/s] mean speed of landings: never 0.5 m/s
+FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone lags behind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 LONGEST_S: Final = 8.0  # duration of a landing, which others wait 15 s for
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
-SETPOINT_EVERY: Final = 3  # tries: no setpoint for longer than 0.45 s
 ARMING_S: Final = 4.0  # motors that are checked one by one take seconds
 STOPPING_S: Final = 2.0  # after a stop, a Crazyflie that does not report "locked" still reports "flying" for so long
 ANSWER_S: Final = 2.5  # the note reports an emergency stop that is unconfirmed for longer
@@ -36,20 +35,15 @@ POLL_S: Final = 0.02
 FRESH_S: Final = 1.0  # an older status is ignored
 LOOP_SILENCE_S: Final = 1.0  # in flight, the robot's loop must command at least this often
 FLYING_FLAG_S: Final = 3.0  # from a take-off to the flag "flying" in the status
-MOVED: Final = 0.01  # [m] goals closer to the last one are not sent to the planner
-TURNED: Final = math.radians(2.0)
-STUTTER_S: Final = 0.2  # a gap of the radio that is longer hands over to the planner on board,
-STEADY_S: Final = 2.0  # which holds the place until no gap was so long for this time
 LANDING_GAP_S: Final = 0.8  # after a longer gap the drone is landed: it has flown without control
-STUTTERING_S, MOST_GAPS = 10.0, 4  # with more gaps in this time the drone is landed: it would hover out of reach next
+REFRESH_S: Final = 0.25  # a setpoint that does not change is sent again after this
+PERIODS: Final = 2.5  # for so many periods of setpoints, and for `HOLD_S`, the last one is held
+MARGIN_S: Final = 2.0  # a drone that nothing reaches is down so long after its trajectory has reached the floor
 HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignored
 AGAIN_S: Final = 3.0  # a landing that takes longer than planned by this is ordered again
-PEAK: Final = 35.0 / 16.0  # maximum / mean speed of the planner's polynomial from rest to rest
-SHORTEST_GO_TO_S: Final = 0.5
 
 ANSWERS: Final[dict[int, str]] = {Status.BUSY: "not armed, or locked", Status.REFUSED: "its planner is busy"}
 
-Target = tuple[float, float, float, float]
 Pause = Callable[[float], None]
 
 
@@ -79,12 +73,13 @@ class Flight:
         self._target: Target | None = None
         self._commanded_at = math.inf
         self._since = -math.inf
-        self._sent = -math.inf
-        self._goal: Target | None = None
-        self._held_since = -math.inf  # last gap after which the planner on board was given the drone
-        self._descent = CLIMB  # mean speed of the next landing [m/s]
-        self._gaps: list[float] = []  # end of each gap of the last seconds [s]
-        self._span = 0.0  # duration of the landing [s]
+        self._due = -math.inf  # next setpoint [s]
+        self._sent: Target | None = None  # last setpoint,
+        self._sent_at = -math.inf  # [s]
+        self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
+        self._top: Target | None = None  # end of the climb, held until the first setpoint
+        self._hold = max(HOLD_S, PERIODS / settings.stream_hz)  # [s]
+        self._span = 0.0  # duration of the take-off or landing [s]
 
     @property
     def airborne(self) -> bool:
@@ -107,19 +102,25 @@ class Flight:
         """Climb to `height` [m] above the ground here; on refusal, `trouble` gives the reason."""
         if self.airborne:
             return
-        self._held_since, self._descent = -math.inf, CLIMB
         self.trouble = self.takeoff_refusal() or self._arm()
         if self.trouble:
             return
-        self._end_streaming()
-        self._target, self._goal = None, None
-        span = max(height / CLIMB, SHORTEST_S)
+        for _ in range(3):  # without answer: low-level setpoints of another program would mute the planner
+            self.link.cf.commander.send_notify_setpoint_stop()
+            self._pause(POLL_S)
+        x, y, z = self._telemetry.position.tolist()
+        place = x, y, z, self._telemetry.yaw
+        self._span = max(height / CLIMB, SHORTEST_S)
+        climb = height, self._span
+        self._target, self._top = None, (x, y, height, place[3])
         self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
-        answer = self._command_planner(HighLevel.TAKEOFF, lambda: self._planner.takeoff(height, span, yaw=None))
+        trajectories = self.link.trajectories
+        answer = self._command_planner(
+            trajectories.start_command, lambda: trajectories.climb(place, climb, self._hold), Info.PLANNER_ACTIVE
+        )
+        self._plan_end(time.monotonic() + self._span, height)
         if answer is None or answer == Status.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
-        if answer == Status.REFUSED and self._telemetry.info & (Info.PLANNER_ACTIVE | Info.FLYING):
-            return  # the reply to the first of two commands was lost
         self._enter(Phase.GROUND)
         self.trouble = f"take-off refused: {ANSWERS.get(answer, f'error {answer}')}"
 
@@ -129,14 +130,12 @@ class Flight:
             self._enter(Phase.FLYING)
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
-        self._land(self._descent)
+        self._land()
 
-    def _land(self, speed: float) -> None:
-        span = min(max(float(self._telemetry.position[2]) / speed, SHORTEST_S), LONGEST_S)
-        if not math.isfinite(span):
-            span = SHORTEST_S
-        self._command_planner(HighLevel.LAND, lambda: self._planner.land(0.0, span, yaw=None))
-        self._end_streaming()  # after the command: an idle planner without setpoints stops the motors
+    def _land(self) -> None:
+        height = float(self._telemetry.position[2]) - FLOOR
+        span = max(min(LONGEST_S, height / DESCENT), SHORTEST_S)  # an unknown height is a large one
+        self._command_planner(HighLevel.LAND, lambda: self._planner.land(FLOOR, span, yaw=None))
         self._enter(Phase.LANDING)
         self._span = span
 
@@ -161,7 +160,7 @@ class Flight:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
         if self.phase is Phase.LANDING and now - self._since > self._span + AGAIN_S and self._flying:
-            self._land(self._descent)  # a gap took the order
+            self._land()  # a gap took the order
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
@@ -170,51 +169,31 @@ class Flight:
             return
         self._stream(now)
 
-    def keep_flying(self, now: float, link: CrazyflieLink) -> None:
-        """Stream the last setpoint over a link that is still being set up: the firmware does not wait for that."""
-        if self.phase is Phase.FLYING:
-            self.link = link
-            self._stream(now)
-
     def _stream(self, now: float) -> None:
-        """Send the setpoint, if due."""
+        """Send the setpoint, if due; while the drone has none, the end of its climb."""
         target = self._target
-        if self.link.busy or now - self._held_since < STEADY_S:
+        if target is None and now - self._since > self._span:
+            target = self._top
+        if target is None or now < self._due or self.link.busy:
             return
-        if target is None or now - self._sent < 1.0 / self._settings.stream_hz - 0.5 * POLL_S:
-            return
-        self._sent = now
-        if self.phase is Phase.CLIMBING:
+        if self._target is not None and self.phase is Phase.CLIMBING:
             self._enter(Phase.FLYING)
-        x, y, z, yaw = target
-        if self._settings.control == "position":
-            self.link.cf.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
-        elif self._settings.control == "velocity":
-            self._send_velocity(target)
-        elif self._goal is None or math.dist(self._goal[:3], target[:3]) > MOVED or abs(self._goal[3] - yaw) > TURNED:
-            far = math.dist(self._telemetry.position.tolist(), target[:3])
-            span = max(PEAK * far / CRAZYFLIE.speed, SHORTEST_GO_TO_S)
-            self._goal = target
-            self._planner.go_to(x, y, z, yaw, span)
+        if target == self._sent and now - self._sent_at < REFRESH_S:
+            return
+        packets = self.link.trajectories.hold(target, self._hold)
+        self._sent, self._sent_at = target, now
+        self._due = now + packets / (SETPOINT_PACKETS * self._settings.stream_hz) - 0.5 * POLL_S
+        self._plan_end(now, target[2])
 
-    def hold_after_gap(self, gap: float) -> None:
-        """Give the drone to the planner on board after a gap of the radio of `gap` [s], or land it after a long one."""
-        if self.phase not in (Phase.CLIMBING, Phase.FLYING):
-            return
-        now = time.monotonic()
-        self._gaps = [at for at in self._gaps if now - at < STUTTERING_S] + [now]
-        if gap > LANDING_GAP_S or len(self._gaps) > MOST_GAPS:
-            many = f"{len(self._gaps)} gaps of the radio in {STUTTERING_S:g} s"
-            self.trouble = f"landed: no radio for {gap:.1f} s" if gap > LANDING_GAP_S else f"landed: {many}"
-            self._descent = GENTLE
+    def _plan_end(self, since: float, height: float) -> None:
+        """Note when a trajectory that holds a height [m] since a time [s] has reached the floor."""
+        self._down_at = since + self._hold + max(height, 0.0) / SINK + MARGIN_S
+
+    def land_after_gap(self, gap: float) -> None:
+        """Land after a gap of the radio, or of the process, of `gap` [s], if it was long."""
+        if gap > LANDING_GAP_S and self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self.trouble = f"landed: no radio for {gap:.1f} s"
             self.land()
-            return
-        target = self._target
-        if self.phase is Phase.FLYING and target is not None and self._settings.control != "high-level":
-            span = max(PEAK * math.dist(self._telemetry.position.tolist(), target[:3]) / CRAZYFLIE.speed, SHORTEST_S)
-            self._planner.go_to(*target, span if math.isfinite(span) else SHORTEST_S)
-            self._end_streaming()  # after the command: an idle planner without setpoints stops the motors
-        self._held_since = now
 
     def update_phase(self, now: float) -> None:
         """Update the phase from the drone's status at `now` on the monotonic clock [s]."""
@@ -247,13 +226,10 @@ class Flight:
             self.land()
 
     def mark_out_of_reach(self) -> None:
-        """Link lost for so long that the firmware has cut the motors, provided that setpoints were streamed."""
-        if self.airborne:
-            stopping = self.phase is Phase.STOPPING
-            held = self._held_since > self._sent or self._settings.control == "high-level"
-            alone = self.phase is Phase.CLIMBING or ((stopping or self.phase is Phase.FLYING) and held)
-            self.trouble = "out of reach: may still hover by itself" if alone else "out of reach: its motors are off"
-            if not (alone and stopping):  # else: the stop is sent as soon as the drone is in reach again
+        """Link lost; once what lies on board has ended on the floor, the drone counts as landed."""
+        if self.airborne and self.phase is not Phase.STOPPING:  # a stop is sent when the drone is in reach again
+            self.trouble = "out of reach: it lands by itself"
+            if time.monotonic() > self._down_at:
                 self._enter(Phase.GROUND)
 
     def resume(self) -> bool:
@@ -261,7 +237,6 @@ class Flight:
         if self.phase is Phase.STOPPING:
             return True
         if self._flying and self.phase is not Phase.STOPPED:
-            self._descent = GENTLE
             if not self.airborne:
                 self._enter(Phase.FLYING)
             return True
@@ -313,35 +288,21 @@ class Flight:
             self._pause(POLL_S)
         return ""
 
-    def _command_planner(self, command: HighLevel, send: Callable[[], None]) -> int | None:
-        """Send a high-level command until the drone replies; returns the code of the reply, or None."""
+    def _command_planner(self, command: HighLevel, send: Callable[[], None], flag: int = 0) -> int | None:
+        """Send a high-level command until the drone replies; returns the code of the reply, or None.
+
+        `flag`: of the status, which stands for a reply.
+        """
         before, _ = self.link.planner_reply(command)
-        for attempt in range(TRIES):
-            if self.phase is Phase.FLYING and attempt % SETPOINT_EVERY == 0:
-                self._sent = -math.inf
-                self._stream(time.monotonic())  # else the firmware levels out, and cuts the motors before it replies
-            send()  # after the setpoint: a setpoint makes the planner forget its plan
+        begin = time.monotonic()
+        for _ in range(TRIES):
+            send()
             deadline = time.monotonic() + REPLY_S
             while time.monotonic() < deadline:
                 self._pause(0.25 * POLL_S)
                 count, code = self.link.planner_reply(command)
                 if count > before:
                     return code
+                if self._telemetry.info & flag and self._telemetry.status_time > begin:
+                    return None
         return None
-
-    def _end_streaming(self) -> None:
-        """Announce the end of setpoints to the firmware; sent three times, because there is no reply."""
-        for _ in range(3):
-            self.link.cf.commander.send_notify_setpoint_stop()
-            self._pause(POLL_S)
-
-    def _send_velocity(self, target: Target) -> None:
-        """Send the velocity toward a position, by the law of the firmware's own position controller."""
-        telemetry, limit = self._telemetry, CRAZYFLIE.speed
-        here = telemetry.position.tolist()
-        if not all(map(math.isfinite, here)):
-            return
-        v = [CRAZYFLIE.response * (there - at) for there, at in zip(target[:3], here, strict=True)]
-        v = [min(max(speed, -limit), limit) for speed in v]
-        turn = CRAZYFLIE.turn_response * math.remainder(target[3] - telemetry.yaw, 2.0 * math.pi)
-        self.link.cf.commander.send_velocity_world_setpoint(*v, math.degrees(turn))

@@ -21,14 +21,15 @@ from agents.body.interface import BodyError
 from agents.protocols import crtp
 from agents.protocols.crazyflie import dongle_of
 from agents.protocols.crazyradio import software
-from agents.protocols.crtp import Port
+from agents.protocols.crtp import HighLevel, Memory, Port
 from bridges.crazyflie.dongle import plug_in
+from bridges.crazyflie.trajectory import PLACES, PromptRadio, Trajectories
 
 FIRST_S: Final = 0.6  # to the first packet; cflib never repeats its first two requests
 SILENCE_S: Final = 1.0  # between two answers while the connection is set up
 ANSWER_S: Final = 3.0  # to the answer about a parameter
 REPEAT_S: Final = 0.3  # a question about a parameter is repeated after this
-BUSY_S: Final = 0.1  # gap after which a packet that waits is not being sent
+BUSY_S: Final = 0.1  # no packet is handed to a radio that has been silent for longer: it would be sent after the gap
 POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never before `Link.gap` has told
 JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
@@ -133,6 +134,7 @@ class CrazyflieLink:
         self._blocks: dict[str, Any] = {}
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
+        self.trajectories = Trajectories(self._send)
         cf = self.cf = Crazyflie()
         cf._toc_cache = _tables()
         cf.link_statistics.start = lambda: None  # its pings cost ten packets a second, and its thread can join itself
@@ -145,6 +147,7 @@ class CrazyflieLink:
         cf.add_port_callback(int(Port.HIGH_LEVEL), self._reply)
         cf.add_port_callback(int(Port.PLATFORM), self._note_firmware)
         cf.add_port_callback(int(Port.PARAM), self._note_parameter)
+        cf.add_port_callback(int(Port.MEMORY), self._note_memory)
 
     @property
     def answered(self) -> bool:
@@ -168,14 +171,11 @@ class CrazyflieLink:
 
     @property
     def busy(self) -> bool:
-        """Whether a packet waits for a radio that is silent: one more would block the sender until the gap is over."""
-        waiting = getattr(self.cf.link, "out_queue", None)
-        return waiting is not None and self.gap > BUSY_S and bool(waiting.full())
+        """Whether a radio is silent, or was since the last `take_gap`: a packet would wait for the end of the gap."""
+        return self.is_radio and max(self.gap, self._longest_gap) > BUSY_S
 
-    def open(self, deadline: float, end: threading.Event, meanwhile: Callable[[CrazyflieLink], None]) -> None:
+    def open(self, deadline: float, end: threading.Event) -> None:
         """Connect; give up at `deadline` on the monotonic clock [s], or at `end`.
-
-        `meanwhile` is called again and again once packets are exchanged.
 
         Raises:
             SilentError: If no answer comes, answers cease, or safelink is missing.
@@ -185,6 +185,7 @@ class CrazyflieLink:
         self.cf.open_link(self.address)
         if self.cf.link is not None and self.is_radio:
             self.cf.link.link_error_callback = None  # a packet that finds no room for 2 s would end the link
+            self.cf.link._thread._radio = PromptRadio(self.cf.link._thread._radio)
         while not self._connected.wait(0.02):
             now = time.monotonic()
             if self._error is not None:
@@ -198,8 +199,6 @@ class CrazyflieLink:
                 raise SilentError("no answer")
             if now > deadline or end.is_set():
                 raise LinkError("the connection was not set up in time")
-            if self._answered:
-                meanwhile(self)
 
     def has_variable(self, variable: str) -> bool:
         """Whether the firmware logs a variable."""
@@ -257,8 +256,6 @@ class CrazyflieLink:
         Raises:
             BodyError: If the firmware has no such parameter, or a read-only one.
         """
-        from cflib.crtp.crtpstack import CRTPPacket  # noqa: PLC0415
-
         element = self._parameter(parameter)
         if element is None:
             raise BodyError(f"the firmware has no parameter {parameter}: is the name right, the firmware new enough?")
@@ -266,12 +263,10 @@ class CrazyflieLink:
             raise BodyError(f"the parameter {parameter} cannot be set: it is read-only")
         self._parameters[element.ident] = parameter, element.pytype
         self._values.pop(parameter, None)
-        packet = CRTPPacket()
-        packet.set_header(int(Port.PARAM), crtp.PARAM_READ if value is None else crtp.PARAM_WRITE)
-        packet.data = crtp.IDENT.pack(element.ident)
+        data = crtp.IDENT.pack(element.ident)
         if value is not None:
-            packet.data += struct.pack(element.pytype, float(value) if element.pytype[-1] in "fde" else int(value))
-        self.cf.send_packet(packet)
+            data += struct.pack(element.pytype, float(value) if element.pytype[-1] in "fde" else int(value))
+        self._send(Port.PARAM, crtp.PARAM_READ if value is None else crtp.PARAM_WRITE, data)
 
     def parameter_answer(self, parameter: str) -> float | None:
         """Value of a parameter in the answer to the last `send_parameter`; None before it."""
@@ -301,18 +296,26 @@ class CrazyflieLink:
         return self.cf.param.toc.get_element(group, name)
 
     def _ask(self, parameter: str, value: float | None) -> float:
-        """Answer about a parameter; the question is repeated, since a drone may lose its answers in a gap."""
+        """Answer about a parameter."""
+        return self._repeat(
+            lambda: self.send_parameter(parameter, value),
+            lambda: self.parameter_answer(parameter),
+            f"the parameter {parameter}",
+        )
+
+    def _repeat(self, ask: Callable[[], None], answer: Callable[[], float | None], about: str) -> float:
+        """Answer to a question, which is repeated, since a drone may lose its answers in a gap."""
         deadline = time.monotonic() + ANSWER_S
         again = 0.0
-        while (answer := self.parameter_answer(parameter)) is None or again == 0.0:
+        while again == 0.0 or (answered := answer()) is None:
             now = time.monotonic()
             if now > deadline or self._error is not None:
-                raise LinkError(f"no answer about the parameter {parameter}")
+                raise LinkError(f"no answer about {about}")
             if now >= again:
                 again = now + REPEAT_S
-                self.send_parameter(parameter, value)
+                ask()
             time.sleep(0.005)
-        return answer
+        return answered
 
     def planner_reply(self, command: int) -> tuple[int, int]:
         """Number of replies to a high-level command so far, and the code of the last."""
@@ -320,11 +323,35 @@ class CrazyflieLink:
 
     def ask_firmware(self) -> None:
         """Ask for the version of the firmware; `firmware` has it when the answer has come."""
+        self._send(Port.PLATFORM, crtp.VERSIONS, bytes((crtp.FIRMWARE,)))
+
+    def define_trajectories(self) -> None:
+        """Tell the drone where its trajectories will be.
+
+        Raises:
+            BodyError: If the firmware cannot fly uploaded trajectories.
+            LinkError: If no answer comes.
+        """
+        memories = [memory.id for memory in self.cf.mem.mems if memory.type == Memory.TRAJECTORY]
+        if not memories:
+            raise BodyError("the firmware has no memory for trajectories: update it")
+        self.trajectories.memory = memories[0]
+        if self.cf.platform.get_protocol_version() < crtp.RELATIVE_YAW:
+            self.trajectories.start_command = HighLevel.START
+
+        def answer() -> int | None:
+            count, code = self.planner_reply(HighLevel.DEFINE)
+            return code if count >= len(PLACES) else None
+
+        if self._repeat(self.trajectories.define, answer, "trajectories"):
+            raise BodyError("the firmware refuses uploaded trajectories: update it")
+
+    def _send(self, port: Port, channel: int, data: bytes) -> None:
         from cflib.crtp.crtpstack import CRTPPacket  # noqa: PLC0415
 
         packet = CRTPPacket()
-        packet.set_header(int(Port.PLATFORM), crtp.VERSIONS)
-        packet.data = (crtp.FIRMWARE,)
+        packet.set_header(int(port), channel)
+        packet.data = data
         self.cf.send_packet(packet)
 
     def close(self) -> None:
@@ -375,6 +402,12 @@ class CrazyflieLink:
         name, packing = self._parameters.get(crtp.IDENT.unpack_from(data)[0], ("", ""))
         if name and len(data) >= begin + struct.calcsize(packing):
             self._values[name] = float(struct.unpack_from(packing, data, begin)[0])
+
+    def _note_memory(self, packet: Packet) -> None:
+        if packet.channel == crtp.MEMORY_WRITE:
+            number, address = crtp.MEMORY.unpack_from(packet.data)
+            if number == self.trajectories.memory:
+                self.trajectories.note_answer(address, packet.data[crtp.MEMORY.size])
 
     def _note_firmware(self, packet: Packet) -> None:
         if packet.data and packet.data[0] == crtp.FIRMWARE:

@@ -11,17 +11,17 @@ from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
-from bridges.crazyflie.flight import STUTTER_S, Flight, Phase, Target
+from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
+from bridges.crazyflie.trajectory import Target
 
 NO_ANSWER_S: Final = 2.4  # without any answer for so long, no Crazyflie is there
 RADIO_LOST_S: Final = 3.0  # without an answered poll the link is lost, and a new one is opened
 LOST_S: Final = 1.0  # likewise without a packet over UDP or USB
 LOGS_S: Final = 1.0  # after a longer gap the firmware has removed its log blocks
 LOGLESS_S: Final = 0.5  # without a log packet over a working link, the log blocks are created again
-LINK_GAP_S: Final = 2.0  # so long after a loss of the link, a drone that flew by streamed setpoints is down
 STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
 QUEUE_S: Final = 0.5  # poses that wait for longer, and not only for a moment, are too many: the rate of logs is halved
@@ -141,15 +141,13 @@ class CrazyfliePilot:
     # ------------------------------------------------------------------ the thread
 
     def _run(self) -> None:
-        lost = inf
         while not self._ending.is_set() or self._flight.airborne:
             try:
                 link = self._connect_in_turn()
             except LinkError as error:
                 self._connection_note = str(error)
                 self._fail(error)
-                if time.monotonic() - lost > LINK_GAP_S or self._ending.is_set():
-                    self._flight.mark_out_of_reach()
+                self._flight.mark_out_of_reach()
                 self._ending.wait(RETRY_S)
                 continue
             try:
@@ -162,7 +160,6 @@ class CrazyfliePilot:
                 self._fail(error)
                 self._ending.wait(RETRY_S)
             except Exception as error:  # noqa: BLE001 - of any kind: the robot must be landed
-                lost = time.monotonic()
                 what = str(error) if isinstance(error, LinkError) else f"{type(error).__name__}: {error}"
                 self._connection_note = f"link lost: {what}; connecting again"
                 self._fail(error)
@@ -208,7 +205,7 @@ class CrazyfliePilot:
         while True:
             link = CrazyflieLink(self._address)
             try:
-                link.open(begin + self._settings.connect_s, self._ending, self._keep_flying)
+                link.open(begin + self._settings.connect_s, self._ending)
             except SilentError as error:
                 answered = answered or link.answered
                 self._discard(link)
@@ -220,9 +217,6 @@ class CrazyfliePilot:
                 raise LinkError(f"{self._address}: {error}; {self._remedy()}") from None
             else:
                 return link
-
-    def _keep_flying(self, link: CrazyflieLink) -> None:
-        self._flight.keep_flying(time.monotonic(), link)
 
     def _remedy(self) -> str:
         if self._address.startswith("radio"):
@@ -249,6 +243,7 @@ class CrazyfliePilot:
         settings, telemetry = self._settings, self._telemetry
         telemetry.reset_status()
         self._slowed = False
+        link.define_trajectories()  # before answers wait behind logs
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
         link.ask_firmware()
@@ -365,8 +360,7 @@ class CrazyfliePilot:
         if now - self._late_since > LATE_S:
             self._late_since = now + SLOWING_S
             self._slowed = link.slow_logs() or self._slowed
-        if gap > STUTTER_S:
-            self._flight.hold_after_gap(gap)
+        self._flight.land_after_gap(gap)
 
     def _pause(self, seconds: float) -> None:
         """Wait in the middle of an order.

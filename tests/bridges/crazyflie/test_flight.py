@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED
+from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings
-from agents.protocols.crtp import Info
+from agents.protocols.crtp import HighLevel, Info, Port
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.telemetry import Board, Telemetry
+from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFF, Trajectories
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
-LEVELS_S = 0.5  # without a setpoint the firmware levels after this, and cuts the motors after 2 s
 
 
 class Air:
@@ -28,7 +29,11 @@ class Air:
         self.telemetry = Telemetry(self.board, 0, lighthouse=False)
         self.flight = Flight(CrazyflieSettings(**chosen), self.telemetry, self.pause)
         self.flight.link = types.SimpleNamespace(
-            cf=self, error=None, busy=False, planner_reply=lambda command: self.replies.get(command, (0, 0))
+            cf=self,
+            error=None,
+            busy=False,
+            planner_reply=lambda command: self.replies.get(command, (0, 0)),
+            trajectories=Trajectories(self.wire),
         )
         self.replies = {}
         self.supervisor = self.commander = self.high_level_commander = self
@@ -38,6 +43,14 @@ class Air:
         if what.startswith("_"):
             raise AttributeError(what)
         return lambda *_args, **_named: self.sent.append((self.now, what))
+
+    def wire(self, port, channel, data):
+        """Notes starts of trajectories, and confirms what is written."""
+        trajectories = self.flight.link.trajectories
+        if port == Port.MEMORY:
+            trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], 0)
+        elif data[0] == HighLevel.START_2:
+            self.sent.append((self.now, "climb" if data[5] == TAKEOFF else "setpoint"))
 
     def pause(self, seconds):
         self.now += seconds
@@ -68,15 +81,44 @@ def air(monkeypatch):
     return Air(monkeypatch).fly()
 
 
-def test_setpoints_go_on_while_a_landing_is_not_answered(air):
-    begin = air.now
+def test_a_landing_that_is_not_answered_is_ordered_again(air):
+    air.sent.clear()
     air.flight.land()
     assert air.flight.phase is Phase.LANDING
-    assert len(air.times("land")) == module.TRIES
-    told = [begin, *(at for at in air.times("send_position_setpoint", "send_notify_setpoint_stop") if at >= begin)]
-    assert air.now - begin > 1.8  # which would have been just short of the 2 s after which the firmware cuts
-    assert np.diff(told).max() < LEVELS_S
-    assert air.sent[-1][1] == "send_notify_setpoint_stop"
+    assert {what for _, what in air.sent} == {"land"}, "a start would make the planner forget the landing"
+    assert len(air.sent) == module.TRIES
+    air.pass_(module.LONGEST_S + module.AGAIN_S)
+    assert len(air.sent) == 2 * module.TRIES
+
+
+def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
+    """Before the descent behind it begins; one that changes is sent at the rate of setpoints."""
+    air.pass_(2.0)
+    assert np.diff(air.times("setpoint")[3:]).max() < 0.5 * HOLD_S
+    begin, places = air.now, iter(np.linspace(0.2, 0.8, 1000))
+    setpoint = air.flight.set_target
+    air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
+    air.pass_(2.0)
+    assert 15 < len([at for at in air.times("setpoint") if at > begin]) < 25
+
+
+def test_the_end_of_a_climb_is_held_until_the_first_setpoint(monkeypatch):
+    """By the robot's loop, which may wait for others; without it, the drone is landed."""
+    air = Air(monkeypatch)
+    air.board.settled[:], air.board.pose[0] = True, [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
+    air.flying = False
+    air.pass_(0.1)
+    air.flight.takeoff(0.5)
+    air.flying, setpoint = True, air.flight.set_target
+    air.flight.set_target = lambda now, _: setpoint(now, None)
+    air.pass_(6.0)
+    assert air.flight.phase is Phase.CLIMBING
+    held = air.times("setpoint")
+    assert held[0] - air.times("climb")[-1] < 1.5 + HOLD_S
+    assert np.diff(held).max() < 0.5 * HOLD_S
+    air.flight.set_target = lambda _now, _: None
+    air.pass_(2.0)
+    assert air.flight.phase is Phase.LANDING
 
 
 def test_an_emergency_stop_is_said_until_it_is_answered(air):
@@ -84,7 +126,7 @@ def test_an_emergency_stop_is_said_until_it_is_answered(air):
     before = air.now
     air.pass_(10.0)
     assert len(air.times("send_emergency_stop")) > 400
-    assert not [at for at in air.times("send_position_setpoint") if at > before]
+    assert not [at for at in air.times("setpoint") if at > before]
     assert air.flight.airborne
     assert air.flight.trouble == UNANSWERED
     air.info |= Info.LOCKED
@@ -105,7 +147,7 @@ def test_a_firmware_that_does_not_say_that_it_is_locked_says_that_it_does_not_fl
 
 
 def test_a_stop_outlives_the_link(monkeypatch):
-    air = Air(monkeypatch, control="high-level").fly()
+    air = Air(monkeypatch).fly()
     air.flight.stop()
     air.flight.mark_out_of_reach()
     assert air.flight.airborne
@@ -136,7 +178,7 @@ def test_a_drone_that_flies_without_an_order_is_landed_and_not_cut(monkeypatch):
 
 def test_a_take_off_without_an_answer_goes_on(monkeypatch):
     air = Air(monkeypatch)
-    air.board.settled[:], air.flying = True, False
+    air.board.settled[:], air.flying, air.board.pose[0] = True, False, 0.0
     air.pass_(0.1)
     air.flight.takeoff(0.5)
     assert air.flight.phase is Phase.CLIMBING
@@ -147,39 +189,19 @@ def test_a_take_off_without_an_answer_goes_on(monkeypatch):
     assert air.flight.trouble == "its motors do not turn"
 
 
-def test_no_setpoint_follows_an_order_to_land(air):
-    """A setpoint makes the planner forget the landing: then the notice that setpoints end would stop the motors."""
-    air.flight.link.planner_reply = lambda command: (len(air.times("land")), 0)
-    air.flight.land()
-    whats = [what for _, what in air.sent]
-    after = whats[len(whats) - whats[::-1].index("land") :]
-    assert set(after) == {"send_notify_setpoint_stop"}
-
-
 @pytest.mark.parametrize(("gap", "phase"), [(0.3, Phase.FLYING), (0.7, Phase.FLYING), (0.9, Phase.LANDING)])
 def test_after_a_gap(air, gap, phase):
-    air.sent.clear()
-    air.flight.hold_after_gap(gap)
-    whats = [what for _, what in air.sent]
+    air.flight.land_after_gap(gap)
     assert air.flight.phase is phase
-    if phase is Phase.FLYING:
-        assert whats[0] == "go_to"  # before the notice, without which the planner is not followed
-        assert set(whats[1:]) == {"send_notify_setpoint_stop"}
-        air.sent.clear()
-        air.pass_(1.5)
-        assert air.times("send_position_setpoint") == []
-        air.pass_(1.0)
-        assert air.times("send_position_setpoint")
 
 
-def test_a_radio_that_stutters_on_ends_in_a_landing(air):
-    for _ in range(4):
-        air.flight.hold_after_gap(0.3)
-        air.pass_(1.0)
-        assert air.flight.phase is Phase.FLYING
-    air.flight.hold_after_gap(0.3)
-    assert air.flight.phase is Phase.LANDING
-    assert "5 gaps of the radio" in air.flight.trouble
+def test_a_drone_out_of_reach_counts_as_flying_until_its_trajectory_has_ended(air):
+    air.now += HOLD_S + PLACE[2] / SINK
+    air.flight.mark_out_of_reach()
+    assert air.flight.airborne
+    air.now += PLACE[2] / SINK + module.MARGIN_S + 0.1
+    air.flight.mark_out_of_reach()
+    assert not air.flight.airborne
 
 
 def test_an_old_status_tells_of_an_earlier_phase(air):
@@ -214,7 +236,7 @@ def test_a_crashed_drone_is_not_recovered_by_a_take_off(monkeypatch, info):
 def test_armed_is_not_yet_able_to_fly(monkeypatch):
     """Motors that are checked after arming: no take-off before the supervisor permits it, and one request to arm."""
     air = Air(monkeypatch)
-    air.board.settled[:], air.flying, air.info = True, False, Info.ARMED
+    air.board.settled[:], air.flying, air.info, air.board.pose[0] = True, False, Info.ARMED, 0.0
     air.pass_(0.1)
     pause = air.pause
 
@@ -226,5 +248,5 @@ def test_armed_is_not_yet_able_to_fly(monkeypatch):
     air.flight._pause = spun_up
     air.flight.takeoff(0.5)
     assert air.flight.phase is Phase.CLIMBING
-    assert min(air.times("takeoff")) > 101.5
+    assert min(air.times("climb")) > 101.5
     assert air.times("send_arming_request") == []

@@ -13,13 +13,10 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.protocols import crtp
-from agents.protocols.crtp import Memory, Status
+from agents.protocols.crtp import COMPRESSED, IN_MEMORY, Memory, Status
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import ORDER, Piece, evaluate, wrap
 
-IN_MEMORY: Final = 1  # the only place of trajectories
-UNCOMPRESSED: Final = 0
-COMPRESSED: Final = 1
 POINTS: Final = (0, 1, 3, 7)  # control points of a compressed element beside the one that the last piece ends with
 SCALES: Final = (crtp.MM, crtp.MM, crtp.MM, radians(0.1))  # units of compressed x, y, z [m], yaw [rad]
 LARGEST: Final = 2.0**32  # upper bound of coefficients and times

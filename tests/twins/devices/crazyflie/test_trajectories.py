@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
 
-from agents.protocols.crtp import HighLevel, Memory, Port, Status
+from agents.protocols.crtp import COMPRESSED, IN_MEMORY, UNCOMPRESSED, HighLevel, Memory, Port, Status
 from tests.twins.crazyflie_wire import Wire
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import Planner, evaluate
-from twins.devices.crazyflie.trajectories import COMPRESSED, IN_MEMORY, UNCOMPRESSED, Trajectories
+from twins.devices.crazyflie.trajectories import Trajectories
 
 RISE = [0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0]  # from 0 to 1 in 1 s, at rest at both ends
 
