@@ -58,7 +58,8 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         Meta(description="a robot that is farther from its `start` than this does not take off [m]; 0: anywhere"),
     ] = 0.3
     landing_s: Annotated[
-        Positive, Meta(description="a drone that takes longer than this to land has its motors cut [s]")
+        Positive,
+        Meta(description="a landing drone that neither descends nor hovers for this long has its motors cut [s]"),
     ] = 20.0
     loop_silence_s: Annotated[
         Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")

@@ -16,7 +16,7 @@ from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause, Observation
-from agents.safety.landing import Landing
+from agents.safety.landing import LOW, SLOW, Landing
 from agents.safety.obedience import Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.safety.situation import ProcessHealth, Situation
@@ -53,6 +53,9 @@ class Separation:
 
 
 SUNK: Final = 0.15  # [m] below its goal
+SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
+CREEPS: Final = 0.025  # [m/s] or more slowly than this for
+STEP: Final = 0.05  # [m]
 SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
@@ -73,6 +76,30 @@ class RowStatus(msgspec.Struct, frozen=True):
     landing_places: Landing  # of rows that land
 
 
+class Descent:
+    """Progress of N rows that land."""
+
+    def __init__(self, rows: int) -> None:
+        self._landing: Mask = np.zeros(rows, dtype=bool)
+        self._due = np.zeros(rows)  # when they are down, at the slowest [s]
+        self._lowest, self._lowered_at = np.zeros(rows), np.zeros(rows)  # [m], [s]
+
+    def update(self, t: float, landing: Mask, valid: Mask, state: BodyState) -> tuple[Mask, Mask]:
+        """Rows (N,) whose motors do no good, and rows that hover, of those that are `landing` with a `valid` pose.
+
+        A row that comes down is given its time, and one that hovers level is never cut: it would fall.
+        """
+        height = state.position[:, 2]
+        begins, self._landing = landing & ~self._landing, landing
+        lower = begins | (valid & (height < self._lowest - STEP))
+        self._lowest = np.where(lower, height, self._lowest)
+        self._lowered_at = np.where(lower, t, self._lowered_at)
+        self._due = np.where(begins, t + np.where(valid, height, 0.0) / SLOWEST, self._due)
+        still = landing & (t - self._lowered_at > STEP / CREEPS)
+        level = valid & (height > LOW) & (norm(state.velocity) < SLOW)
+        return still & ~level & (t > self._due), still & level
+
+
 class Detector:
     """Detects causes of hazards on N rows."""
 
@@ -90,11 +117,12 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
+        self._descent = Descent(len(self._flies))
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""
         state, neighbours, health = now.state, now.neighbours, now.health
-        found = [self._measured(state, rows)]
+        found = [self._measured(now.t, state, rows, ~now.where.invalid)]
         if some(rows.ordered) or some(rows.not_finite) or rows.unguided is not None:
             found.append(self._orders(rows))
         if state.heard is not None:
@@ -156,7 +184,7 @@ class Detector:
         yield Observation(Cause.OUTSIDE, where.outside, partial(excess, OUTSIDE_M))
         yield Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, partial(excess, cut))
 
-    def _measured(self, state: BodyState, rows: RowStatus) -> Iterator[Observation]:
+    def _measured(self, t: float, state: BodyState, rows: RowStatus, valid: Mask) -> Iterator[Observation]:
         """Speed, battery, motors, sinking, clock, tilt and landing, as the body measures them."""
         limits = self._limits
         squared = np.vecdot(state.velocity, state.velocity)
@@ -176,8 +204,9 @@ class Detector:
             lean = f"it leans {{:.0f}}° (limit {degrees(limits.tilt):.0f}°)"
             yield Observation(Cause.TILT, leans, lambda row: lean.format(degrees(tilt_angle(attitude, row))))
         if some(rows.landing):
-            late = rows.landing & self._flies & state.flying
-            yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s")
+            late, hovers = self._descent.update(t, rows.landing & self._flies & state.flying, valid, state)
+            yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s without a descent")
+            yield Observation(Cause.HOVERING, hovers, lambda row: f"at {state.position[row, 2]:.2f} m")
             yield Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below)
 
     def _moving(self, state: BodyState, squared: Array, rows: RowStatus) -> Iterator[Observation]:

@@ -64,6 +64,7 @@ class Cause(IntEnum):
     STILL = 24
     STRAYING = 25
     UNREACHABLE = 26
+    HOVERING = 27
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,7 @@ RULES: Final[Mapping[Cause, Rule]] = {
     ),
     Cause.LATE: Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5),
     Cause.LANDING: Rule("its landing takes too long", Outcome.CUT, landing=True),
+    Cause.HOVERING: Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True),
     # its device lands it, or its battery is empty: neighbours must not follow
     Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
     Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
@@ -146,7 +148,7 @@ def failed(text: str) -> bool:
     It has landed, was cut, does not move although it is told to, or its device does not answer.
     """
     outcome, _, words = text.partition(": ")
-    severe = tuple(RULES[cause].words for cause in (Cause.STILL, Cause.UNREACHABLE))
+    severe = tuple(RULES[cause].words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
     return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
 
 import numpy as np
 
@@ -13,8 +12,6 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, join_names
 from experiments.definition import bodies
-
-SLOW_M_S: Final = 0.2  # no robot comes down more slowly
 
 
 def safety(analysis: Analysis) -> Iterator[Claim]:
@@ -26,11 +23,6 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
     if chosen.cut_outside <= OUTSIDE_M:
         message = f"motors are cut {chosen.cut_outside:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
         yield Claim("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
-    for name, robot in analysis.experiment.robots.items():
-        if robot.hover is not None and robot.hover > SLOW_M_S * chosen.landing_s:
-            message = f"{name} may still be landing from {robot.hover:g} m when landing_s cuts its motors"
-            remedy = f"raise landing_s to {robot.hover / SLOW_M_S:g} or more"
-            yield Claim("warning", "landing", message, remedy, ("safety", "landing_s"))
     if chosen.separation is not None:
         yield from _separation(analysis, chosen.separation)
 

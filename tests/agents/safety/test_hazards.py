@@ -78,6 +78,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.STILL: [(0, "WARN")],
     Cause.STRAYING: [(0, "LAND")],
     Cause.UNREACHABLE: [(50, "WARN")],
+    Cause.HOVERING: [(200, "WARN")],
 }
 
 
@@ -167,8 +168,10 @@ def test_who_is_on_the_ground_has_no_hazards_and_who_lands_only_those_of_landing
         Cause.LANDING,
         Cause.BELOW,
         Cause.UNREACHABLE,
+        Cause.HOVERING,
     }
-    cut = {each.outcome for each in bench.hazards.incidents if each.cause not in {Cause.BELOW, Cause.UNREACHABLE}}
+    warned = {Cause.BELOW, Cause.UNREACHABLE, Cause.HOVERING}
+    cut = {each.outcome for each in bench.hazards.incidents if each.cause not in warned}
     assert cut == {Outcome.CUT}
 
 
@@ -380,14 +383,49 @@ def test_a_law_that_wants_nonsense_lands():
     assert swarm.phase("F") >= LANDING
 
 
-def test_a_drone_that_does_not_come_down_is_cut():
+def landing(**values):
+    """A drone that is told to land after 0.2 s, with `landing_s` 2, and whose body says this."""
     swarm = drone(safety=Safety(landing_s=2.0)).running().run(0.2)
     swarm.agent("F").lifecycle.land(0, "ordered to land")
-    spoiled(swarm, flying=True)
+    spoiled(swarm, **values)
+    return swarm
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"flying": True}, {"flying": True, "position": np.nan}, {"flying": True, "velocity": [0.0, 0.0, 0.5]}],
+    ids=["on the floor", "blind", "climbs"],
+)
+def test_a_landing_drone_that_does_no_good_is_cut(values):
+    """It comes down, but says that its motors are on; nobody knows where it is; it does not descend, but moves."""
+    swarm = landing(**values, **({"position": [0.0, 0.0, 0.5]} if "velocity" in values else {}))
     swarm.run(1.9)
     assert swarm.phase("F") == LANDING
-    swarm.run(0.2)
+    swarm.run(5.0)
     assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (DONE, ["its landing takes too long"])
+
+
+def test_a_landing_drone_that_hovers_is_never_cut():
+    swarm = landing(flying=True, position=[0.0, 0.0, 0.5], velocity=[0.0, 0.0, 0.0]).run(30.0)
+    assert swarm.phase("F") == LANDING
+    assert "warn: it is told to land and hovers: at 0.50 m" in happened(swarm)["F"]
+
+
+def test_a_landing_that_takes_long_is_given_its_time():
+    swarm = landing(flying=True)
+    group = swarm.groups[0]
+    spoil, begin = group.spoil, swarm.t
+
+    def sinks(t, state):
+        state = spoil(t, state)
+        state.position[:, 2] = 1.0 - 0.03 * (t - begin)
+        state.velocity[:] = 0.0, 0.0, -0.03
+        return state
+
+    group.spoil = sinks
+    swarm.run(30.0)
+    assert swarm.phase("F") == LANDING
+    assert not any("land" in text for text in happened(swarm)["F"])
 
 
 def test_leaning_is_an_angle_to_the_vertical():
