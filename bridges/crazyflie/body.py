@@ -140,13 +140,15 @@ class CrazyflieBody:
             flying=board.airborne.copy(),
             notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
             refusals=tuple(pilot.refusal for pilot in self._pilots),
+            heard=board.pose_time - self._zero,
             rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
         )
         if len(self._external_rows):
-            rows, heard = self._external_rows, state.time.copy()
+            rows = self._external_rows
             self._external.fill(state, rows)
             state.position[rows[~board.settled[rows]]] = np.nan  # no flight before the estimator on board has settled
-            state.time[rows] = np.minimum(state.time[rows], heard[rows])  # a drone without telemetry is lost as well
+            # a drone without telemetry is lost as well
+            state.time[rows] = np.minimum(state.time[rows], board.pose_time[rows] - self._zero)
         return state
 
     def command(self, setpoint: Array) -> None:

@@ -176,6 +176,8 @@ class Flight:
             target = self._top
         if target is None or now < self._due or self.link.busy:
             return
+        if time.monotonic() - self._commanded_at > LOOP_SILENCE_S:  # the process stood still until a moment ago
+            return
         if self._target is not None and self.phase is Phase.CLIMBING:
             self._enter(Phase.FLYING)
         if target == self._sent and now - self._sent_at < REFRESH_S:
@@ -190,9 +192,9 @@ class Flight:
         self._down_at = since + self._hold + max(height, 0.0) / SINK + MARGIN_S
 
     def land_after_gap(self, gap: float) -> None:
-        """Land after a gap of the radio, or of the process, of `gap` [s], if it was long."""
+        """Land after `gap` [s] in which nothing was received, or the process stood still, if it was long."""
         if gap > LANDING_GAP_S and self.phase in (Phase.CLIMBING, Phase.FLYING):
-            self.trouble = f"landed: no radio for {gap:.1f} s"
+            self.trouble = f"landed: nothing received for {gap:.1f} s"
             self.land()
 
     def update_phase(self, now: float) -> None:

@@ -11,7 +11,7 @@ from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
-from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.flight import LANDING_GAP_S, Flight, Phase
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
 from bridges.crazyflie.telemetry import Telemetry
@@ -28,6 +28,7 @@ QUEUE_S: Final = 0.5  # poses that wait for longer, and not only for a moment, a
 LATE_S: Final = 1.0
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
+EXTERNAL_AGE_S: Final = 0.5  # older external poses are not passed on
 LANDING_S: Final = 12.0  # `close` waits so long for a landing
 JOIN_S: Final = 5.0
 
@@ -37,7 +38,7 @@ Order = tuple[str, float, float]  # "takeoff", "land" or "stop"; height of a tak
 
 
 class OrderReplaced(RuntimeError):
-    """A stop has replaced the current order."""
+    """A stop has replaced the current order, or a standstill of the process has made it old."""
 
 
 class CrazyfliePilot:
@@ -70,6 +71,7 @@ class CrazyfliePilot:
         self._convergence: Convergence | None = None
         self._settle_deadline = inf
         self._closers: list[threading.Thread] = []
+        self._stood_still = 0.0  # [s] a standstill of the process that was not acted on yet
         self._logs_at = -inf  # last creation of the log blocks [s]
         self._late_since, self._slowed = inf, False  # begin of a queue before the radio [s]; logs were slowed down
         rate = max(settings.stream_hz, LOOP_HZ)
@@ -301,9 +303,10 @@ class CrazyfliePilot:
         landed_by = inf
         link.take_gap()
         while True:
-            self._wake.wait(max(0.0, due - time.monotonic()))
+            begin = time.monotonic()
+            self._wake.wait(max(0.0, due - begin))
             self._wake.clear()
-            now = time.monotonic()
+            now = self._note_standstill(begin, due)
             due = max(due + self._period, now) if now >= due else due
             self._check(link)
             try:
@@ -347,7 +350,8 @@ class CrazyfliePilot:
 
     def _mend_gap(self, link: CrazyflieLink, now: float) -> None:
         """After a gap: hold or land, and log again. The link stays: its polls have gone on."""
-        gap = link.take_gap() if link.is_radio else 0.0
+        gap = max(link.take_gap() if link.is_radio else 0.0, self._stood_still)
+        self._stood_still = 0.0
         silent = now - max(self._telemetry.arrival, self._logs_at)
         if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.status_hz and link.gap < LOGLESS_S):
             self._logs_at = now
@@ -367,7 +371,7 @@ class CrazyfliePilot:
 
         Raises:
             LinkError: If the link is lost meanwhile.
-            OrderReplaced: If a stop is ordered meanwhile.
+            OrderReplaced: If a stop is ordered meanwhile, or the process stood still.
         """
         link = self._flight.link
         until = time.monotonic() + seconds
@@ -380,6 +384,17 @@ class CrazyfliePilot:
             if now >= until:
                 return
             time.sleep(min(until - now, self._period))
+            self._note_standstill(now, until)
+            if self._stood_still:
+                raise OrderReplaced
+
+    def _note_standstill(self, begin: float, due: float) -> float:
+        """Note whether a wait from `begin` until `due` [s] took far longer, as in a suspended process; returns now."""
+        now = time.monotonic()
+        late = now - max(begin, due)
+        if late > LANDING_GAP_S:
+            self._stood_still = late
+        return now
 
     def _forward_external_pose(self, link: CrazyflieLink, now: float) -> None:
         """Send external poses to the estimator on board at the rate set; start and end its convergence."""
@@ -389,7 +404,9 @@ class CrazyfliePilot:
         pose = self._external_pose
         if pose is not None and now - self._forwarded_at >= 0.9 / system.rate_hz and not link.busy:
             self._external_pose, self._forwarded_at = None, now
-            _, position, yaw = pose
+            measured, position, yaw = pose
+            if time.monotonic() - measured > EXTERNAL_AGE_S:
+                return
             x, y, z = position.tolist()
             if system.attitude and isfinite(yaw):
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))

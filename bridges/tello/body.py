@@ -102,6 +102,7 @@ class TelloBody:
                 np.array([pilot.battery for pilot in self._pilots]),
                 np.array([pilot.flying for pilot in self._pilots]),
                 tuple(pilot.note(now) for pilot in self._pilots),
+                heard=received,
             )
             self._external.fill(state, self._rows)
             fresh = t - state.time <= FRESH_S

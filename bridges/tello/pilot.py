@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any, Final, Protocol
 
@@ -56,8 +56,10 @@ class Duty(Enum):
 class TelloPilot:
     """One drone: duty, commands sent, state received. Times are monotonic [s]."""
 
-    def __init__(self, drone: Vendor, kind: Kind, chosen: protocol.TelloSettings) -> None:
-        self._drone, self._kind, self._settings = drone, kind, chosen
+    def __init__(
+        self, drone: Vendor, kind: Kind, chosen: protocol.TelloSettings, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._drone, self._kind, self._settings, self._clock = drone, kind, chosen, clock
         self.duty = Duty.REST
         self.state_received = -math.inf  # time of the last state; -inf before the first
         self.battery = math.nan  # charge, 0 to 1
@@ -152,7 +154,7 @@ class TelloPilot:
             else:
                 self._send("emergency")
         elif self.duty is Duty.RISE:
-            self._take_off(now)
+            self._take_off(now, last_read)
         elif self.duty is Duty.LAND:
             if self._on_ground(now):  # the answer was lost
                 self.duty = Duty.REST
@@ -175,19 +177,27 @@ class TelloPilot:
 
     def _send_sticks(self, now: float, last_read: float) -> None:
         if now - last_read > UNREAD_S:
-            self.land(now, f"landing: its process did nothing for {UNREAD_S:.0f} s")
+            self._land_unattended(now)
         elif self.battery < self._settings.low_battery:
             self.land(now, f"landing: battery at {self.battery:.0%}")
         elif self._on_ground(now):
             self.duty, self.trouble = Duty.REST, f"landed by itself, battery at {self.battery:.0%}"
         else:
+            sticks = self._sticks(now, last_read)
+            if self._clock() - now > FRESH_S:  # the process stood still meanwhile
+                return
             try:
-                self._drone.send_rc_control(*self._sticks(now, last_read))
+                self._drone.send_rc_control(*sticks)
             except OSError as error:
                 self._send_error = f"cannot send: {error.strerror}"
 
-    def _take_off(self, now: float) -> None:
-        if now - self._began_at > TAKEOFF_S:
+    def _land_unattended(self, now: float) -> None:
+        self.land(now, f"landing: its process did nothing for {UNREAD_S:.0f} s")
+
+    def _take_off(self, now: float, last_read: float) -> None:
+        if now - last_read > UNREAD_S:
+            self._land_unattended(now)
+        elif now - self._began_at > TAKEOFF_S:
             self.land(now, f"did not take off in {TAKEOFF_S:.0f} s")
         elif self._aloft > self._began_at and now - self._sent_at > TAKEOFF_RETRY_S:
             self._airborne(now)  # the answer was lost

@@ -1,6 +1,9 @@
 """What goes wrong between a Crazyflie bridge and its robot: the robot ends on the ground, the others go on."""
 
+import os
+import signal
 import socket
+import subprocess
 import sys
 import time
 
@@ -65,7 +68,9 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         assert any("link lost" in note for note in said[blinking])
         assert any("landed: battery low" in note for note in said[empty])
         assert any("link lost" in note for note in said[killed])
-        assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is
+        assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is,
+        assert process.t - process.state.heard[mute] > 0.5  # and that its device is silent
+        assert process.t - process.state.heard[well] < 0.5
         assert said[well] == {""}
         assert process.state.flying[: lossy + 1].all(), said[lossy]
         process.until(
@@ -95,6 +100,48 @@ def test_loop_that_stops_commanding():
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
         assert supervised(twin) != State.LOCKED
         assert "no commands from" in process.tick().notes[0]
+
+
+FLYING = """
+import sys
+import numpy as np
+from tests.bridges.crazyflie_flight import Process
+from tests.twins.loopback import request
+from bridges.crazyflie.body import open_crazyflie
+
+process = Process(open_crazyflie(request("crazyflie", sys.argv[1:])))
+process.takeoff(0.4)
+process.setpoint = [(0.3, 0.0, 0.4, 0.0)]
+while True:
+    process.tick()
+"""
+
+
+@pytest.mark.parametrize("link", ["udp", "radio"])
+@pytest.mark.system
+def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):
+    """It is suspended until its drone has come down; then its loop commands as before, and the drone stays down."""
+    asked = request("crazyflie", ["crazyflie-twin"], device={"link": link})
+    with Served(open_device, asked) as twin:
+        child = subprocess.Popen([sys.executable, "-c", FLYING, *twin.addresses])
+        try:
+            until(lambda: abs(truth(twin)[0] - 0.3) < 0.05, "it follows setpoints")
+            os.kill(child.pid, signal.SIGSTOP)
+            until(lambda: truth(twin)[2] == 0.0, "its drone has come down")
+            assert supervised(twin) == State.FLYING
+            os.kill(child.pid, signal.SIGCONT)
+            heights = []
+
+            def stands():
+                heights.append(truth(twin)[2])
+                return not twin.device.flock.quadrotor.flying[0]
+
+            until(stands, "its motors are stopped")
+            assert max(heights) == 0.0
+            assert supervised(twin) != State.LOCKED
+        finally:
+            child.kill()
+            child.wait()
 
 
 @pytest.mark.system

@@ -204,6 +204,17 @@ def test_a_drone_out_of_reach_counts_as_flying_until_its_trajectory_has_ended(ai
     assert not air.flight.airborne
 
 
+def test_a_process_that_stood_still_sends_no_setpoint_of_before(air):
+    """Between the choice of a setpoint and its start, too; then the robot's loop has been silent, and it lands."""
+    air.sent.clear()
+    chosen = air.now
+    air.now += 3.0
+    air.flight._stream(chosen + 0.2)
+    assert air.sent == []
+    air.flight.send_due(air.now)
+    assert {what for _, what in air.sent} == {"land"}
+
+
 def test_an_old_status_tells_of_an_earlier_phase(air):
     """Behind a full queue: `flying` of before the take-off's end, `not flying` of before the take-off."""
     air.flying = False

@@ -69,7 +69,7 @@ class Cockpit:
 
     def __init__(self, **chosen):
         self.drone, self.now = Paper(), 100.0
-        self.pilot = TelloPilot(self.drone, TELLO, protocol.TelloSettings(**chosen))
+        self.pilot = TelloPilot(self.drone, TELLO, protocol.TelloSettings(**chosen), lambda: self.now)
         self.report = {"bat": 80, "yaw": 20, "h": 0, "time": 0}
         self.speaks = self.attended = True
 
@@ -130,6 +130,34 @@ def test_it_climbs_to_its_height_and_holds_its_place_until_setpoints_come():
     assert cockpit.drone.sticks[-1] == (-30, 0, 0, 0)
     cockpit.pass_(0.1)
     assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)  # a setpoint of half a second ago is none
+
+
+def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before():
+    """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
+    cockpit = Cockpit().fly()
+    pilot, drone = cockpit.pilot, cockpit.drone
+    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (0.0, 0.3, 0.0, 0.0), cockpit.now
+    sticks, read = pilot._sticks, cockpit.now
+
+    def suspended(now, last_read):
+        cockpit.now += 3.0
+        return sticks(now, last_read)
+
+    pilot._sticks = suspended
+    drone.sticks.clear()
+    pilot.step(cockpit.now, read)
+    pilot._sticks = sticks
+    assert drone.sticks == []
+    pilot.step(cockpit.now, read)
+    assert drone.sticks == []
+    assert (pilot.duty, drone.said[-1]) == (Duty.LAND, "land")
+    rising = Cockpit()
+    rising.pass_(0.2)
+    rising.pilot.position = (1.0, 2.0, 0.0)
+    rising.pilot.take_off(0.6, rising.now)
+    rising.drone.said.clear()
+    rising.pilot.step(rising.now + 8.0, rising.now)
+    assert rising.drone.said == ["land"]
 
 
 def test_sticks_of_another_scale():
@@ -479,6 +507,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_flying():
     assert said["empty"] == "no take-off: battery at 8%"
     assert said["killed"].startswith("silent for")
     assert said["silent"].startswith("silent for")
+    assert said["silence"][0] < 0.5 < said["silence"][1]
     assert said["weak"] == "landing: battery at 9%"
     assert flown["weak_height"] < 0.05
     assert None not in (flown["there"], flown["fell"])
