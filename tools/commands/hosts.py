@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from tools.commands.lab import SOON_DAYS
 from tools.commands.options import AsJson, File, Lab, Settings, example, group, print_json
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ On = Annotated[
 YES, NO, DOUBTFUL, NOTHING = "✓", "✗", "!", "–"
 HEADING: Final = ("host", "reachable", "zenpark", "Python", "clock", "devices", "router")
 SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
-SOON_DAYS: Final = 14.0
 VAGUE_S: Final = 0.02  # a clock with a larger uncertainty lets robots start apart
 REACH_S: Final = 15.0
 INSTALL_S: Final = 900.0

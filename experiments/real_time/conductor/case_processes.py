@@ -170,16 +170,16 @@ class CaseProcesses:
                 yield Death(again[0], "conductor", again[1])
             elif process.name in self._standins:
                 what = process.name.removeprefix(self._context.process(""))
-                text = f"the {what} ended ({process.exit}); robots that need it hold, or land{_because(process)}"
+                text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
                 yield Death("device", "conductor", text)
             elif process.name == self._context.process("recorder"):
                 yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             elif process.name.startswith(STATION):
-                what = f"the connection to it ended ({process.exit}); without a router robots hold{_because(process)}"
+                what = f"the connection to it ended ({process.exit}); without a router robots hold{process.because}"
                 yield Death("host", process.name.removeprefix(STATION), what)
             else:
                 for name in self._groups.get(process.name.removeprefix(self._context.process("")), []):
-                    yield Death("lost", name, f"its process ended ({process.exit}){_because(process)}")
+                    yield Death("lost", name, f"its process ended ({process.exit}){process.because}")
 
     def output(self) -> Iterator[tuple[str, str]]:
         """Lines that processes on other machines have printed since the last call, each with its place."""
@@ -208,8 +208,3 @@ class CaseProcesses:
         if self._standins:
             self._addressed = self._context.folder / f"{self._context.case}-addressed.json"
             self._addressed.write_bytes(write_json(self._reached))
-
-
-def _because(process: Process) -> str:
-    """Last line of its output, behind a colon."""
-    return "".join(f": {line}" for line in process.tail().strip().splitlines()[-1:])

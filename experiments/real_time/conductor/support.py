@@ -187,8 +187,7 @@ class Servants:
             servant.starts += 1
             servant.start()
         what = f"started again{servant.meanwhile}" if more else f"given up{servant.given_up}"
-        last = [] if is_router(process.name) else process.tail().strip().splitlines()[-1:]
-        return kind, f"the {kind} ended ({process.exit}); {what}" + "".join(f": {line}" for line in last)
+        return kind, f"the {kind} ended ({process.exit}); {what}{'' if is_router(process.name) else process.because}"
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,11 @@ class Process:
             return ""
         return "\n".join(lines[-TAIL:])
 
+    @property
+    def because(self) -> str:
+        """The last line of its output behind a colon, for a message; empty if there is none."""
+        return "".join(f": {line}" for line in self.tail().strip().splitlines()[-1:])
+
 
 def is_router(process: str) -> bool:
     """Whether a process of this name is a router."""
