@@ -22,6 +22,7 @@ from agents.body.limits import Limits
 QUIET_S: Final = 1.0  # absence of a cause that ends its hazard: a flickering one is reported once
 ROUNDING_S: Final = 1e-9
 NEVER: Final = np.inf
+OVER, UNRESOLVED = "over", "unresolved at the end"  # first words of the last incident of a hazard
 
 
 class Outcome(IntEnum):
@@ -145,11 +146,18 @@ def rules(limits: Limits) -> dict[Cause, Rule]:
 def failed(text: str) -> bool:
     """Whether an incident's text tells that a robot does not do its part of an experiment any more.
 
-    It has landed, was cut, does not move although it is told to, or its device does not answer.
+    It has landed, was cut, does not move although it is told to, its device does not answer, or it has no position at
+    the end.
     """
     outcome, _, words = text.partition(": ")
     severe = tuple(RULES[cause].words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
-    return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe))
+    blind = outcome == UNRESOLVED and is_blind(text)
+    return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe)) or blind
+
+
+def is_blind(text: str) -> bool:
+    """Whether an incident's text is about a lost own position."""
+    return text.partition(": ")[2].startswith(RULES[Cause.POSITION].words)
 
 
 class Observation(NamedTuple):
@@ -198,6 +206,7 @@ class Hazards:
         self._since, self._begun, self._last = np.full((3, *shape), NEVER)
         self._last[:] = -NEVER
         self._level: Index = np.zeros(shape, dtype=np.intp)
+        self._present: Mask = np.zeros(shape, dtype=bool)  # on the last tick
         self._texts: list[dict[int, str]] = [{} for _ in flies]
         self._quiet = True
         self.held = np.zeros(len(flies), dtype=bool)
@@ -218,7 +227,8 @@ class Hazards:
         now = np.zeros(self._level.shape, dtype=bool)
         for cause, rows, _ in found:
             now[cause] = rows
-        now &= active | (self._landing & landing)
+        watched = active | (self._landing & landing)
+        now &= watched
         before = self._level
         self._since = np.where(now, np.minimum(self._since, t), NEVER)
         begins = now & np.isinf(self._begun) & (t - self._since >= self._after - ROUNDING_S)
@@ -231,24 +241,30 @@ class Hazards:
         level = np.where(worse, np.maximum(level, self._then), level)
         silence = t - self._last
         over = on & ~now & (level < Outcome.LAND) & (silence >= np.maximum(self._clears, QUIET_S) - ROUNDING_S)
+        # the cause is still there, but the row has ended
+        unresolved = on & self._present & ~watched & (level < Outcome.LAND)
         lasted = self._last - self._begun
-        self._begun = np.where(over, NEVER, self._begun)
-        self._level = level = np.where(over, 0, level)
+        self._begun = np.where(over | unresolved, NEVER, self._begun)
+        self._level = level = np.where(over | unresolved, 0, level)
+        self._present = now
         holds = (level == Outcome.HOLD) & self._place & (now | (silence < self._clears - ROUNDING_S))
         self.held = np.asarray(holds.any(axis=0))
         self._quiet = not (some(on) or some(now))
         if not some(level != before):
             return []
-        return self._record(t, before, lasted, {sighting.cause: sighting for sighting in found})
+        return self._record(t, before, lasted, unresolved, {sighting.cause: sighting for sighting in found})
 
-    def _record(self, t: float, before: Index, lasted: Array, found: Mapping[int, Observation]) -> list[Incident]:
+    def _record(
+        self, t: float, before: Index, lasted: Array, unresolved: Mask, found: Mapping[int, Observation]
+    ) -> list[Incident]:
         """Record changes in words; returns landings and cuts, the hardest of each row last."""
         news = []
         for cause, row in np.argwhere(self._level != before).tolist():
             outcome = Outcome(self._level[cause, row])
             words = self._words[cause]
             if outcome == Outcome.NONE:
-                text = f"over: {words}, after {lasted[cause, row]:.2f} s"
+                end = f"{UNRESOLVED}: {words}, for" if unresolved[cause, row] else f"{OVER}: {words}, after"
+                text = f"{end} {lasted[cause, row]:.2f} s"
                 self._texts[row].pop(cause, None)
             else:
                 text = f"{outcome.name.lower()}: {words}: {found[cause].detail(row)}"

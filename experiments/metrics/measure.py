@@ -150,7 +150,7 @@ def measure(trace: Trace) -> CaseMetrics:
         intervened_share=_share(trace.interventions.sum(), ticks),
         avoided_share=_share(trace.avoided.sum(), ticks),
         world_factor=_slowest(trace),
-        away_s=network_away(errors.alive, trace.time)[0],
+        away_s=network_away(np.asarray(np.isfinite(trace.true_position).all(axis=2)), trace.time)[0],
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
         failures=_failures(trace, robots),
         network_messages=sum(robot.messages + robot.goals for robot in robots),

@@ -15,6 +15,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.formation.graph import Links
+from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from experiments.definition.formation import errors_over_time
 from experiments.metrics.results import Passage
 from experiments.recording.losses import count_unrecorded
@@ -64,8 +65,11 @@ class LinkErrors:
         """The errors of a whole trace."""
         pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
-        error = errors_over_time(trace.plan.law, pattern, trace.time, trace.true_position)
         own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
+        blind = without_position(trace)
+        alive &= ~blind
+        place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
+        error = errors_over_time(trace.plan.law, pattern, trace.time, place)
         return cls(trace.time, pattern.links, own, error, alive, away)
 
     def part(self, begin: int, end: int) -> LinkErrors:
@@ -118,6 +122,19 @@ class LinkErrors:
             other = self.net.sender[k] if self.net.receiver[k] == i else self.net.receiver[k]
             found.append((float(mean[k]), names[other]))
         return found
+
+
+def without_position(trace: Trace) -> Mask:
+    """(T, N) samples at which a robot had lost its own position, by its hazards: its body may repeat an old one."""
+    blind = np.zeros((len(trace.time), len(trace.robots)), dtype=bool)
+    for event in trace.events:
+        lost = event.kind == "lost"  # its process ended: there are no more positions, or those of the next one
+        if event.source not in trace.robots or not (lost or (event.kind == "hazard" and is_blind(event.text))):
+            continue
+        since = event.stamp - QUIET_S if not lost and event.text.startswith(OVER) else event.stamp
+        begins = not (lost or event.text.startswith((OVER, UNRESOLVED)))
+        blind[trace.time >= since, trace.robots.index(event.source)] = begins
+    return blind
 
 
 def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:

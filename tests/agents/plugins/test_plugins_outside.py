@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 
 from agents.body.interface import BodyError
 from agents.formation.graph import Links
+from tests.system import lab
 from tests.waiting import until
 
 ROOT = Path(__file__).parents[3]
@@ -158,6 +160,71 @@ def test_the_body_of_the_docs_drives_a_robot_over_udp(rover):
     body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
     until(lambda: len(rover.twists) >= 5 and rover.twists[-2:] == [(0.0, 0.0)] * 2)
     body.close()
+
+
+ROVER = """
+import json, math, signal, socket, sys
+x, y, yaw = float(sys.argv[1]), float(sys.argv[2]), 0.0
+broken = []
+signal.signal(signal.SIGUSR1, lambda *_: broken.append(True))
+link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+link.bind(("127.0.0.1", 0))
+print(link.getsockname()[1], flush=True)
+while True:
+    payload, sender = link.recvfrom(1500)
+    twist = json.loads(payload)
+    yaw += 0.02 * twist["w"]
+    x, y = x + 0.02 * twist["v"] * math.cos(yaw), y + 0.02 * twist["v"] * math.sin(yaw)
+    link.sendto(json.dumps({"x": math.nan if broken else x, "y": y, "yaw": yaw}).encode(), sender)
+"""
+STARTS = {"RV01": (0.0, 0.0), "RV02": (0.6, 0.0), "RV03": (0.0, 0.6), "RV04": (0.6, 0.6)}
+FAULTS = {"RV01": signal.SIGKILL, "RV02": signal.SIGSTOP, "RV03": signal.SIGUSR1}
+
+
+@pytest.fixture
+def four_rovers():
+    """Robots of the guide as processes, by name."""
+    made = {
+        name: subprocess.Popen([sys.executable, "-c", ROVER, *map(str, start)], stdout=subprocess.PIPE, text=True)
+        for name, start in STARTS.items()
+    }
+    yield made
+    for process in made.values():
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.system
+def test_a_robot_of_the_guide_that_dies_or_freezes_or_tells_nonsense_fails_the_run(
+    installed, four_rovers, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(lab.ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(installed), str(ROOT)]))
+    robots = "".join(
+        f'[robots.{name}]\nkind = "khepera4"\nstart = {list(STARTS[name])}\n'
+        f'body = "rover://127.0.0.1:{int(process.stdout.readline())}"\n'
+        for name, process in four_rovers.items()
+    )
+    file = tmp_path / "rovers.toml"
+    file.write_text(
+        f'title = "Rovers"\nduration_s = 5.0\n[arena]\nsize = [4.0, 4.0, 2.0]\n{robots}'
+        '[formation.links]\n"RV04 > RV01" = 0.9\n"RV04 > RV02" = 0.6\n"RV04 > RV03" = 0.6\n'
+    )
+    flight = lab.Flight(tmp_path / "run", str(file))
+    flight.until_said("event start|start conductor: common start")
+    for name, fault in FAULTS.items():
+        four_rovers[name].send_signal(fault)
+    code, _ = flight.finish()
+    assert code == 1
+    said = flight.said()
+    (failed,) = re.findall(r"^zenpark: (Failed in .*)$", said, re.MULTILINE)
+    top = re.sub("<.*?>", "", (tmp_path / "run" / "report.html").read_text("utf-8")).partition("Nothing was lost")[0]
+    for text in (failed, top):
+        assert "RV01 at " in text
+        assert "RV02 at " in text
+        assert "RV03 at " in text
+        assert "RV04 at " not in text
+    assert "RV03: unresolved at the end: its own position is lost, for " in said
+    assert "over: " not in said
 
 
 def test_the_body_of_the_docs_refuses_what_is_no_address_and_a_robot_that_is_not_there():

@@ -132,6 +132,19 @@ def test_what_lands_never_ends():
     assert [each.row for each in bench.acts] == [0, 1]
 
 
+@pytest.mark.parametrize("absent_s", [0.0, 0.5])
+def test_a_hazard_of_a_robot_that_ends_is_unresolved_if_its_cause_was_there_until_then(absent_s):
+    bench = Bench().see(10.0, Cause.MARGIN).see(absent_s).see(5.0, Cause.MARGIN, active=NONE, landing=ALL)
+    *_, end = [each for each in bench.hazards.incidents if each.row == 0]
+    assert end.outcome == Outcome.NONE
+    if absent_s:
+        assert end.text == "over: it is beyond a wall of the arena, after 9.99 s"
+    else:
+        assert end.text == "unresolved at the end: it is beyond a wall of the arena, for 9.99 s"
+        assert end.time == pytest.approx(10.0)
+    assert bench.hazards.worst(0) == ""
+
+
 def test_what_flickers_is_told_once():
     bench = Bench()
     for _ in range(20):

@@ -89,11 +89,11 @@ def test_short_gaps_are_flown_through():
 @pytest.mark.mechanism("Crazyflie bridge: radio gap")
 def test_a_long_gap_ends_in_a_landing():
     with flown(device=RADIO, exchanges_hz=1000.0) as (twin, process):
-        process.takeoff(0.2)
+        process.takeoff(HEIGHT)
         descent = Descent(twin, process)
-        process.setpoint = [(0.0, 0.0, 0.2, 0.0)]
-        twin.device.lines[0].silence(1.05)
-        process.run(1.05)
+        hovering(process).run(0.1)
+        twin.device.lines[0].silence(1.1)
+        process.run(1.1)
         process.until(lambda: not process.state.flying[0], "landed")
         assert truth(twin)[2] == pytest.approx(0.0, abs=0.02)
         assert descent.fastest.max() < SINKS

@@ -378,7 +378,10 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
     ("events", "expected"),
     [
         ([("hazard", "warn: a neighbour is lost: L")], ()),
-        ([("hazard", "hold: its own position is lost: none")], ()),
+        (
+            [("hazard", "hold: its own position is lost: none"), ("hazard", "over: its own position is lost, after")],
+            (),
+        ),
         ([("hazard", "over: it is told to move and does not, after 2.00 s")], ()),
         (
             [("hazard", "warn: it is told to move and does not: told 0.21 m in vain"), ("lost", "its process ended")],
@@ -400,6 +403,34 @@ def test_robots_that_did_not_do_their_part_are_named_first(events: list[tuple[st
     assert (
         (first.mark == "bad" and first.text == f"Failed in only: {expected[0]}.") if expected else first.mark != "bad"
     )
+
+
+BLIND = "hold: its own position is lost: the last is 0.51 s old"
+
+
+@pytest.mark.parametrize(
+    ("events", "known", "failed"),
+    [
+        ([(15.0, BLIND)], 0.75, "its position was known for 75% of the time only"),
+        ([(4.0, BLIND), (13.0, "over: its own position is lost, after 8.00 s")], 0.6, "for 60% of the time only"),
+        ([(4.0, BLIND), (5.2, "over: its own position is lost, after 0.20 s")], 0.99, ""),
+        (
+            [(19.0, BLIND), (20.0, "unresolved at the end: its own position is lost, for 1.00 s")],
+            0.95,
+            "F at 20.0 s: unresolved at the end: its own position is lost, for 1.00 s",
+        ),
+    ],
+)
+def test_a_body_that_repeats_an_old_position_has_none(events: list[tuple[float, str]], known: float, failed: str):
+    made = tuple(Event(at, "hazard", "F", text) for at, text in events)
+    measured = measure.measure(dataclasses.replace(pair(1.0 + np.exp(-T)), events=made))
+    robot = measured.robots[1]
+    assert robot.known == pytest.approx(known, abs=0.002)
+    assert robot.coverage == pytest.approx(known, abs=0.002)
+    assert measured.away_s == 0.0
+    assert ("F" in measured.died) == (known < 0.95)
+    assert bool(measured.failures) == bool(failed)
+    assert failed in "".join(measured.failures)
 
 
 def test_a_robot_without_a_position_for_a_fifth_of_the_run_did_not_do_its_part():

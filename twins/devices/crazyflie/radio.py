@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.protocols import crazyradio
 from agents.protocols.crazyradio import ACK, ANSWER, COUNTERS, DATA_RATES, DOWN, EXCHANGE, NULL, SAFELINK, UP
-from agents.protocols.crtp import NRF, Port, PowerSwitch, header
+from agents.protocols.crtp import Port, header
 from twins.devices.device import Faults
 
 HOST: Final = "127.0.0.1"
@@ -36,14 +36,9 @@ class RadioLink:
         self.faults, self._random = faults, random
         self.queue: deque[bytes] = deque()
         self.dropped = 0  # log packets that found the queue full
+        self.safelink = False
         self.heard = -np.inf  # last exchange [s]
         self.silent_until = -np.inf  # end of an outage [s]
-        self.on = True  # until all is switched off
-        self._start()
-
-    def _start(self) -> None:
-        """State after switching on."""
-        self.safelink = False
         self._up = self._down = 1  # counters of safelink
         self._acknowledgement = NOTHING
 
@@ -72,7 +67,7 @@ class RadioLink:
     def exchange(self, packet: bytes, retries: int) -> tuple[int, bytes, bytes | None]:
         """One exchange: status byte and acknowledgement for the client, and the packet for the drone, or None."""
         received, forwarded = False, None
-        out = not self.on or self.faults.silent(self.t) or self.t < self.silent_until
+        out = self.faults.silent(self.t) or self.t < self.silent_until
         for attempt in range(retries + 1):
             if out or self._lost():
                 continue
@@ -94,11 +89,6 @@ class RadioLink:
             self.safelink, self._up, self._down = bool(packet[2]), 1, 1
             self._acknowledgement = packet
             return None
-        if null and len(packet) > 2 and packet[1] == NRF:  # for the radio's processor: without counters
-            if packet[2] == PowerSwitch.RESET:
-                self._start()
-            self._acknowledgement, self.on = NOTHING, packet[2] != PowerSwitch.ALL_OFF
-            return packet
         forwarded = None
         if not self.safelink or bool(packet[0] & UP) != bool(self._up):
             self._up = 1 - self._up

@@ -2,14 +2,9 @@
 
 import numpy as np
 import pytest
-from cflib.utils.power_switch import PowerSwitch
 
 from agents.protocols.crazyradio import ACK, QUEUE
 from agents.protocols.crtp import Port
-from bridges.crazyflie.link import prepare
-from tests.twins.loopback import Served, request
-from tests.waiting import until
-from twins.devices.crazyflie.device import open_device
 from twins.devices.crazyflie.radio import NOTHING, RadioLink
 from twins.devices.device import Faults
 
@@ -113,45 +108,3 @@ def test_losses_cost_retransmissions():
     share = np.mean([bool(status & ACK) for status, _, _ in results])
     assert share == pytest.approx(1.0 - 0.75**4, abs=0.05)
     assert sum(packet is not None for _, _, packet in results) == pytest.approx(2000 * (1.0 - 0.5**4), rel=0.05)
-
-
-@pytest.mark.parametrize("polls", [1, 2])
-def test_a_power_command_is_taken_whatever_the_counters_are(link, polls):
-    """Of a program that knows no counters, after the session of one that did; the counters stay as they are."""
-    host = secured(link)
-    for _ in range(polls):
-        host.poll()
-    off = b"\xf3\xfe\x02"
-    status, _, forwarded = link.exchange(off, 3)
-    assert status & ACK
-    assert forwarded == off
-    link.send(Port.LOG, 2, b"\7")
-    host.down = link._down
-    assert {host.poll()[0][1:] for _ in range(3)} >= {b"\7"}
-
-
-@pytest.mark.system
-def test_the_power_switch_of_the_unmodified_library():
-    """The processor off and on again, a restart of all, then all off: nothing is answered any more."""
-    with Served(open_device, request("crazyflie", ["crazyflie-twin"], device={"link": "radio"})) as twin:
-        prepare(twin.addresses)
-        (drone,), (line,), flock = twin.device.drones, twin.device.lines, twin.device.flock
-        drone.values[0] += 1
-        changed = drone.values[0]
-        switch = PowerSwitch(twin.addresses[0])
-        switch.stm_power_down()
-        until(lambda: not drone.on, "off")
-        flock.supervisor.state[0] = 5  # locked
-        switch.stm_power_cycle()
-        until(lambda: drone.on, "on")
-        assert flock.supervisor.may_fly[0]
-        assert drone.values[0] != changed
-        line.safelink = True
-        switch.reboot_to_fw()
-        until(lambda: not line.safelink, "the radio has restarted, too")
-        assert drone.on
-        switch.platform_power_down()
-        until(lambda: not drone.on, "all off")
-        with pytest.raises(Exception, match="Failed to connect"):
-            switch.stm_power_up()
-        assert not drone.on
