@@ -221,8 +221,11 @@ class Agent:
         life = self.lifecycle
         where = self._safety.validate_poses(state.position, state.yaw, t - state.time)
         self._now = Situation(t, state, where, self.neighbours, self.health)
-        commands = life.advance(t, self._ready(self._now), state.position, state.velocity, state.flying)
-        self._commands = self._landing.filter_commands(self._now, commands, life.phase)
+        ready = self._ready(self._now) if life.waiting else self._no_row  # all rows have taken off
+        commands = life.advance(t, ready, state.position, state.velocity, state.flying)
+        if commands is not None or self._landing.any_aside:
+            commands = self._landing.filter_commands(self._now, commands, life.phase)
+        self._commands = commands
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
             since = t - float(life.start_at[life.phase == RUNNING].min())
@@ -286,8 +289,6 @@ class Agent:
     def _ready(self, now: Situation) -> Mask:
         t, state = now.t, now.state
         life, assignment = self.lifecycle, self.assignment
-        if not life.waiting:
-            return self._no_row  # all rows have taken off
         lacks = np.zeros(len(life.phase), dtype=bool)
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks[assignment.links.receiver[assignment.unreceived(self.neighbours.stamp_once_alive)]] = True

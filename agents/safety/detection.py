@@ -121,8 +121,15 @@ class Detector:
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""
-        state, neighbours, health = now.state, now.neighbours, now.health
-        found = [self._measured(now.t, state, rows, ~now.where.invalid)]
+        state = now.state
+        found = self._around(now, rows)
+        squared = np.vecdot(state.velocity, state.velocity)
+        if not every(squared < self._slow_squared):
+            found.append(self._moving(state, squared, rows))
+        if some(low := state.battery < self._limits.battery_low) or state.flying.tobytes() != self._all_fly:
+            found.append(self._spent(state, low, rows))
+        if state.ahead is not None or state.attitude is not None or some(rows.landing):
+            found.append(self._measured(now.t, state, rows, ~now.where.invalid))
         if some(rows.ordered) or some(rows.not_finite) or rows.unguided is not None:
             found.append(self._orders(rows))
         if state.heard is not None:
@@ -134,6 +141,14 @@ class Detector:
             found.append(self._disobedient(self._obedience))
         if not now.where.all_valid:
             found.append(self._outside(now))
+        if not found:  # as on most ticks
+            return []
+        return [each for each in chain.from_iterable(found) if some(each.rows)]
+
+    def _around(self, now: Situation, rows: RowStatus) -> list[Iterator[Observation]]:
+        """Causes in other robots, the network and the process."""
+        neighbours, health = now.neighbours, now.health
+        found = []
         if self._limits.separation is not None:
             found.append(self._near(now, self._limits.separation))
         if neighbours.incomplete:
@@ -144,7 +159,7 @@ class Detector:
             found.append(self._not_refreshed(now, rows))
         if health.troubled:
             found.append(self._surroundings(now.t, health))
-        return [each for each in chain.from_iterable(found) if some(each.rows)]
+        return found
 
     def _receivers(self, links: Mask) -> Mask:
         """Rows (N,) that receive on `links` (E,)."""
@@ -185,17 +200,8 @@ class Detector:
         yield Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, partial(excess, cut))
 
     def _measured(self, t: float, state: BodyState, rows: RowStatus, valid: Mask) -> Iterator[Observation]:
-        """Speed, battery, motors, sinking, clock, tilt and landing, as the body measures them."""
+        """Clock, tilt and landing, as the body measures them."""
         limits = self._limits
-        squared = np.vecdot(state.velocity, state.velocity)
-        if not every(squared < self._slow_squared):
-            yield from self._moving(state, squared, rows)
-        if some(low := state.battery < limits.battery_low):
-            text = f"{{:.0%}} (limit {limits.battery_low:.0%})"
-            yield Observation(Cause.BATTERY, low, lambda row: text.format(state.battery[row]))
-        if state.flying.tobytes() != self._all_fly:
-            fallen = (self._flies > state.flying) & rows.cruising
-            yield Observation(Cause.FALLEN, fallen, lambda _: "its motors are off")
         if state.ahead is not None:
             off = clock_off(state.ahead, limits.own_silence_s)
             yield Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead))
@@ -208,6 +214,13 @@ class Detector:
             yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s without a descent")
             yield Observation(Cause.HOVERING, hovers, lambda row: f"at {state.position[row, 2]:.2f} m")
             yield Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below)
+
+    def _spent(self, state: BodyState, low: Mask, rows: RowStatus) -> Iterator[Observation]:
+        """Battery, which is `low` (N,), and motors."""
+        limit = self._limits.battery_low
+        yield Observation(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limit:.0%})")
+        fallen = (self._flies > state.flying) & rows.cruising
+        yield Observation(Cause.FALLEN, fallen, lambda _: "its motors are off")
 
     def _moving(self, state: BodyState, squared: Array, rows: RowStatus) -> Iterator[Observation]:
         """Speed and sinking, of rows that move."""
