@@ -147,7 +147,7 @@ class TwinBody:
         engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
         if (flying := engine.flying.tobytes()) != self._flew:
             self._flew, self._uses = flying, self._dt * (engine.flying | self._drives)
-        self._used += self._uses
+        self._used = self._used + self._uses
         if before is not None:
             self._drift.advance(engine.position[:, :2] - before)
         if self._sensors is not None:

@@ -77,9 +77,8 @@ class Differential:
         """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
         wanted = self._wanted
         speed = np.abs(wanted)
-        over = np.maximum(speed[0], speed[1]) / self._limit
-        if not every(over <= 1.0):  # both wheels are slowed by the same factor, which keeps the curvature
-            wanted = wanted / np.maximum(over, 1.0)
+        if not every(speed <= self._limit):  # both wheels are slowed by the same factor, which keeps the curvature
+            wanted = wanted / np.maximum(np.maximum(speed[0], speed[1]) / self._limit, 1.0)
         self._wheels += clamp(wanted - self._wheels, self._least, self._change)
         left, right = self._wheels[0], self._wheels[1]
         v = 0.5 * (left + right)
@@ -87,4 +86,4 @@ class Differential:
         middle = self.yaw + 0.5 * turn
         self.velocity[:, 0], self.velocity[:, 1] = v * np.cos(middle), v * np.sin(middle)
         self.position += self._dt * self.velocity
-        self.yaw += turn
+        self.yaw = self.yaw + turn  # see `Quadrotor.advance`

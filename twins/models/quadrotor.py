@@ -91,7 +91,7 @@ class Quadrotor(OnboardFlight):
             turn = np.where(self.flying, turn, 0.0)
         self.velocity = velocity
         self.position += self._dt * velocity
-        self.yaw += self._dt * turn
+        self.yaw = self.yaw + self._dt * turn  # in place, numpy adds one number as a sum: 7 µs more
         if not aloft or some(orders.landing):
             self._touch_down()
 
