@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
+from agents.arrays import Array, Mask, norm, some
 from agents.body.kinds import Kind
 
 SAMPLE_S: Final = 0.1  # between two samples of the setpoint
@@ -74,13 +74,14 @@ class Obedience:
             return
         missed = t - self._due >= SAMPLE_S  # ticks were missed, or it is the first one
         self._due = t + SAMPLE_S
-        here = np.column_stack([position, yaw])
+        here = np.concatenate([position, yaw[:, None]], axis=1)
         watched = watched & np.isfinite(setpoint).all(axis=1) & np.isfinite(here).all(axis=1)
         anew = np.isnan(self._begin[:, 0]) | ~watched
         if missed or anew.all():
             self._forget(np.ones(len(watched), dtype=bool), here)
             return
-        self._forget(anew, here)
+        if some(anew):
+            self._forget(anew, here)
         velocity, turn = self._told_motion(setpoint, position, yaw)
         self._way += velocity * SAMPLE_S
         self._turn += turn * SAMPLE_S
@@ -108,9 +109,10 @@ class Obedience:
         self.told = norm(self._vain) + self._rim * np.abs(self._vain_turn)
         moved = norm(here[:, :3] - self._anchor[:, :3]) + self._rim * np.abs(_wrapped(here[:, 3] - self._anchor[:, 3]))
         again = (moved > MOVES * np.maximum(self.told, self._without)) | (self._told_s < 0.0) | ~watched
-        for each in (self.told, self._told_s, self._vain, self._vain_turn):
-            each[again] = 0.0
-        self._anchor[again] = here[again]
+        if some(again):
+            for each in (self.told, self._told_s, self._vain, self._vain_turn):
+                each[again] = 0.0
+            self._anchor[again] = here[again]
         self.still = (self.told >= self._without) & (self._told_s >= LEAST_WITHOUT_S)
 
     def _count_strays(self, here: Array, watched: Mask) -> None:
