@@ -170,9 +170,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     acquired_s: tuple[float | None, ...]
     # [rad/s] net rotation rate of the formation per phase, from acquisition on
     rotation_rad_s: tuple[float | None, ...]
-    # Σ(0.02·messages + 0.1·updates + 0.3·settle_s + 0.1·IAE + 0.01·ITAE), all of the whole run. The weights are those
-    # of the authors' benchmark cost; theirs counts messages, updates, half the IAE, and ITAE up to the settling time
-    # only, which it takes from 2 % of the way of Σ(d² − r²). Not comparable
+    # cost of the authors' benchmark: Σ(0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE) over the robots that receive
+    # poses, each until its settling time t_s, see `measure`
     j2: float
     belief: tuple[Belief, ...]  # per link
     belief_rms: float | None  # [m] over all links

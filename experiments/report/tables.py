@@ -55,11 +55,9 @@ DEFINITIONS: Final = (
      " slope of the angle that fits the followers' positions best to those at acquisition."),
     ("Belief", "A receiver's estimate of a neighbour: the newest pose received, carried on by the prediction until the"
      " next."),
-    ("J2", "0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE + 0.01 · ITAE, summed over all"
-     " robots, all of the whole run; the settling time is when e(t) enters 2 % of its largest value for good (the"
-     " duration if never). The weights are those of the authors' benchmark, the sums are not: theirs end at the"
-     " settling time, which is of 2 % of the way from first to last of Σ(d² − r²), and take half of each robot's IAE."
-     " Values of the two cannot be set beside each other."),
+    ("J2", "Cost of the authors' benchmark: 0.02 · transmissions + 0.1 · decisions + 0.3 · settling time + 0.1 · IAE +"
+     " 0.01 · ITAE, summed over the robots that receive poses, all until the settling time: the last time at which"
+     " Σ(r² − d²) is farther from its end than 2 % of its way. IAE and ITAE are halved, because a link has two ends."),
     ("Collision", "Robots are upright cylinders of their kind's radius and height. A collision is a contact that the"
      " world's engine saw begin, with its impulse; of robots that no such engine carries it is a maximal time in which"
      " true cylinders overlap each other, an obstacle or the arena's walls."),

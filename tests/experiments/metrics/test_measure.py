@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.network.messages import Event
+from experiments.definition.experiment import Anchor
 from experiments.metrics import measure, statistics
 from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, net_rotation
@@ -169,13 +170,28 @@ def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_numbe
     assert (leader.messages, leader.recorded) == (messages, len(seq))
 
 
-def test_benchmark_cost_by_hand():
-    known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0]})
+def test_settling_time_is_that_of_two_percent_of_the_largest_error():
     settle = round(math.log(50.0) / STEP + 0.5) * STEP
-    robot = 0.3 * settle + 0.1 * 1.0 + 0.01 * 1.0 + 0.1 * (1001 // 5)
-    measured = measure.measure(known)
-    assert measured.robots[1].settle_s == pytest.approx(settle)
-    assert measured.j2 == pytest.approx(2.0 * robot + 0.02 * 3, rel=1e-4)
+    assert measure.measure(pair(1.0 + np.exp(-T))).robots[1].settle_s == pytest.approx(settle)
+
+
+@pytest.mark.parametrize("anchored", [False, True])
+def test_benchmark_cost_by_hand(anchored: bool):
+    known = pair(1.0 + np.exp(-T), sent={"F": [0.0, 1.0, 2.0, 10.0], "L": [0.5]})
+    if anchored:  # at the place of the leader: the same once more
+        formation = msgspec.structs.replace(known.experiment.formation, anchors={"F": Anchor(distance=1.0)})
+        known = dataclasses.replace(known, experiment=msgspec.structs.replace(known.experiment, formation=formation))
+    # r² − 1 = x² + 2x with x = e⁻ᵗ, from 3 to 0: 2 % of it at x = √1.06 − 1, 3.5212 s; the last sample before
+    settled = 3.52
+    x = math.exp(-settled)
+    iae, itae = 1.0 - x, 1.0 - (1.0 + settled) * x  # ∫ e⁻ᵗ dt and ∫ t e⁻ᵗ dt
+    updates = 200 * 176 / 1000  # the goal changes at each of the 1000 samples
+    expected = 0.02 * 3 + 0.1 * updates + 0.3 * settled + (1 + anchored) * (0.05 * iae + 0.005 * itae)
+    assert measure.measure(known).j2 == pytest.approx(expected, rel=1e-5)
+
+
+def test_benchmark_cost_of_a_robot_that_is_never_off_is_nothing():
+    assert measure.measure(pair(np.ones_like(T), sent={"F": [1.0]})).j2 == 0.0
 
 
 def test_closest_approach_and_excursion():
