@@ -129,7 +129,7 @@ class Panel:
 
     def _plot(self, title: str, data: Any, series: Any) -> Any:  # noqa: ANN401 - viser's own types
         return self._gui.add_uplot(
-            data, series, title=title, height=140, legend={"show": False},
+            data, series, title=title, height=140, padding=(8, 12, 0, 0), legend={"show": False},
             scales={"x": {"time": False, "range": (-HISTORY_S, 0.0)}},
         )  # fmt: skip
 

@@ -184,6 +184,7 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
         robots.kill()
 
 
+@pytest.mark.timeout(240)
 def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
