@@ -26,7 +26,7 @@ from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import SOURCE
+from experiments.recording.run_folder import METRICS, SOURCE, read_origin
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
 from experiments.virtual_time import simulation
@@ -224,10 +224,38 @@ def reopen(folder: str | Path) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
+    order = [case for case, _ in metrics_files.cases_and_seeds(folder / METRICS)]  # a copy's files have other times
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
+    files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
     return read_back(folder, {file.stem: file for file in files}, [])
+
+
+def reopen_seeds(folder: str | Path) -> list[Run]:
+    """As `reopen`, and of seeds that were not recorded the metrics that the folder keeps, as runs without traces.
+
+    Raises:
+        RecordingError: If there is no recording, one cannot be read, or the metrics of another seed cannot.
+    """
+    recorded = reopen(folder)
+    file = Path(folder) / METRICS
+    seeds = list(dict.fromkeys(seed for _, seed in metrics_files.cases_and_seeds(file)))
+    asked = origin.seeds if (origin := read_origin(Path(folder))) else 1
+    if not {*seeds} - {recorded.seed}:
+        note = f"{asked} seeds were to be run; what is kept is of seed {recorded.seed} alone"
+        return [replace(recorded, notes=(*recorded.notes, note)) if asked > 1 else recorded]
+    try:
+        kept = metrics_files.read_json(file)
+    except ValueError as error:
+        raise RecordingError(
+            f"{file}: was written by another version ({error}), and most of its seeds are not recorded; "
+            "repeat the run, or keep this report"
+        ) from None
+    runs = {seed: Run(recorded.title, seed, {}, {}, recorded.folder, recorded.source) for seed in seeds}
+    for case in kept:
+        runs[case.seed].metrics[case.case] = case
+    return [recorded, *(run for seed, run in runs.items() if seed != recorded.seed)]
 
 
 def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:

@@ -7,7 +7,7 @@ twice; those that draw motions take traces, of one seed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import LinkErrors, leaders, phase_starts, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
+from experiments.report.metrics_files import Band
 from experiments.report.style import (
     BARS,
     CASES,
@@ -63,7 +64,12 @@ SOLID: Final = 0.95  # share of the time that marks cover where there is nothing
 __all__ = ["formation", "plan_view", "save", "svg"]  # besides those of this module
 
 
-def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = WIDTH) -> dict[str, Figure]:
+def every(
+    cases: Sequence[CaseMetrics],
+    traces: Sequence[Trace],
+    width: float = WIDTH,
+    bands: Mapping[str, Band] | None = None,
+) -> dict[str, Figure]:
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
     Figures without content are left out: all without a trace; ratios of a single case; pictures of space where no
@@ -72,6 +78,7 @@ def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = 
     Args:
         cases, traces: The run; several seeds of a case have one name.
         width: Of each figure [in].
+        bands: Of `errors`, where traces of most seeds are not known.
     """
     known = [trace for trace in traces if len(trace.time)]
     first = first_seed(known)
@@ -81,7 +88,7 @@ def every(cases: Sequence[CaseMetrics], traces: Sequence[Trace], width: float = 
         if any(map(has_heights, first)):
             figures["formation"] = formation(first, width)
     if first:
-        figures["errors"] = errors(known, cases, width)
+        figures["errors"] = errors(known, cases, width, bands)
     if len(by_case(cases)) > 1:
         figures["global_bars"] = global_bars(cases, width)
     if cases:
@@ -160,47 +167,43 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
 
 
 @styled
-def errors(traces: Sequence[Trace], cases: Sequence[CaseMetrics] = (), width: float = WIDTH) -> Figure:
+def errors(
+    traces: Sequence[Trace],
+    cases: Sequence[CaseMetrics] = (),
+    width: float = WIDTH,
+    bands: Mapping[str, Band] | None = None,
+) -> Figure:
     """Worst link of the formation and of each robot over time, as acquisition is judged, on a logarithmic axis.
 
     All cases in one axis; the tolerance is a band, the acquisition by all followers a marker; legs of the timeline are
     dashed (paper, figure 16, there Σ over the links on a linear axis). Of several seeds the median and the range.
 
     Args:
-        traces: Of all seeds; the first `MOST_SEEDS` of each case are drawn.
+        traces: Of all seeds.
         cases: Where acquisitions are taken from; no markers if left out.
         width: [in]
+        bands: Medians and ranges; `error_bands` of the traces if left out.
     """
     figure = Drawing(figsize=(width, min(0.5 * width + 0.75, 3.2)), layout="constrained")
     axes = figure.subplots()
-    grouped: dict[str, list[Trace]] = {}
-    for trace in traces:
-        grouped.setdefault(trace.case, []).append(trace)
+    first = {trace.case: trace for trace in first_seed(traces)}
     handles: dict[str, Artist] = {}
-    lowest, highest = np.inf, 0.0
-    for k, (name, runs) in enumerate(grouped.items()):
-        few = thinned(runs[0], 1)
+    lowest, highest, tolerance = np.inf, 0.0, traces[0].experiment.tolerance
+    for k, (name, band) in enumerate((bands or error_bands(traces)).items()):
         line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
-        robots = [_worst_links(trace)[few] for trace in runs[:MOST_SEEDS]]
-        length = min(map(len, robots))
-        time = runs[0].time[few][:length]
-        worst = np.stack([_largest(each[:length]) for each in robots])
-        middle, low, high = np.median(worst, axis=0), worst.min(axis=0), worst.max(axis=0)
-        if len(runs) > 1:
-            axes.fill_between(time, low, high, color=line["color"], alpha=0.25, linewidth=0.0)
-        else:
-            for mine in robots[0].T:
-                axes.plot(time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
-        axes.plot(time, middle, **line, linewidth=1.3, zorder=3)
+        if band.seeds > 1:
+            axes.fill_between(band.time, band.low, band.high, color=line["color"], alpha=0.25, linewidth=0.0)
+        elif name in first:
+            few = thinned(first[name], 1)
+            for mine in _worst_links(first[name])[few].T:
+                axes.plot(band.time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
+        axes.plot(band.time, band.middle, **line, linewidth=1.3, zorder=3)
         handles[plain(name)] = Line2D([], [], **line, linewidth=1.3)
-        known = low[np.isfinite(low) & (low > 0.0)]
+        known = band.low[np.isfinite(band.low) & (band.low > 0.0)]
         lowest = min(lowest, float(known.min(initial=np.inf)))
-        highest = max(highest, float(np.nanmax(high, initial=0.0)))
+        highest = max(highest, float(np.nanmax(band.high, initial=0.0)))
         at = _acquisitions([case for case in cases if case.case == name])
-        axes.plot(
-            at, [runs[0].experiment.tolerance] * len(at), "v", color=line["color"], ms=5.0, mec=PAPER, mew=0.5, zorder=4
-        )
-    tolerance = traces[0].experiment.tolerance
+        axes.plot(at, [tolerance] * len(at), "v", color=line["color"], ms=5.0, mec=PAPER, mew=0.5, zorder=4)
     axes.set_yscale("log")
     bottom = 10.0 ** math.floor(math.log10(min(max(lowest, LEAST_ERROR), 0.1 * tolerance)))
     axes.set_ylim(bottom, max(1.6 * highest, 4.0 * tolerance))
@@ -215,6 +218,26 @@ def errors(traces: Sequence[Trace], cases: Sequence[CaseMetrics] = (), width: fl
     axes.set_ylabel("error of the worst link [m]")
     legend_above(figure, (list(handles.values()), list(handles)), columns=4)
     return figure
+
+
+def error_bands(traces: Sequence[Trace]) -> dict[str, Band]:
+    """Median and range over the seeds of the error of the worst link of each case, thinned for print.
+
+    Args:
+        traces: Of all seeds; the first `MOST_SEEDS` of each case count.
+    """
+    grouped: dict[str, list[Trace]] = {}
+    for trace in traces:
+        grouped.setdefault(trace.case, []).append(trace)
+    found = {}
+    for name, runs in grouped.items():
+        few = thinned(runs[0], 1)
+        robots = [_worst_links(trace)[few] for trace in runs[:MOST_SEEDS]]
+        length = min(map(len, robots))
+        worst = np.stack([_largest(each[:length]) for each in robots])
+        time, middle = runs[0].time[few][:length], np.median(worst, axis=0)
+        found[name] = Band(len(robots), time, middle, worst.min(axis=0), worst.max(axis=0))
+    return found
 
 
 def _worst_links(trace: Trace) -> Array:

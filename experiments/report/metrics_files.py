@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
+from agents.arrays import Array
 from experiments.metrics.results import INDICES, Approach, CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 
@@ -101,3 +103,62 @@ def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
 def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
     """All metrics, one object per case."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(cases), indent=2) + b"\n")
+
+
+def read_json(path: Path) -> list[CaseMetrics]:
+    """The metrics of a file.
+
+    Raises:
+        ValueError: If they are those of another version.
+    """
+    return msgspec.json.decode(path.read_bytes(), type=list[CaseMetrics])
+
+
+class _Which(msgspec.Struct):
+    case: str
+    seed: int
+
+
+def cases_and_seeds(path: Path) -> list[tuple[str, int]]:
+    """Case and seed of all metrics in a file of any version, in order; empty if it holds none."""
+    try:
+        return [(each.case, each.seed) for each in msgspec.json.decode(path.read_bytes(), type=list[_Which])]
+    except (OSError, ValueError, RecursionError):
+        return []
+
+
+class Band(NamedTuple):
+    """Error of the worst link of a formation over several seeds."""
+
+    seeds: int
+    time: Array  # (T,) [s]
+    middle: Array  # (T,) [m] the median
+    low: Array  # (T,) [m]
+    high: Array  # (T,) [m]
+
+
+BANDS: Final = "errors.csv"
+_BAND: Final = ("case", "seeds", "time_s", "median_m", "lowest_m", "highest_m")
+
+
+def write_bands(path: Path, bands: Mapping[str, Band]) -> None:
+    """The errors over seeds of each case as a table: recordings of most seeds are not kept."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(_BAND)
+        for case, band in bands.items():
+            table.writerows(
+                (case, band.seeds, *(f"{value:.6g}" for value in row)) for row in zip(*band[1:], strict=True)
+            )
+
+
+def read_bands(path: Path) -> dict[str, Band]:
+    """What `write_bands` has written; empty if there is nothing of that kind."""
+    found: dict[str, list[list[float]]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                found.setdefault(row["case"], []).append([float(row[name]) for name in _BAND[1:]])
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return {case: Band(int(rows[0][0]), *np.array(rows).T[1:]) for case, rows in found.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +17,7 @@ from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, rea
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
 from experiments.report import figures, replay, scenery
+from experiments.report.metrics_files import Band
 from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
     DEFINITIONS,
@@ -81,6 +82,7 @@ def write(
     measured: Sequence[CaseMetrics] | None = None,
     notes: Sequence[str] = (),
     run: Path | None = None,
+    bands: Mapping[str, Band] | None = None,
 ) -> Path:
     """Writes the report of one run.
 
@@ -95,10 +97,11 @@ def write(
         text: The experiment file; the experiment of the first trace as JSON if left out.
         date: When the run was, see `date_of`; now if left out.
         name: Of the file.
-        measured: `measure` of each trace, if that was done already.
+        measured: `measure` of each trace, if that was done already; and of seeds whose traces are not known.
         notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
             interrupted is seen from the traces.
         run: Folder of the run; the same as `folder` if left out.
+        bands: Errors over all seeds, where most of their traces are not known.
 
     Raises:
         ValueError: If there is no trace (no robot had started: there is nothing to report), or one of less than two
@@ -109,7 +112,7 @@ def write(
     cases = [measure(trace) for trace in traces] if measured is None else measured
     first = figures.first_seed(traces)
     experiment = traces[0].experiment
-    seeds = sorted({trace.seed for trace in traces})
+    seeds = sorted({case.seed for case in cases})
     folder.mkdir(parents=True, exist_ok=True)
     made = _origin(
         folder if run is None else run, RunOrigin(command, date or date_of(time.time()), made_by=provenance())
@@ -122,7 +125,7 @@ def write(
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
-    drawn = _pictures(cases, traces)
+    drawn = _pictures(cases, traces, bands or figures.error_bands(traces))
     short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
@@ -154,12 +157,12 @@ def write(
     )
 
 
-def labelled(runs: Sequence[tuple[str, Sequence[Trace]]]) -> list[CaseMetrics]:
+def labelled(runs: Sequence[tuple[str, Sequence[CaseMetrics]]]) -> list[CaseMetrics]:
     """Metrics of all cases of several runs, by names that tell the runs apart."""
     return [
-        msgspec.structs.replace(measure(trace), case=_label(name, trace, traces))
-        for name, (_, traces) in zip(_distinct([name for name, _ in runs]), runs, strict=True)
-        for trace in traces
+        msgspec.structs.replace(case, case=_label(name, case, cases))
+        for name, (_, cases) in zip(_distinct([name for name, _ in runs]), runs, strict=True)
+        for case in cases
     ]
 
 
@@ -170,9 +173,10 @@ def result_tables(cases: Sequence[CaseMetrics]) -> list[Table]:
 
 def compare(
     target: Path,
-    runs: Sequence[tuple[str, Sequence[Trace]]],
+    runs: Sequence[tuple[str, Sequence[CaseMetrics]]],
     *,
     title: str = "Comparison of runs",
+    source: str = "",
     command: str = "",
     date: str = "",
     differences: Sequence[tuple[str, str, Sequence[str]]] = (),
@@ -181,16 +185,16 @@ def compare(
 
     Args:
         target: The file.
-        runs: Name and traces of each run; several seeds of a case within one run become means with 95 % intervals.
+        runs: Name and metrics of each run; several seeds of a case within one run become means with 95 % intervals.
             Runs of the same name are numbered.
-        title: Of the page.
+        title, source: Of the page; the source is shown below the title.
         command: How to do it again.
         date: Now if left out.
         differences: Name and folder of each run, and how its file, seeds and versions differ from the first one's;
             shown before anything else.
 
     Raises:
-        ValueError: If there is no trace, or one of less than two samples.
+        ValueError: If there is no case.
     """
     names, cases = _distinct([name for name, _ in runs]), labelled(runs)
     if not cases:
@@ -202,7 +206,6 @@ def compare(
         ("Runs", ", ".join(names)),
         ("Reference", cases[0].case),
     ]
-    experiments = dict.fromkeys(trace.experiment.title for _, traces in runs for trace in traces)
     how = [
         Row((name, folder, "; ".join(found) or ("the same file, seeds and versions" if k else "the reference")))
         for k, (name, folder, found) in enumerate(differences)
@@ -219,7 +222,6 @@ def compare(
         Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
-    source = "; ".join(experiments)
     return render(
         target,
         title=title,
@@ -257,25 +259,29 @@ def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
     return kept if kept is not None and kept.date else now  # another file of that name has no date
 
 
-def _pictures(cases: Sequence[CaseMetrics], traces: Sequence[Trace]) -> tuple[PageFigure, ...]:
+def _pictures(
+    cases: Sequence[CaseMetrics], traces: Sequence[Trace], bands: Mapping[str, Band]
+) -> tuple[PageFigure, ...]:
     legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
     seeds = len({case.seed for case in cases})
     seed = f" Seed {traces[0].seed}." if seeds > 1 else ""
     shown = [trace.experiment for trace in traces]
     of_cases = "all cases, the first one's robots named" if len({trace.case for trace in traces}) > 1 else "by robot"
-    curves = f"median and range of {min(seeds, figures.MOST_SEEDS)} seeds" if seeds > 1 else "single robots thin"
+    drawn_seeds = max((band.seeds for band in bands.values()), default=1)
+    curves = f"median and range of {drawn_seeds} seeds" if drawn_seeds > 1 else "single robots thin"
+    recorded = f"{seed} Recordings of the others are not kept." if seeds > 1 and drawn_seeds == 1 else ""
     captions = {
         "global_bars": _global_caption(cases),
         "formation": f"Trajectories in space, {of_cases}; start hollow, end full, with its links."
         f"{scenery.caption(shown, space=True)}{seed}",
         "robot_bars": _robot_caption(cases),
-        "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.",
+        "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.{recorded}",
         "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
         "delays": f"Delays of poses from stamp to arrival, all links; vertical: 95 % are shorter.{seed}",
     }
-    drawn = figures.every(cases, traces)
+    drawn = figures.every(cases, traces, bands=bands)
     return numbered((figure, captions[name]) for name, figure in drawn.items())
 
 
@@ -321,8 +327,8 @@ def _length(case: CaseMetrics) -> str:
     return f"{case.duration_s:.1f} s of {case.planned_s:g} s" if case.interrupted else f"{case.duration_s:g} s"
 
 
-def _label(name: str, trace: Trace, traces: Sequence[Trace]) -> str:
-    return name if len({each.case for each in traces}) == 1 else f"{name} · {trace.case}"
+def _label(name: str, case: CaseMetrics, cases: Sequence[CaseMetrics]) -> str:
+    return name if len({each.case for each in cases}) == 1 else f"{name} · {case.case}"
 
 
 def _interval_note(cases: Sequence[CaseMetrics]) -> str:

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -46,32 +46,36 @@ def report(
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
-    from experiments.run import reopen
+    from experiments.run import reopen_seeds
 
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
     _refuse_labels(labels, runs)
-    read = [reopen(folder) for folder in runs]
-    for folder, run in zip(runs, read, strict=True):
-        if not run.traces:
+    read = [reopen_seeds(folder) for folder in runs]
+    for folder, seeds in zip(runs, read, strict=True):
+        if not seeds[0].traces:
             raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
-    named = [(name, list(run.traces.values())) for name, run in zip(labels, read, strict=True)]
+    named = [
+        (name, [case for each in seeds for case in each.metrics.values()])
+        for name, seeds in zip(labels, read, strict=True)
+    ]
     if as_latex or as_markdown:
-        cases = pages.labelled(named) if len(read) > 1 else list(read[0].metrics.values())
+        cases = pages.labelled(named) if len(read) > 1 else named[0][1]
         print((typeset.latex if as_latex else typeset.markdown)(pages.result_tables(cases)))
         return 0
     target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
     try:
         if len(read) == 1:
-            write_figures_of_merit(read, target)
-            page = write_report(read, target, width)
+            write_figures_of_merit(read[0], target)
+            page = write_report(read[0], target, width)
         else:
-            page = pages.compare(target, named, differences=_differences(labels, runs))
+            titles = "; ".join(dict.fromkeys(seeds[0].title for seeds in read))
+            page = pages.compare(target, named, source=titles, differences=_differences(labels, runs))
     except OSError as error:
         raise RecordingError(
             f"{target}: cannot be written: {error.strerror}; choose another place with --out"
         ) from None
     if as_json:
-        print_json({"report": page, "runs": [{"folder": run.folder, **run.summary()} for run in read]})
+        print_json({"report": page, "runs": [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read]})
     else:
         print(page)
     return 0
@@ -236,16 +240,35 @@ def write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
     metrics_files.write_json(folder / "metrics.json", every)
 
 
+def summary(runs: Sequence[Run]) -> dict[str, Any]:
+    """The figures of a run for scripts: those of its first seed, and `across` its seeds if there are several."""
+    from experiments.metrics.statistics import across_seeds
+
+    found = runs[0].summary()
+    return found | ({"across": across_seeds([each.summary() for each in runs])} if len(runs) > 1 else {})
+
+
 def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
-    """Write figures and report of a run into its folder; return the report."""
+    """Write figures and report of a run into its folder; return the report.
+
+    Of seeds that are not recorded the figure of errors is drawn from the table that the run has left beside it.
+    """
+    from experiments.report import figures, metrics_files, style
     from experiments.report import report as pages
-    from experiments.report import style as figures
     from experiments.report.page import date_of
 
     every = [case for each in runs for case in each.metrics.values()]
     traces = [trace for each in runs for trace in each.traces.values()]
-    for name, figure in runs[0].figures(width).items():
-        figures.save(figure, folder / "figures", name)
+    recorded = len({trace.seed for trace in traces}) == len(runs)
+    place = Path(runs[0].folder or folder) / "figures" / metrics_files.BANDS
+    bands = {} if recorded else metrics_files.read_bands(place)
+    drawn = figures.every(every, traces, width, bands) | figures.shadow_figures(list(runs[0].traces.values()), width)
+    if not (recorded or bands):
+        drawn.pop("errors", None)  # the one that is there is of all seeds
+    for name, figure in drawn.items():
+        style.save(figure, folder / "figures", name)
+    if len(runs) > 1 and (bands or recorded):
+        metrics_files.write_bands(folder / "figures" / metrics_files.BANDS, bands or figures.error_bands(traces))
     return pages.write(
         folder,
         traces,
@@ -254,6 +277,7 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
         text=runs[0].source,
         measured=every,
         notes=[n for each in runs for n in each.notes],
+        bands=bands,
     )
 
 

@@ -30,7 +30,7 @@ from tools.commands.options import (
     print_json,
     warn,
 )
-from tools.commands.results import figure, write_figures_of_merit, write_report
+from tools.commands.results import figure, summary, write_figures_of_merit, write_report
 
 if TYPE_CHECKING:
     from experiments.file.document import Document
@@ -287,17 +287,12 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
     """Write and print the results."""
     import webbrowser
 
-    from experiments.metrics.statistics import across_seeds
-
     write_figures_of_merit(runs, folder)
     page = write_report(runs, folder) if show.report else None
-    summary: dict[str, Any] = runs[0].summary()
-    if len(runs) > 1:
-        summary["across"] = across_seeds([each.summary() for each in runs])
     if show.as_json:
-        print_json(summary)
+        print_json(summary(runs))
     else:
-        _print(runs, summary, page)
+        _print(runs, summary(runs), page)
     if show.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
 
@@ -345,14 +340,14 @@ def _command(origin: RunOrigin, options: RunOptions) -> str:
     return " ".join([*parts, *(["--anyway"] if origin.anyway else [])])
 
 
-def _print(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> None:
+def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> None:
     """Print the results in a few lines."""
     from experiments.report import verdict
 
     for finding in verdict.interruptions([case for each in runs for case in each.metrics.values()]):
         print(finding.text)
-    across = summary.get("across")
-    for name, case in summary["cases"].items():
+    across = found.get("across")
+    for name, case in found["cases"].items():
         mean, ratio = case["mean"], case["ratio"]
         spread = {"f_hz": "", "iae": "", "rmse": ""}
         if across is not None:
@@ -370,7 +365,7 @@ def _print(runs: Sequence[Run], summary: dict[str, Any], page: Path | None) -> N
         line += f", lost {lost}"
         if dropped := sum(r["dropped"] for r in case["robots"].values()):
             line += f", {dropped} dropped by the modelled network"
-        if name != next(iter(summary["cases"])):
+        if name != next(iter(found["cases"])):
             line += f"   (ratios: f {figure(ratio['f_hz'])}, IAE {figure(ratio['iae'])})"
         print(line)
     for finding in verdict.contacts([case for each in runs for case in each.metrics.values()]):

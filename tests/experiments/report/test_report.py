@@ -79,6 +79,10 @@ def checked(html: str) -> Page:
     return page
 
 
+def measured(traces):
+    return [measure(trace) for trace in traces]
+
+
 @pytest.fixture(scope="module")
 def run():
     return [park(), park("event", 0.01)]
@@ -185,14 +189,15 @@ def test_report_of_a_run_in_which_a_robot_died_and_samples_were_lost(tmp_path):
 
 def test_comparison_has_a_column_per_run_and_case(tmp_path, run):
     target = tmp_path / "there" / "compare.html"
-    page = checked(report.compare(target, [("monday", run), ("tuesday", [park("event", 0.02)])]).read_text())
+    runs = [("monday", measured(run)), ("tuesday", measured([park("event", 0.02)]))]
+    page = checked(report.compare(target, runs).read_text())
     for words in ("monday · periodic", "monday · event", "tuesday", "× is relative to monday · periodic."):
         assert words in page.words
 
 
 def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
     differ = [("A", "runs/a", []), ("B", "runs/b", ["duration_s 45 → 44", "seeds: 1 → 2", "x 1 → 2"])]
-    path = report.compare(tmp_path / "c.html", [("A", run[:1]), ("B", run[1:])], differences=differ)
+    path = report.compare(tmp_path / "c.html", [("A", measured(run[:1])), ("B", measured(run[1:]))], differences=differ)
     html = path.read_text(encoding="utf-8")
     said = checked(html).words.split("</style>")[-1]
     assert "! B differs in duration_s 45 → 44; seeds: 1 → 2 and 1 more." in said
@@ -201,7 +206,11 @@ def test_comparison_shows_first_how_the_runs_differ(tmp_path, run):
 
 
 def test_the_same_run_twice_is_two_columns(tmp_path, run):
-    page = checked(report.compare(tmp_path / "c.html", [("a", run[:1]), ("a", run[:1]), ("a", run)]).read_text())
+    page = checked(
+        report.compare(
+            tmp_path / "c.html", [("a", measured(run[:1])), ("a", measured(run[:1])), ("a", measured(run))]
+        ).read_text()
+    )
     for words in ("a, a (2), a (3)", "relative to a.", "a (3) · event"):
         assert words in page.words
     assert "±" not in page.words.split("Definitions")[0]

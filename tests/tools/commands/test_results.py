@@ -1,0 +1,70 @@
+"""Reports that are made again, tables for papers, and the lines that a run prints."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.experiments.recording.test_bundle import SHORT
+from tools.main import app
+
+
+def zenpark(*words: str) -> str:
+    done = CliRunner().invoke(app, [*words])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Folder of a run of two cases and three seeds, and what the command printed."""
+    folder = tmp_path_factory.mktemp("results")
+    (folder / "short.toml").write_text(SHORT)
+    out = str(folder / "run")
+    return folder / "run", zenpark("run", str(folder / "short.toml"), "--virtual", "--seeds", "3", "--out", out)
+
+
+def test_a_report_made_again_keeps_the_seeds_that_are_not_recorded(three: tuple[Path, str], tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(three[0], again)
+    for k, file in enumerate(("event.mcap", "periodic.mcap")):
+        os.utime(again / file, (k, k))  # as unpacked from an archive: the reference stays the first one
+    found = json.loads(zenpark("report", str(again), "--json"))
+    assert found["runs"][0]["across"]["seeds"] == [1, 2, 3]
+    before, after = (json.loads((folder / "metrics.json").read_bytes()) for folder in (three[0], again))
+    assert [(each["case"], each["seed"]) for each in after] == [(each["case"], each["seed"]) for each in before]
+    assert after[2:] == before[2:]
+    assert "median and range of 3 seeds" in (again / "report.html").read_text()
+    assert (again / "figures/errors.csv").read_bytes() == (three[0] / "figures/errors.csv").read_bytes()
+
+
+def test_without_the_errors_of_all_seeds_their_figure_stays(three: tuple[Path, str], tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(three[0], again)
+    (again / "figures" / "errors.csv").unlink()
+    zenpark("report", str(again))
+    assert (again / "figures/errors.svg").read_bytes() == (three[0] / "figures/errors.svg").read_bytes()
+    assert "Recordings of the others are not kept." in (again / "report.html").read_text()
+
+
+def test_metrics_of_another_version_are_not_overwritten(three: tuple[Path, str], tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(three[0], again)
+    (again / "metrics.json").write_text((again / "metrics.json").read_text().replace('"iae"', '"iae_of_old"'))
+    before = (again / "metrics.json").read_bytes()
+    done = CliRunner().invoke(app, ["report", str(again)])
+    assert done.exit_code != 0
+    assert (again / "metrics.json").read_bytes() == before
+
+
+def test_tables_for_papers_are_over_all_seeds(three: tuple[Path, str]) -> None:
+    for form in ("--latex", "--markdown"):
+        text = zenpark("report", str(three[0]), form)
+        assert "3 seeds" in text
+        assert text.count("±") + text.count(r"\pm") > 10
+        assert zenpark("report", str(three[0]), str(three[0]), form).count("3 seeds")
