@@ -33,6 +33,7 @@ class Phase(IntEnum):
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
 AT_HEIGHT = 0.05  # [m] from the hover height: arrived
+FINISHED, TOLD_TO_END = "finished", "told to end"  # reasons for a landing that is no fault; orders are others
 SETTLED = 0.1  # [m/s] slower: climbing or rolling has ended
 
 
@@ -157,7 +158,7 @@ class Lifecycle:
         if highest >= RUNNING:
             over = (phase == RUNNING) & (t - self.start_at >= self._duration - 1e-6)
             for row in np.flatnonzero(over) if over.any() else ():
-                self.land(int(row), "finished")
+                self.land(int(row), FINISHED)
         if highest >= LANDING:
             slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # an unknown velocity counts as slow
             down = (phase == LANDING) & np.where(self._flies, ~flying, slow)

@@ -26,7 +26,7 @@ from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import uptime
 from agents.decision.assignment import Assignment
-from agents.decision.lifecycle import Phase
+from agents.decision.lifecycle import TOLD_TO_END, Phase
 from agents.decision.transmission import Transmission
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -122,7 +122,7 @@ class Runtime:
 
     def _reason(self, asked: bool) -> str | None:
         if asked:
-            return "told to end"
+            return TOLD_TO_END
         return "ordered to leave" if len(self._leaving) == len(self._names) else None
 
     def _come_down(self) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agents.arrays import Array, Index
-from agents.decision.lifecycle import Phase
+from agents.decision.lifecycle import FINISHED, Phase
 from agents.formation.graph import Links
 from agents.network import messages
 from agents.plugins import registry
@@ -292,7 +292,7 @@ class Logbook:
                     robot=name,
                     stamp=EPOCH + end,
                     phase=phase,
-                    reason=unsafe.get(row, "finished"),
+                    reason=unsafe.get(row, FINISHED),
                     body="",
                     battery=None,
                     sent=int(sent[done][row]),

@@ -11,7 +11,7 @@ from math import inf
 from typing import Final, Literal, Protocol, Self
 
 from agents.clock import Clock
-from agents.decision.lifecycle import Phase
+from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
 from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
 from agents.network import session as network
@@ -29,6 +29,8 @@ BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behin
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
+# beginnings of reasons for a landing that a user or the conductor wanted; every other one is a fault
+ASKED: Final = (FINISHED, "ordered to ", messages.EMERGENCY, TOLD_TO_END)
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
 
 
@@ -227,6 +229,8 @@ class NetworkView:
             if incident.seq > view.last_incident:
                 view.last_incident = incident.seq
                 self.report("hazard", status.robot, incident.text)
+        if _fell_out(view.status, status):
+            self.report("hazard", status.robot, f"land: {status.reason}")
         note = re.sub(r"[\d.]+", "", status.body)  # of a silence whose seconds count up, one is reported
         if note != view.note:
             view.note = note
@@ -240,6 +244,17 @@ class NetworkView:
         view.status = status
         view.origin = status.origin or view.origin
         view.behind = min(view.behind, self.clock.utc() - status.stamp)
+
+
+def _fell_out(before: messages.Status | None, now: messages.Status) -> bool:
+    """Whether a robot has landed for a fault that none of its hazards tells: its loop hung, or its starter is gone.
+
+    Its process may have recovered, and know of the fault only from outside of its loop (`agents.runtime.watchdog`).
+    """
+    if before is None or before.pid != now.pid or before.phase not in ("ready", "airborne", "running"):
+        return False
+    told = any(incident.text.startswith(("land: ", "cut: ")) for incident in now.incidents)
+    return now.phase in ("landing", "done") and not (told or now.reason.startswith(ASKED))
 
 
 class Shown(Protocol):

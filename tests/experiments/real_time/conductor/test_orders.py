@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 
+import msgspec
 import pytest
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
+from agents.safety.hazards import failed
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView
 from tests.conftest import RouterProcess
@@ -71,3 +73,38 @@ def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
     assert view.robots["TB01"].began == START + 0.28
     view.robots["TB01"].forget_process()
     assert view.robots["TB01"].began is None
+
+
+@pytest.mark.parametrize(
+    ("reason", "incidents", "fault"),
+    [
+        ("its control loop hangs: no tick for 0.5 s", (), True),
+        ("its control loop hangs: no tick for 0.5 s", ("over: a neighbour is lost, after 2.00 s",), True),
+        ("the starter is gone", (), True),
+        ("its battery is low", ("land: its battery is low: 5% (limit 10%)",), False),
+        ("finished", (), False),
+        ("ordered to land", (), False),
+        ("ordered to leave", (), False),
+        ("told to end", (), False),
+        ("emergency stop by a test", (), False),
+    ],
+)
+def test_a_landing_that_nobody_asked_for_is_a_hazard_with_its_reason_once(
+    reason: str, incidents: tuple[str, ...], fault: bool
+) -> None:
+    view = NetworkView.__new__(NetworkView)
+    view.clock = Clock()
+    view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
+    view.robots = view._progress.robots
+    said = []
+    view.report = lambda kind, source, text: said.append((kind, source, text))  # type: ignore[method-assign]
+    told = [messages.Incident(k + 1, START, text) for k, text in enumerate(incidents)]
+    for at, phase in enumerate(("running", "landing", "landing", "done")):
+        down = phase != "running"
+        made = msgspec.structs.replace(
+            status(at=float(at)), phase=phase, reason=reason if down else "", incidents=told if down else []
+        )
+        view._receive_status(made)
+    found = [text for kind, source, text in said if (kind, source) == ("hazard", "TB01")]
+    assert found == [*incidents, *([f"land: {reason}"] if fault else [])]
+    assert any(failed(text) for text in found) == (fault or reason == "its battery is low")
