@@ -72,7 +72,7 @@ EXPLAINED: Final = (
     ("experiments.file.problems", "DocumentError"),
     ("experiments.recording.reader", "RecordingError"),
     ("experiments.report.export", "ExportError"),
-    ("experiments.real_time.conductor.conductor", "RunFailed"),
+    ("experiments.real_time.conductor.run_view", "RunFailed"),
     ("experiments.real_time.hosts.hosts", "HostError"),
     ("experiments.virtual_time.conductor", "Stuck"),
     ("experiments.sweep.workers", "SweepError"),

@@ -175,6 +175,8 @@ def conductor() -> Iterator[Target]:
     experiment = document.read("triangle").experiment
 
     class Nobody:
+        last_silence = -np.inf
+
         def died(self) -> list[object]:
             return []
 

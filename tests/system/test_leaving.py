@@ -110,3 +110,16 @@ def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path,
                 process.kill()
             except psutil.NoSuchProcess:
                 continue
+
+
+def test_a_conductor_that_stood_still_gives_no_further_order(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--no-report")
+    flight.until_said(r"phase conductor: formation", 60.0)
+    robots = [process for name, process in flight.children().items() if name in ("KH01", "KH02", "CF01")]
+    flight.signal(signal.SIGSTOP)
+    until(lambda: gone(robots), "the robots land and end", 40.0)
+    flight.signal(signal.SIGCONT)
+    code, _ = flight.finish()
+    assert code == 2
+    assert "this process stood still for more than 3 s; its robots have landed without it" in flight.said()
+    assert "landing" not in [line.rpartition("phase conductor: ")[2] for line in flight.said().splitlines()]

@@ -27,8 +27,7 @@ from agents.runtime.lifeline import Lifeline
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
-from experiments.real_time.conductor.conductor import RunFailed
-from experiments.real_time.conductor.run_view import Progress
+from experiments.real_time.conductor.run_view import Progress, RunFailed
 from experiments.real_time.conductor.support import StandInError
 from experiments.real_time.hosts.hosts import HostError
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged

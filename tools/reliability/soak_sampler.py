@@ -18,7 +18,7 @@ from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from experiments.definition.experiment import Experiment
-from experiments.real_time.conductor.conductor import RunFailed
+from experiments.real_time.conductor.run_view import RunFailed
 from experiments.real_time.hosts.launcher import Launcher
 from tools.reliability.run_process import Request, WatchedRun, usage_of
 from tools.reliability.soak_verdict import COLUMNS, Row, Soaked

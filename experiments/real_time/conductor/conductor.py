@@ -22,7 +22,16 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.hot_changes import CLIMB_S, HotChanges
 from experiments.real_time.conductor.orders import start_lead_s
-from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S, OUTPUT, NetworkView, Progress, RobotView, Show
+from experiments.real_time.conductor.run_view import (
+    AHEAD_S,
+    BEHIND_S,
+    OUTPUT,
+    NetworkView,
+    Progress,
+    RobotView,
+    RunFailed,
+    Show,
+)
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
 
@@ -34,10 +43,6 @@ ADOPT_S: Final = 0.5
 MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
-
-
-class RunFailed(RuntimeError):
-    """A run that could not begin, with reason and remedy."""
 
 
 @dataclass(frozen=True)

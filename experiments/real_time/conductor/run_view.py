@@ -18,6 +18,7 @@ from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.shutdown import held
+from agents.runtime.lifeline import SILENCE_S
 from experiments.definition import mesh
 from experiments.file import document
 from experiments.real_time.conductor import orders
@@ -108,6 +109,10 @@ class News:
 Show = Callable[[Progress], None]
 
 
+class RunFailed(RuntimeError):
+    """A run that could not begin or go on, with reason and remedy."""
+
+
 class NetworkView:
     """The network as the conductor of a case sees it."""
 
@@ -118,6 +123,7 @@ class NetworkView:
             Unreachable: If no router answers.
         """
         self.clock, self.robots, self._progress = progress.clock, progress.robots, progress
+        self._launcher, self._begun = context.launcher, time.monotonic()
         experiment, endpoints = context.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
         opened = network.open_session(
@@ -157,7 +163,17 @@ class NetworkView:
         self._experiment.undeclare()  # type: ignore[no-untyped-call]
 
     def update(self) -> list[str]:
-        """Receive all since the last update; return the robots whose token has vanished for good."""
+        """Receive all since the last update; return the robots whose token has vanished for good.
+
+        Raises:
+            RunFailed: If this process stood still for so long that its robots have landed; other ones may have their
+                names now.
+        """
+        if self._launcher.last_silence > self._begun:
+            raise RunFailed(
+                f"this process stood still for more than {SILENCE_S:g} s; its robots have landed without it, and get "
+                "no further order: robots of these names may belong to another run now"
+            )
         self.recording_begun |= any(there for _, there in self._recorder_watch.changes())
         for status in self._statuses.read():
             self._receive_status(status)

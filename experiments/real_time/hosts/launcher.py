@@ -18,12 +18,13 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
 from agents.clock import Clock
-from agents.runtime.lifeline import BEAT_S
+from agents.runtime.lifeline import BEAT_S, SILENCE_S
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
 LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
@@ -93,10 +94,12 @@ class Launcher:
         self._processes: dict[str, Process] = {}
         self._lock = threading.Lock()
         self._over = threading.Event()
+        self._silence_at, self._beat_at = -inf, time.monotonic()
         self._beat = threading.Thread(target=self._beats, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
         self._logs.mkdir(parents=True, exist_ok=True)
+        self._beat_at = time.monotonic()
         self._beat.start()
         return self
 
@@ -225,8 +228,15 @@ class Launcher:
         if process.handle.stdout is not None:
             process.handle.stdout.close()
 
+    @property
+    def last_silence(self) -> float:
+        """Time of the last silence of the heartbeat that made all processes land and end [monotonic s]; -inf: none."""
+        now = time.monotonic()
+        return now if now - self._beat_at > SILENCE_S + BEAT_S else self._silence_at
+
     def _beats(self) -> None:
         while not self._over.wait(BEAT_S):
+            self._silence_at, self._beat_at = self.last_silence, time.monotonic()
             with self._lock:
                 for process in self._processes.values():
                     process.unsent += b"" if process.unsent else b"\n"

@@ -1,7 +1,9 @@
 """Who serves a whole run is started again, where others look for it, and not for ever."""
 
+import math
 import re
 import socket
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -53,3 +55,11 @@ def test_a_port_that_another_run_took_at_the_same_moment_ends_the_run(tmp_path):
         free = Router("router2", [free_endpoint(preferred_port=0)])
         free.start(launcher)
         await_routers(launcher, [free])
+
+
+def test_a_launcher_that_stood_still_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
+    launcher, zero = Launcher(tmp_path), time.monotonic()
+    for since, silence in ((3.0, -math.inf), (3.7, zero + 3.7), (40.0, zero + 40.0)):
+        with monkeypatch.context() as patched:
+            patched.setattr(time, "monotonic", lambda at=zero + since: at)
+            assert launcher.last_silence == silence
