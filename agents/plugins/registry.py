@@ -59,13 +59,17 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
 
     Raises:
         UnknownPlugin: If there is none, with the nearest name or all of them.
-        PluginError: If its module fails to import, with the distribution it came from and why.
+        PluginError: If two distributions register different ones under this name, or if its module fails to import,
+            with the distribution it came from and why.
     """
     known = _registered(group)
+    what = group.rpartition(".")[2]
     if name not in known:
-        what = group.rpartition(".")[2]
         raise UnknownPlugin(f"no {name!r} among the {what}; {did_you_mean(name, sorted(known)) or 'none is installed'}")
-    entry = known[name]
+    entry, *rivals = known[name]
+    if rivals:
+        owners = " and ".join(_origin(each) for each in known[name])
+        raise PluginError(f"{name!r} among the {what} is ambiguous: {owners}; give one of them another name")
     try:
         return entry.load()
     except _IMPORT_FAILURES as error:
@@ -77,12 +81,16 @@ def struct(group: str, name: str) -> type[msgspec.Struct]:
 
     Raises:
         UnknownPlugin: If there is none.
-        PluginError: If it fails to import or is no `msgspec.Struct`.
+        PluginError: If it fails to import, or is no frozen `msgspec.Struct`.
     """
     plugin = load(group, name)
+    origin = _origin(_registered(group)[name][0])
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
+        raise PluginError(f"{origin} is no msgspec.Struct; its parameters must be its fields")
+    if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
-            f"{_origin(_registered(group)[name])} is no msgspec.Struct; its parameters must be its fields"
+            f"{origin} can be changed, and would mix what it keeps of different robots and runs; declare it with "
+            "frozen=True and keep nothing in it (triggers: memory(rows))"
         )
     return plugin
 
@@ -96,7 +104,7 @@ def build(group: str, choice: str | Mapping[str, Any]) -> Any:  # noqa: ANN401 -
 
     Raises:
         UnknownPlugin: If there is none of that name.
-        PluginError: If it cannot be imported or is no `msgspec.Struct`.
+        PluginError: If it cannot be imported or is no frozen `msgspec.Struct`.
         msgspec.ValidationError: If a parameter is unknown, missing or out of range, with its path `$.parameter`.
     """
     name, parameters = split(choice)
@@ -139,8 +147,14 @@ def _installed() -> _Groups:
 
 
 @cache
-def _registered(group: str) -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in _installed().select(group=group)}
+def _registered(group: str) -> dict[str, list[EntryPoint]]:
+    """Entry points of a group by name: one each, unless distributions register different objects under one name."""
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in _installed().select(group=group):
+        same = found.setdefault(entry.name, [])
+        if entry.value not in {each.value for each in same}:  # a distribution may be found twice, by two paths
+            same.append(entry)
+    return found
 
 
 def _origin(entry: EntryPoint) -> str:

@@ -1,4 +1,5 @@
 from importlib.metadata import EntryPoint
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -19,6 +20,10 @@ class Pulse(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("width must be positive")
 
 
+class Keeper(msgspec.Struct, dict=True):
+    width: float = 1.0
+
+
 @pytest.fixture
 def foreign(monkeypatch):
     """A group of plug-ins as a stranger's distribution would register it."""
@@ -28,8 +33,16 @@ def foreign(monkeypatch):
         "gone": EntryPoint("gone", "no_such_module_anywhere:Thing", "test"),
         "misnamed": EntryPoint("misnamed", f"{here}:Puls", "test"),
         "function": EntryPoint("function", f"{here}:foreign", "test"),
+        "keeper": EntryPoint("keeper", f"{here}:Keeper", "test"),
     }
-    monkeypatch.setattr(registry, "_registered", lambda group: entries)
+    listed = [
+        *entries.values(),
+        entries["pulse"],
+        EntryPoint("twice", "one:A", "test"),
+        EntryPoint("twice", "two:B", "test"),
+    ]
+    monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: listed))
+    monkeypatch.setattr(registry, "_registered", registry._registered.__wrapped__)
     return "test"
 
 
@@ -123,3 +136,14 @@ def test_body_name(address, name):
 )
 def test_did_you_mean(word, known, answer):
     assert registry.did_you_mean(word, known) == answer
+
+
+def test_two_of_one_name_are_refused_not_chosen_from(foreign):
+    with pytest.raises(registry.PluginError, match=r"'twice' .* is ambiguous: .*one:A.* and .*two:B.*another name"):
+        registry.load(foreign, "twice")
+    assert registry.struct(foreign, "pulse") is Pulse, "found by two paths, it is one"
+
+
+def test_a_plugin_that_can_be_changed_is_refused(foreign):
+    with pytest.raises(registry.PluginError, match=r"Keeper.* can be changed.* frozen=True"):
+        registry.build(foreign, "keeper")
