@@ -48,6 +48,7 @@ WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # a robot whose position is known for less of the run was out of reach
+GAP_S: Final = 0.5  # [s] shorter times without a position are not named
 KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
 
 
@@ -154,6 +155,9 @@ def measure(trace: Trace) -> CaseMetrics:
         avoided_share=_share(trace.avoided.sum(), ticks),
         world_factor=_slowest(trace),
         away_s=network_away(np.asarray(np.isfinite(trace.true_position).all(axis=2)), trace.time)[0],
+        gaps=tuple(
+            f"{names[row]} from {begin:.1f} to {end:.1f} s" for row, begin, end in errors.gaps() if end - begin > GAP_S
+        ),
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
         failures=_failures(trace, robots),
         network_messages=sum(robot.messages + robot.goals for robot in robots),

@@ -199,6 +199,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     # [s] without any robot's position, all of which came back: the network was away. `known`, `coverage`, acquisition
     # and settling are over the rest
     away_s: float = 0.0
+    # times without a robot's position that ended, one phrase each: errors leave them out, acquisition bridges them
+    gaps: tuple[str, ...] = ()
     # found by conductor and recorder: robots that began late, messages that could not be read
     troubles: tuple[str, ...] = ()
     # robots that did not do their part: out of reach, lost, did not move, fell, landed or were cut; one sentence each

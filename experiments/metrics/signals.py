@@ -59,6 +59,7 @@ class LinkErrors:
     error: Array
     alive: Mask  # (T, N) whether the robot's own position is known
     away: Mask  # (T,) the network was away, see `network_away`: unknown positions then tell nothing of a robot
+    gone: Mask  # (T, N) from then on neither a robot's position nor an error of its links is known any more
 
     @classmethod
     def of_trace(cls, trace: Trace) -> LinkErrors:
@@ -70,12 +71,14 @@ class LinkErrors:
         alive &= ~blind
         place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
         error = errors_over_time(trace.plan.law, pattern, trace.time, place)
-        return cls(trace.time, pattern.links, own, error, alive, away)
+        gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
+        return cls(trace.time, pattern.links, own, error, alive, away, np.asarray(gone))
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
         rows = slice(begin, end)
-        return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], self.alive[rows], self.away[rows])
+        masks = (self.alive[rows], self.away[rows], self.gone[rows])
+        return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], *masks)
 
     def per_robot(self) -> Array:
         """e_i(t) = Σ_j e_ij (T, N) [m] over its own links, see `error`; NaN where none of them is known."""
@@ -88,12 +91,25 @@ class LinkErrors:
         """Per robot, from when on the mean of each of its links over `window` samples stays within the tolerance [m].
 
         Seconds since the first sample; None if the last sample is still outside. A neighbour that died does not count.
+        While nothing is known of a robot that comes back, it is where it was before: outside, if never seen inside.
         """
-        known = np.isfinite(self.error)
         total, count = self._over_window(window)
-        outside = total > tolerance * count + 1e-12
-        unknown = ((known.astype(float) @ self.own == 0.0) | ~self.alive) & ~self.away[:, None]
-        return after_last((outside.astype(float) @ self.own > 0.0) | unknown, self.time)
+        outside = (total > tolerance * count + 1e-12).astype(float) @ self.own > 0.0
+        known = (np.isfinite(self.error) @ self.own > 0.0) & self.alive
+        last = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, None], -1), axis=0)
+        before = np.take_along_axis(outside, np.maximum(last, 0), axis=0) | ((last < 0) & ~self.away[:, None])
+        return after_last(before | self.gone, self.time)
+
+    def gaps(self) -> list[tuple[int, float, float]]:
+        """Times [s, s] without the position of a robot, by its row, until it is known again; no absence of all."""
+        unknown = ~self.alive & ~self.away[:, None] & np.maximum.accumulate(self.alive, axis=0)
+        found = []
+        for row in range(self.alive.shape[1]):
+            edges = np.flatnonzero(np.diff(unknown[:, row], prepend=False, append=False))
+            for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+                if end < len(self.time):
+                    found.append((row, float(self.time[begin]), float(self.time[end])))
+        return found
 
     def moving_mean(self, window: int) -> Array:
         """Mean of each link over the last `window` samples (T, E) [m], as `acquired` judges it; NaN without any."""

@@ -64,6 +64,10 @@ NETWORK: Final = (
     "The effects that the file asks of the network, on top of the real network's own: dropped poses did arrive, and "
     "were discarded. Delays are from the stamp of a pose to its arrival, whatever caused them."
 )
+SAME_STARTS: Final = (
+    "All seeds begin at the same poses: intervals (±) are of noise and network alone; "
+    "`[start] scatter` varies the starts."
+)
 DIFFERENCES: Final = (
     "Experiment file, options, seeds, code and versions. What follows is to be read with these in mind."
 )
@@ -144,6 +148,8 @@ def write(
         Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
     ]
     first_of_all, verdict = [*failures(cases), *interruptions(cases)], findings(cases)
+    if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
+        verdict.append(Finding("plain", SAME_STARTS))
     return render(
         folder / name,
         title=experiment.title,

@@ -34,11 +34,12 @@ SUMMARY: Final = (
     ("itae", "ITAE [m s²]"),
     ("rmse", "RMSE [m]"),
     ("acquired_s", "Acquired, mean over followers [s]"),
+)
+TROUBLES: Final = (
     ("lost", "Lost samples"),
     ("dropped", "Dropped by the modelled network"),
     ("missed_deadlines", "Missed deadlines"),
 )
-TROUBLES: Final = ("lost", "dropped", "missed_deadlines")  # rows that are hidden where none occurred
 DEFINITIONS: Final = (
     ("e(t)", "Formation error of a robot: the sum of |distance − target distance| over the links on which it listens;"
      " for one without incoming links, over its outgoing ones. Taken on true positions."),
@@ -106,11 +107,7 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
             return text
         return text, f"× {share.mean:.3f}" + ("" if share.ci95 is None else f" ± {share.ci95:.3f}")
 
-    rows = [
-        Row((label, *(cell(runs, index) for runs in grouped.values())))
-        for index, label in SUMMARY
-        if index not in TROUBLES or any(run.mean[index] for run in cases)
-    ]
+    rows = [Row((label, *(cell(runs, index) for runs in grouped.values()))) for index, label in SUMMARY]
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
     note += f" Means over {seeds} seeds with their 95 % confidence intervals." if seeds > 1 else ""
@@ -161,6 +158,11 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Cost": [("J2", attrgetter("j2"), 1.0)],
     }
     tables = [_across(unit, cases, lines) for unit, lines in units.items()]
+    sums = [
+        Row((label, *(number(sum(getattr(run, field) for run in runs)) for runs in by_case(cases).values())))
+        for field, label in TROUBLES
+    ]
+    tables.append(Table((f"Sum over all robots{' and seeds' if over else ''}", *by_case(cases)), tuple(sums)))
     if any(case.belief for case in cases):  # a formation that was never acquired is a result
         return tables[0], *(shown for table in tables[1:] if (shown := _occurred(table)).rows)
     return tuple(shown for table in tables if (shown := _occurred(table)).rows)

@@ -23,6 +23,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_nothing_lost(cases),
         *_modelled(cases),
         *_deadlines(cases),
+        *_gaps(cases),
         *_died(cases),
         *_guided(cases),
         *_formation(cases),
@@ -115,12 +116,22 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
         return []
     if not any(case.missed_deadlines for case in cases):
         return [Finding("good", "No deadline was missed.")]
-    worst = max(cases, key=lambda case: case.missed_share or 0.0)
-    share = worst.missed_share or 0.0
-    text = (
-        f"Deadlines were missed: {number(worst.missed_deadlines)} in {worst.case}, {100.0 * share:.2g} % of all ticks."
-    )
-    return [Finding("fair" if share < 0.01 else "bad", text)]
+    words = []
+    for name, runs in by_case(cases).items():
+        if missed := sum(run.missed_deadlines for run in runs):
+            share = spread([run.missed_share for run in runs]).mean or 0.0
+            words.append(f"{number(missed)} in {name} ({100.0 * share:.2g} % of its ticks)")
+    worst = max(case.missed_share or 0.0 for case in cases)
+    return [Finding("fair" if worst < 0.01 else "bad", f"Deadlines were missed: {_list(words)}.")]
+
+
+def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Times without the position of a robot that came back."""
+    return [
+        Finding("fair", f"Position unknown in {case.case}: {_first(case.gaps)}; neither in nor out of the tolerance.")
+        for case in cases
+        if case.gaps
+    ]
 
 
 def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:

@@ -346,35 +346,43 @@ def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Non
 
     for finding in verdict.interruptions([case for each in runs for case in each.metrics.values()]):
         print(finding.text)
-    across = found.get("across")
-    for name, case in found["cases"].items():
-        mean, ratio = case["mean"], case["ratio"]
-        spread = {"f_hz": "", "iae": "", "rmse": ""}
-        if across is not None:
-            means = across["cases"][name]
-            mean, ratio = ({k: v["mean"] for k, v in means[what].items()} for what in ("mean", "ratio"))
-            spread = {k: f" ± {figure(means['mean'][k]['ci95'])}" for k in spread}
-        lost = sum(r["lost"] for r in case["robots"].values())
-        line = f"{name:>12}: {figure(mean['f_hz'])}{spread['f_hz']} messages/s"
-        if mean["iae"] is None:
-            line += ", no link was measured"
-        else:
-            acquired = "never" if mean["acquired_s"] is None else f"{mean['acquired_s']:.1f} s"
-            line += f", IAE {figure(mean['iae'])}{spread['iae']}, RMSE {figure(mean['rmse'])}{spread['rmse']} m"
-            line += f", acquired {acquired} (mean)"
-        line += f", lost {lost}"
-        if dropped := sum(r["dropped"] for r in case["robots"].values()):
-            line += f", {dropped} dropped by the modelled network"
-        if name != next(iter(found["cases"])):
-            line += f"   (ratios: f {figure(ratio['f_hz'])}, IAE {figure(ratio['iae'])})"
-        print(line)
+    for name in found["cases"]:
+        print(_case_line(name, runs, found))
     for finding in verdict.contacts([case for each in runs for case in each.metrics.values()]):
         if finding.mark == "bad":
             print(finding.text)
-    if across is not None:
+    if len(runs) > 1:
         print(f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)")
     for note in runs[0].notes:
         print(f"note: {note}")
     print(f"run: {runs[0].folder}")
     if page is not None:
         print(f"report: {page}")
+    print(f"replay in the browser: ./zenpark view {runs[0].folder}")
+
+
+def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
+    """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
+    from experiments.metrics.statistics import Spread
+    from experiments.report.page import NONE, interval
+
+    case = found["cases"][name]
+    mean, ratio = ({k: figure(v) for k, v in case[what].items()} for what in ("mean", "ratio"))
+    if "across" in found:
+        means = found["across"]["cases"][name]
+        mean, ratio = ({k: interval(Spread(**v)) for k, v in means[what].items()} for what in ("mean", "ratio"))
+    measured = [each.metrics[name] for each in runs if name in each.metrics]
+    line = f"{name:>12}: {mean['f_hz']} messages/s"
+    if case["mean"]["iae"] is None:
+        line += ", no link was measured"
+    else:
+        never = mean["acquired_s"] in {"?", NONE}
+        line += f", IAE {mean['iae']}, RMSE {mean['rmse']} m"
+        line += f", acquired {'never' if never else mean['acquired_s'] + ' s'} (mean)"
+    line += f", lost {sum(each.lost for each in measured)}"
+    for field, words in (("missed_deadlines", "deadlines missed"), ("dropped", "dropped by the modelled network")):
+        if count := sum(getattr(each, field) for each in measured):
+            line += f", {count} {words}"
+    if name != next(iter(found["cases"])):
+        line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']})"
+    return line

@@ -455,3 +455,20 @@ def test_a_robot_without_a_position_for_a_fifth_of_the_run_did_not_do_its_part()
     place[T > 15.0, 1] = np.nan
     measured = measure.measure(dataclasses.replace(known, true_position=place, position=place))
     assert measured.failures == ("F: its position was known for 75% of the time only",)
+
+
+def test_a_time_without_a_position_is_neither_inside_nor_outside():
+    """The process of one robot stood still for 0.6 s, after it had acquired."""
+    known = pair(1.0 + np.exp(-T))
+    whole = measure.measure(known)
+    place = known.true_position.copy()
+    place[(T > 6.0) & (T < 6.6), 1] = np.nan
+    measured = measure.measure(dataclasses.replace(known, true_position=place))
+    assert measured.acquired_s == whole.acquired_s
+    (gap,) = measured.gaps
+    assert gap == f"{known.robots[1]} from 6.0 to 6.6 s"
+    assert any(gap in each.text and each.mark == "fair" for each in verdict.findings([measured]))
+    early = known.true_position.copy()
+    early[(T > 2.9) & (T < 3.7), 1] = np.nan  # last seen outside: inside for certain only when it is seen again
+    acquired = measure.measure(dataclasses.replace(known, true_position=early)).acquired_s[0]
+    assert acquired == pytest.approx(3.7, abs=0.1)

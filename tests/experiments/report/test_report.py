@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents.network.messages import Contact, Event, WorldState
-from experiments.definition.experiment import Arena, Experiment, Shadow
+from experiments.definition.experiment import Arena, Experiment, Shadow, Start
 from experiments.metrics.measure import measure
 from experiments.metrics.statistics import spread
 from experiments.report import report
@@ -183,7 +183,7 @@ def test_report_of_a_run_in_which_a_robot_died_and_samples_were_lost(tmp_path):
     page = checked(report.write(tmp_path, [known]).read_text(encoding="utf-8"))
     assert "CF03 dropped out; the means leave it out." in page.words
     assert "Samples were lost: 3 in periodic" in page.words
-    assert "Deadlines were missed: 3 in periodic" in page.words
+    assert "Deadlines were missed: 3 in periodic (" in page.words
     assert "Known [%]" in page.words
 
 
@@ -471,3 +471,26 @@ def test_experiment_is_shown_even_without_its_file(tmp_path):
     assert isinstance(known.experiment, Experiment)
     page = checked(report.write(tmp_path, [known]).read_text())
     assert '"duration_s": 2.0' in page.words
+
+
+def test_losses_are_sums_over_all_robots_and_seeds_everywhere():
+    ones = [dataclasses.replace(park(case, seed=seed, duration=2.0), clock="real") for case in "ab" for seed in (1, 2)]
+    runs = measured([dataclasses.replace(each, lost=each.lost + 1, missed_deadlines=each.lost + 2) for each in ones])
+    robots = len(ones[0].robots)
+    words = " ".join(each.text for each in findings(runs))
+    assert f"Samples were lost: {2 * robots} in a and {2 * robots} in b" in words
+    assert f"Deadlines were missed: {4 * robots} in a (" in words
+    (sums,) = [table for table in whole_tables(runs) if table.head[0] == "Sum over all robots and seeds"]
+    assert [row.cells for row in sums.rows] == [
+        ("Lost samples", *[str(2 * robots)] * 2),
+        ("Missed deadlines", *[str(4 * robots)] * 2),
+    ]
+    assert not any("ost" in row.cells[0] for row in summary_table(runs).rows)
+
+
+def test_seeds_that_begin_alike_are_named(tmp_path):
+    runs = [park(seed=seed, duration=2.0) for seed in (1, 2)]
+    assert "All seeds begin at the same poses" in report.write(tmp_path / "a", runs).read_text()
+    scattered = msgspec.structs.replace(runs[0].experiment, start=Start(scatter=0.1))
+    apart = [dataclasses.replace(each, experiment=scattered) for each in runs]
+    assert "begin at the same poses" not in report.write(tmp_path / "b", apart).read_text()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -68,3 +69,11 @@ def test_tables_for_papers_are_over_all_seeds(three: tuple[Path, str]) -> None:
         assert "3 seeds" in text
         assert text.count("±") + text.count(r"\pm") > 10
         assert zenpark("report", str(three[0]), str(three[0]), form).count("3 seeds")
+
+
+def test_the_console_gives_the_digits_that_an_interval_bears(three: tuple[Path, str]) -> None:
+    lines = three[1].splitlines()
+    half = re.search(r"IAE (\d\.\d+) ± (\d\.\d+), ", lines[0])
+    assert half is not None
+    assert len(half[1]) == len(half[2])
+    assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
