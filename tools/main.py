@@ -85,16 +85,22 @@ EXPLAINED: Final = (
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version  # noqa: PLC0415
+        from experiments.recording.version import provenance  # noqa: PLC0415
 
-        typer.echo(f"zenpark {version('zenpark')}")
+        typer.echo(provenance().words[0])
         raise typer.Exit
 
 
 @app.callback()
 def _zenpark(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+        bool,
+        typer.Option(
+            "--version",
+            callback=_version,
+            is_eager=True,
+            help="Show version, digest of the code and commit, as run.json has them.",
+        ),
     ] = False,
 ) -> None: ...
 

@@ -11,6 +11,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError, free_endpoint
+from experiments.recording.version import SHOWN, digest, provenance
 from tools.commands.options import PANELS
 from tools.main import EXPLAINED, app, main
 
@@ -163,6 +164,20 @@ def test_tables_are_json_where_it_is_asked_for():
     assert json.loads(said.stdout)[0]["key"].startswith("disturbance.")
 
 
+def test_results_of_doing_are_json_where_it_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    past = tmp_path / "runs" / "past"
+    past.mkdir(parents=True)
+    for name in ("experiment.toml", "default.mcap"):
+        (past / name).touch()
+    invoke = CliRunner().invoke
+    said = json.loads(invoke(app, ["clean", "--older", "0", "--recordings", "--json"]).stdout)
+    assert said == [{"folder": "runs/past", "parts": ["runs/past/default.mcap"], "removed": False}]
+    made = json.loads(invoke(app, ["cert", "init", "lab", "KH01", "--json"]).stdout)
+    assert made["identities"]["KH01"]["role"] == "robot"
+    assert list(json.loads(invoke(app, ["cert", "issue", "lab", "ana", "--json"]).stdout)["identities"]) == ["ana"]
+
+
 def test_routers_come_from_the_environment(monkeypatch):
     monkeypatch.setenv("ZENPARK_CONNECT", "tcp/127.0.0.1:9 udp")
     found = CliRunner().invoke(app, ["keys"]).exception
@@ -190,7 +205,8 @@ def test_an_emergency_stop_waits_for_no_numpy():
 
 def test_version():
     done = zenpark("--version")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "zenpark 0.1.0\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{provenance().words[0]}\n", "")
+    assert done.stdout.startswith(f"zenpark 0.1.0, code {digest()[:SHOWN]}")
 
 
 @pytest.mark.parametrize(
@@ -285,6 +301,11 @@ def test_endpoints_come_from_the_file_of_a_run(tmp_path):
         ("run robotic-park --case pe", ["periodic"]),
         ("run triangle --set dur", ["duration_s="]),
         ("run triangle --set robots.KH01.ki", ["robots.KH01.kind="]),
+        ("run triangle --set safety.sep", ["safety.separation="]),
+        ("run triangle --set robots.CF01.ho", ["robots.CF01.hover="]),
+        ("run triangle --set trigger.thr", ["trigger.threshold="]),
+        ("run triangle --set cases.event.rates.bo", ["cases.event.rates.body_hz="]),
+        ("run triangle --set formation.t", ["formation.tracking_gain="]),
         ("agent triangle CF", ["CF01"]),
         ("report runs/f", ["runs/first"]),
         ("bench saf", ["safety"]),

@@ -126,7 +126,7 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None,
 
 
 @app.command(epilog=example("hosts install lab.toml"))
-def install(file: File, settings: Settings = None, on: On = None, lab: Lab = None) -> int:
+def install(file: File, settings: Settings = None, on: On = None, lab: Lab = None, as_json: AsJson = False) -> int:
     """Put this zenpark on every host that has another or none, and in a lab the certificates of its robots."""
     from experiments.definition import endpoints
     from experiments.file import document
@@ -138,21 +138,29 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
     experiment = read.experiment
     folder = endpoints.lab_folder(experiment, read.path, lab)
     chosen = {name: host for name, host in choose(experiment.hosts, on or []).items() if host.address is not None}
-    code = 0
+    shown: list[dict[str, str | bool]] = []
     with stations(read, chosen, lab, routed=False) as found:
         for (name, host), there in zip(chosen.items(), found, strict=True):
+            row: dict[str, str | bool] = {"host": name, "ok": True}
+            shown.append(row)
             same = not isinstance(there, HostError) and there.same_version
             try:
-                done = f"has it already ({version.digest()[: version.SHOWN]})" if same else put(name, host)
-                print(f"{name}: {done}", flush=True)
+                row["zenpark"] = f"has it already ({version.digest()[: version.SHOWN]})" if same else put(name, host)
+                if not as_json:
+                    print(f"{name}: {row['zenpark']}", flush=True)
                 if folder is not None and host.robots:
                     robots = certificates.of_host(name, experiment.hosts)
                     right = not isinstance(there, HostError) and same and _trusted(there, folder, robots)
-                    print(f"{name}: {'has its certificates' if right else send(name, host, folder, robots)}")
+                    row["certificates"] = "has its certificates" if right else send(name, host, folder, robots)
+                    if not as_json:
+                        print(f"{name}: {row['certificates']}")
             except HostError as error:
+                row |= {"ok": False, "trouble": str(error)}
                 print(error, file=sys.stderr)
-                code = 1
-    return code
+    done = all(row["ok"] for row in shown)
+    if as_json:
+        print_json({"ok": done, "hosts": shown})
+    return int(not done)
 
 
 def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:

@@ -32,9 +32,11 @@ def init(
     given: Annotated[
         list[str] | None, typer.Argument(metavar="[FILE|ROBOT...]", help="Experiments, whose robots; or their names.")
     ] = None,
+    *,
     host: Hosts = None,
     days: Days = 90.0,
     authority_days: Annotated[float, typer.Option(min=0.01, help="For which the lab itself is valid.")] = 1826.0,
+    as_json: AsJson = False,
 ) -> None:
     """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
     from tools.commands.authority import SERVICES, create
@@ -45,10 +47,11 @@ def init(
     known = create(
         place, identities, hosts=host or [], listening=_listening(given or []), days=days, authority_days=authority_days
     )
-    _print(place, known, list(known.identities))
-    typer.echo(
+    _print(place, known, list(known.identities), as_json=as_json)
+    _advise(
+        as_json,
         f"{place}/ca.key makes new identities: keep it here. A robot's computer needs ca.pem and its own .pem and .key,"
-        f" a router's ca.pem, lab.json, router.*\nNow: ./zenpark run FILE --lab {place}, or [network] lab in the file"
+        f" a router's ca.pem, lab.json, router.*\nNow: ./zenpark run FILE --lab {place}, or [network] lab in the file",
     )
 
 
@@ -56,9 +59,11 @@ def init(
 def issue(
     folder: Folder,
     names: Names,
+    *,
     role: Annotated[str, typer.Option(help="robot, operator, observer, router, ...; or by the name itself.")] = "",
     host: Hosts = None,
     days: Days = 90.0,
+    as_json: AsJson = False,
 ) -> None:
     """Make certificates for more robots, people or routers."""
     from agents.network.lab import ROLES, LabError
@@ -69,37 +74,40 @@ def issue(
         raise LabError(f"no role '{role}' in a lab; {did_you_mean(role, ROLES)}")
     roles: dict[str, Role] = {each: each for each in ROLES}
     identities = {name: roles.get(role or name, "robot") for name in names}
-    _print(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names)
+    _print(Path(folder), made(Path(folder), identities, hosts=host or [], days=days), names, as_json=as_json)
 
 
 @app.command(epilog=example("cert renew lab", "cert renew lab router --host 192.168.0.10"))
 def renew(
     folder: Folder,
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME...]", help="All, if none is named.")] = None,
+    *,
     host: Hosts = None,
     days: Days = 90.0,
     authority: Annotated[
         bool, typer.Option("--authority", help="A new authority too: every file from before is refused.")
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make new certificates for the same names; those before are valid until they end."""
     from tools.commands.authority import renew as made
 
     known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
-    _print(Path(folder), known, names or list(known.identities))
+    _print(Path(folder), known, names or list(known.identities), as_json=as_json)
 
 
 @app.command(epilog=example("cert revoke lab KH01"))
-def revoke(folder: Folder, names: Names, days: Days = 90.0) -> None:
+def revoke(folder: Folder, names: Names, days: Days = 90.0, as_json: AsJson = False) -> None:
     """Take all rights from certificates that are lost or stolen, and make new ones."""
     from tools.commands.authority import revoke as made
 
-    _print(Path(folder), made(Path(folder), names, days=days), names)
-    typer.echo(
+    _print(Path(folder), made(Path(folder), names, days=days), names, as_json=as_json)
+    _advise(
+        as_json,
         "The old keys have no rights at a `./zenpark router` that reads this lab.json: one that runs notices it in a "
         "second; copy the file to routers elsewhere. Poses of their owners are not received any more: give them new "
         "files. A zenohd notices nothing, and the old keys go on working: print its file again (./zenpark router FILE "
-        "--lab LAB --print-config) and restart it"
+        "--lab LAB --print-config) and restart it",
     )
 
 
@@ -109,10 +117,7 @@ def show(folder: Folder, as_json: AsJson = False) -> int:
     from agents.network.lab import register
 
     known = register(Path(folder))
-    if as_json:
-        print_json(known)
-    else:
-        _print(Path(folder), known, list(known.identities))
+    _print(Path(folder), known, list(known.identities), as_json=as_json)
     now = datetime.now(UTC)
     return int(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
 
@@ -153,7 +158,19 @@ def _robots(given: list[str], taken: set[str]) -> dict[str, Role]:
     return found
 
 
-def _print(folder: Path, known: Register, names: list[str]) -> None:
+def _advise(as_json: bool, text: str) -> None:
+    """Say what is to be done now, to people."""
+    if not as_json:
+        typer.echo(text)
+
+
+def _print(folder: Path, known: Register, names: list[str], *, as_json: bool) -> None:
+    """Print these members of a lab; as JSON a register that has them alone."""
+    if as_json:
+        from msgspec.structs import replace
+
+        print_json(replace(known, identities={name: known.identities[name] for name in names}))
+        return
     now = datetime.now(UTC)
     width = max(map(len, names))
     for name in names:

@@ -368,6 +368,7 @@ def clean(
     tagged: Annotated[bool, typer.Option("--tagged", help="Also runs that have a tag.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Does it; else it is only shown.")] = False,
     below: Below = None,
+    as_json: AsJson = False,
 ) -> int:
     """Remove folders of past runs: those of some words or age, never one with a tag or one that is up."""
     import shutil
@@ -385,6 +386,7 @@ def clean(
         if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
         if older is None or age_days(run, now) > older
     ]
+    shown = []
     for run in chosen:
         folder = Path(run.folder)
         parts = [*folder.glob("*.mcap"), *folder.glob("logs")] if recordings else [folder]
@@ -394,6 +396,11 @@ def clean(
         except OSError as error:
             print(f"zenpark: {error.filename}: cannot be removed: {error.strerror}", file=sys.stderr)
             return 1
-        print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
+        shown.append({"folder": run.folder, "parts": parts, "removed": yes})
+        if not as_json:
+            print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
+    if as_json:
+        print_json(shown)
+        return 0
     print(f"runs: {len(chosen)}" + ("" if yes or not chosen else "; --yes does it"))
     return 0

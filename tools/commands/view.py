@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from tools import completion
-from tools.commands.options import As, Case, Connect, Lab, Realm, Seconds, example, routers
+from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, Seconds, example, print_json, routers
 
 if TYPE_CHECKING:
     import zenoh
@@ -89,8 +89,9 @@ def top(
     lab: Lab = None,
     identity: As = "observer",
     seconds: Seconds = None,
+    as_json: AsJson = False,
 ) -> int:
-    """Show the live table of a run, from any shell; in a pipe, the table once."""
+    """Show the live table of a run, from any shell; in a pipe and as JSON, the table once."""
     from agents.network.session import open_session
     from agents.network.shutdown import held
     from agents.runtime.command_line import on_termination
@@ -102,7 +103,7 @@ def top(
         with held(opened) as (session, declared):
             table = _Top(session, watched)
             declared.append(table)
-            return table.run(ended, seconds)
+            return table.run(ended, seconds, as_json=as_json)
 
 
 class _Top:
@@ -116,7 +117,7 @@ class _Top:
         self._watched, self._trends = watched, Trends()
         self._observer = Observer(session, Keys(watched.realm))
 
-    def run(self, ended: threading.Event, seconds: float | None) -> int:
+    def run(self, ended: threading.Event, seconds: float | None, *, as_json: bool) -> int:
         """Draws until it is ended, the run is over, or `seconds` [s] are; returns the exit code."""
         import time
         from math import inf
@@ -127,11 +128,15 @@ class _Top:
         console = Console()
         began, over = time.monotonic(), False
         limit_s = inf if seconds is None else seconds
-        if not console.is_terminal:
+        if as_json or not console.is_terminal:
             while not (over := self._heard()) and time.monotonic() - began < min(FIRST_S, limit_s):
                 if ended.wait(POLL_S):
                     break
-            console.print(Group(*self._lines(console.width, len(self._observer.robots) + 20)), soft_wrap=True)
+            if as_json:
+                seen = self._observer
+                print_json({"case": seen.case, "time_s": seen.elapsed, "robots": self._rows()})
+            else:
+                console.print(Group(*self._lines(console.width, len(self._observer.robots) + 20)), soft_wrap=True)
             return int(not over)
         with Live(console=console, auto_refresh=False, screen=True) as live:
             while not (over or ended.wait(REFRESH_S)) and time.monotonic() - began < limit_s:
