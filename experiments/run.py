@@ -124,15 +124,16 @@ class Run:
     def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars
         """Metrics as a data frame of pandas, or of polars where only that is installed: a row per case and robot.
 
-        Columns are those of `metrics.csv`.
+        Columns are those of `metrics.csv`; an unknown number is NaN.
 
         Raises:
             ImportError: If neither is installed.
         """
         rows = list(metrics_files.rows(list(self.metrics.values())))
+        columns = {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
         for library in ("pandas", "polars"):
             try:
-                return importlib.import_module(library).DataFrame(rows)
+                return importlib.import_module(library).DataFrame(columns)
             except ModuleNotFoundError:
                 continue
         raise ImportError("neither pandas nor polars is installed; `./zenpark install pandas` installs one of them")
@@ -140,6 +141,13 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """The figures for scripts, as `./zenpark run --json` prints them."""
         return metrics_files.document(str(self.folder or ""), self.seed, list(self.metrics.values()))
+
+
+def _column(values: Sequence[Any]) -> list[Any]:
+    """Values of a column: numbers of one type, which for unknown ones is float; texts as they are."""
+    if any(isinstance(value, str) for value in values) or all(isinstance(value, int) for value in values):
+        return list(values)
+    return [math.nan if value is None else float(value) for value in values]
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all

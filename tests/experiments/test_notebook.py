@@ -45,10 +45,23 @@ def test_frames_are_of_the_library_that_is_there(run, monkeypatch, installed):
         monkeypatch.setitem(sys.modules, library, None)  # its import fails
     with pytest.raises(ImportError, match="neither pandas nor polars"):
         run.to_frame()
-    monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=lambda rows: rows))
-    rows = run.to_frame()
-    assert [row["robot"] for row in rows] == list(next(iter(run.traces.values())).robots)
-    assert {"seed", "case", "f_hz", "iae", "near_gap"} <= rows[0].keys()
+    monkeypatch.setitem(sys.modules, installed, SimpleNamespace(DataFrame=lambda columns: columns))
+    columns = run.to_frame()
+    assert columns["robot"] == list(next(iter(run.traces.values())).robots)
+    assert {"seed", "case", "f_hz", "iae", "near_gap"} <= columns.keys()
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_frame_has_numbers_where_some_are_unknown(run, monkeypatch, library):
+    pytest.importorskip(library)
+    for other in {"pandas", "polars"} - {library}:
+        monkeypatch.setitem(sys.modules, other, None)
+    frame = run.to_frame()
+    assert type(frame).__module__.startswith(library)
+    assert frame.shape[0] == len(next(iter(run.traces.values())).robots)
+    assert frame["robot"].to_list() == list(next(iter(run.traces.values())).robots)
+    assert str(frame["acquired_s"].dtype).lower() == "float64", "none has acquired: NaN"
+    assert str(frame["messages"].dtype).lower() == "int64"
 
 
 CELLS = (
