@@ -122,11 +122,11 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     lengths: list[Line] = [(ends[k], lambda case, k=k: _worst(case, k), 100.0) for k in phases]  # type: ignore[misc]
     lengths += [
         ("Belief error, RMS", attrgetter("belief_rms"), 100.0),
-        ("Belief error, largest", attrgetter("belief_max"), 100.0),
-        ("Closest two robots, between centres", attrgetter("closest"), 100.0),
-        ("Closest two robots, between surfaces", lambda case: None if case.near is None else case.near.gap, 100.0),
-        ("Closest to the arena", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
-        ("Farthest outside the arena", attrgetter("excursion"), 100.0),
+        (f"Belief error, largest{over}", attrgetter("belief_max"), 100.0),
+        (f"Closest two robots, between centres{over}", attrgetter("closest"), 100.0),
+        (f"Closest two robots, between surfaces{over}", lambda case: case.near and case.near.gap, 100.0),
+        (f"Closest to the arena{over}", lambda case: case.near_arena and case.near_arena.gap, 100.0),
+        (f"Farthest outside the arena{over}", attrgetter("excursion"), 100.0),
     ]
     units: dict[str, list[Line]] = {
         "Acquired by all followers [s]": [
@@ -141,7 +141,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Delay of poses [ms]": [
             ("mean", lambda case: _delay(case, mean_delay), 1000.0),
             (
-                "longest",
+                f"longest{over}",
                 lambda case: _delay(case, lambda links: _known(max, (each.delay_max for each in links))),
                 1000.0,
             ),
@@ -153,7 +153,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ],
         "Collisions": [("Number", lambda case: float(len(case.collisions)), 1.0)],
         "Hardest impulse [mN s]": [
-            ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
+            (f"of a collision{over}", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
         "Cost": [("J2", attrgetter("j2"), 1.0)],
     }
@@ -300,9 +300,8 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     for k in range(1, max(len(run.starts_s) for run in runs)):
         later = lambda robots, k=k: _known(_mean, (p.acquired_s for r in robots for p in r.phases[k - 1 : k]))  # noqa: E731
         columns.append((f"{_phase(runs, k).strip()} [s]", lambda robots, later=later: number(later(robots))))  # type: ignore[misc]
-    columns.append(
-        ("Worst link at the end [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0))
-    )
+    worst = "Worst link at the end" + (", mean" if len(runs) > 1 else "")
+    columns.append((f"{worst} [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
     if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
         columns.append(("Known [%]", _cell(_mean, "coverage", 100.0)))
     kept = [robot for run in runs for robot in run.robots if robot.robot not in left_out]
@@ -348,9 +347,9 @@ def gaps_table(cases: Sequence[CaseMetrics]) -> Table:
 
 def links_table(cases: Sequence[CaseMetrics]) -> Table:
     """Belief error of each link, per case; the mean and the largest over several seeds."""
-    columns = [("RMS", _cell(statistics.fmean, "rms", 1000.0)), ("largest", _cell(max, "max", 1000.0))]
+    columns = [("RMS", _cell(statistics.fmean, "rms", 100.0)), ("largest", _cell(max, "max", 100.0))]
     name = "{0.receiver}, {0.sender}".format
-    return _Rows("Receiver, sender", attrgetter("belief"), name, columns).side_by_side(cases, "mm")
+    return _Rows("Receiver, sender", attrgetter("belief"), name, columns).side_by_side(cases, "cm")
 
 
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -416,7 +415,7 @@ def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case the agreement of shadow twins with their robots, of the first seed; nothing where there are none."""
 
-    def signed(*fields: str, scale: float = 1000.0, form: str = ".1f") -> Callable[[Sequence[RobotMetrics]], str]:
+    def signed(*fields: str, scale: float = 100.0, form: str = ".2f") -> Callable[[Sequence[RobotMetrics]], str]:
         """Values with a sign, those along axes one by one; 0.0 instead of -0.0."""
 
         def text(value: float | None) -> str:
@@ -434,12 +433,12 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
     columns: list[Column[RobotMetrics]] = [
         ("Ahead [s]", ahead),
-        ("Bias x, y, z [mm]", signed("bias")),
-        ("Along, across [mm]", signed("along", "across")),
-        ("Yaw [mrad]", signed("bias_yaw")),
-        ("RMSE [mm]", _cell(max, "shadow.rmse", 1000.0)),
+        ("Bias x, y, z [cm]", signed("bias")),
+        ("Along, across [cm]", signed("along", "across")),
+        ("Yaw [mrad]", signed("bias_yaw", scale=1000.0, form=".1f")),
+        ("RMSE [cm]", _cell(max, "shadow.rmse", 100.0)),
         ("RMSE yaw [mrad]", _cell(max, "shadow.rmse_yaw", 1000.0)),
-        ("Largest [mm]", _cell(max, "shadow.largest", 1000.0)),
+        ("Largest [cm]", _cell(max, "shadow.largest", 100.0)),
         ("Correlation x, y, z", signed("correlation", scale=1.0, form=".4f")),
         ("of speeds", signed("correlation_speed", scale=1.0, form=".4f")),
     ]
@@ -464,9 +463,9 @@ def collision_table(cases: Sequence[CaseMetrics]) -> Table:
     rows = []
     for case, each in found[:MOST_COLLISIONS]:
         where = (case.case, f"seed {case.seed}") if several else case.case
-        depth, impulse = number(each.overlap, 1000.0), number(each.impulse, 1000.0)
+        depth, impulse = number(each.overlap, 100.0), number(each.impulse, 1000.0)
         rows.append(Row((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
-    head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [mm]")
+    head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [cm]")
     return Table(head, tuple(rows), note=_more(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
 
 

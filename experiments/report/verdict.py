@@ -218,10 +218,12 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
         rate = spread(ratios(runs, first, "f_hz"))
         if rate.mean is not None:
             fewer = 100.0 * (1.0 - rate.mean)
-            how = f"{abs(fewer):.1f} % {'fewer' if fewer >= 0.0 else 'more'} transmissions than {reference}"
+            share = f"{abs(fewer):.1f}"
+            how = f"{share} % {'fewer' if fewer > 0.0 else 'more'}" if float(share) else "as many"
+            how += f" transmissions {'than' if float(share) else 'as'} {reference}"
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
             text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot."
-            found.append(Finding("good" if fewer > 0.0 else "plain", text))
+            found.append(Finding("good" if fewer > 0.0 and float(share) else "plain", text))
         errors = [(index.upper(), spread(ratios(runs, first, index))) for index in ("iae", "itae", "rmse")]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
@@ -266,7 +268,7 @@ def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def _collision(each: Collision) -> str:
     parts = [] if each.impulse is None else [f"{number(each.impulse, 1000.0)} mN s"]
-    parts += [f"{number(each.overlap, 1000.0)} mm deep"] if each.overlap > 0.0 else []
+    parts += [f"{number(each.overlap, 100.0)} cm deep"] if each.overlap > 0.0 else []
     return f"{each.first}–{each.second} at {each.time_s:.2f} s" + (f" ({', '.join(parts)})" if parts else "")
 
 

@@ -339,17 +339,17 @@ def test_verdict_says_how_near_it_came_if_nothing_touched():
 
 
 def test_verdict_names_collisions():
-    text = "One collision in only: A–B at 0.00 s (40.0 mm deep)."
+    text = "One collision in only: A–B at 0.00 s (4.00 cm deep)."
     assert said_of(side_by_side(apart=0.1))[text] == "bad"
     contacts = tuple(Contact(0.5 * k, "A", "wall" if k else "B", 0.012 * k, 0.0003) for k in range(5))
     seen = dataclasses.replace(side_by_side(), contacts=contacts)
     text = (
-        "5 collisions in only: A–B at 0.00 s (0 mN s, 0.300 mm deep), A–wall at 0.50 s (12.0 mN s, 0.300 mm deep), "
-        "A–wall at 1.00 s (24.0 mN s, 0.300 mm deep) and 2 more."
+        "5 collisions in only: A–B at 0.00 s (0 mN s, 0.0300 cm deep), A–wall at 0.50 s (12.0 mN s, 0.0300 cm deep), "
+        "A–wall at 1.00 s (24.0 mN s, 0.0300 cm deep) and 2 more."
     )
     assert said_of(seen)[text] == "bad"
     seeds = [side_by_side(), side_by_side(apart=0.1, seed=2)]
-    assert said_of(*seeds)["One collision in 1 of 2 seeds of only: A–B at 0.00 s (40.0 mm deep)."] == "bad"
+    assert said_of(*seeds)["One collision in 1 of 2 seeds of only: A–B at 0.00 s (4.00 cm deep)."] == "bad"
 
 
 def test_verdict_on_a_world_that_fell_behind():
@@ -389,9 +389,9 @@ def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
     page = checked(report.write(tmp_path, [known]).read_text(encoding="utf-8"))
     for words in (
         "Contacts are those that the world saw begin",
-        "only 1.23 A B 17.0 0.400",
+        "only 1.23 A B 17.0 0.0400",
         "B 36.0 A 0.00 – – 1 40.0 25.0",
-        "A 5 0.0, 12.0, 0.0 0.0, 12.0 0.0 12.0 0 12.0 –, –, – –",
+        "A 5 0.00, 1.20, 0.00 0.00, 1.20 0.0 1.20 0 1.20 –, –, – –",
         "Robots and the twins beside them",
     ):
         assert words in page.words
