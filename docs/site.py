@@ -65,8 +65,8 @@ def experiment_file() -> Iterator[str]:
         for number, entry in enumerate(below):
             if not entry.key.endswith(")"):
                 continue
-            yield f"\n### `{entry.key}`\n"
-            yield f"{entry.text}\n"
+            yield f"\n### `{entry.key.rpartition('.')[2]}`\n"
+            yield f"`{entry.key}`: {entry.text}\n"
             own = [each for each in below[number:] if each.key.startswith(f"{entry.key}.")]
             if own:
                 yield from _keys(own, entry.key)
@@ -90,6 +90,7 @@ def commands() -> Iterator[str]:
     """Every command with its options, and the exit codes."""
     import typer.main  # noqa: PLC0415
 
+    from tools.commands.options import PANELS  # noqa: PLC0415
     from tools.main import app  # noqa: PLC0415
 
     yield "# Commands\n"
@@ -99,23 +100,27 @@ def commands() -> Iterator[str]:
     yield "of `--connect` (several routers with spaces between them).\n"
     yield from ("| exit code | meaning |", "|---|---|", "| 0 | done |", "| 1 | it ran, and something failed |")
     yield "| 2 | wrong input: the message names the place and the remedy |\n| 130 | ended by Ctrl-C |\n"
-    yield from _command(typer.main.get_command(app), "./zenpark", 2)
+    every = getattr(typer.main.get_command(app), "commands", {})
+    for title, names in PANELS.items():
+        yield f"\n## {title}\n"
+        for name in names.split():
+            yield from _command(every[name], f"./zenpark {name}", 3)
 
 
 def _command(command: click.Command, name: str, depth: int) -> Iterator[str]:
     below = getattr(command, "commands", {})
-    if depth > 2:
-        arguments = " ".join(str(part.name).upper() for part in command.params if not _is_option(part))
-        yield f"\n{'#' * min(depth, 4)} {name.removeprefix('./zenpark ')}\n"
-        yield f"    {name} {arguments}\n" if not below else ""
-        yield f"{inspect.cleandoc(command.help or '')}\n"
-        rows = [part for part in command.params if getattr(part, "help", None) and part.name != "help"]
-        if rows:
-            yield from ("| option | meaning | default |", "|---|---|---|")
-            for part in rows:
-                names = ", ".join(f"`{each}`" for each in part.opts) if _is_option(part) else f"`{part.name}`"
-                plain = isinstance(part.default, int | float | str) and part.default is not False
-                yield f"| {names} | {_cell(getattr(part, 'help', ''))} | {part.default if plain else ''} |"
+    arguments = " ".join(str(part.name).upper() for part in command.params if not _is_option(part))
+    yield f"\n{'#' * min(depth, 4)} {name.removeprefix('./zenpark ')}\n"
+    yield f"    {name} {arguments}\n" if not below else ""
+    yield f"{inspect.cleandoc(command.help or '')}\n"
+    rows = [part for part in command.params if getattr(part, "help", None) and part.name != "help"]
+    if rows:
+        yield from ("| option | meaning | default |", "|---|---|---|")
+        for part in rows:
+            names = ", ".join(f"`{each}`" for each in part.opts) if _is_option(part) else f"`{part.name}`"
+            plain = isinstance(part.default, int | float | str) and not isinstance(part.default, bool)
+            default = part.default if plain else "on" if part.default is True else ""
+            yield f"| {names} | {_cell(getattr(part, 'help', ''))} | {default} |"
     for child, each in below.items():
         if not each.hidden:
             yield from _command(each, f"{name} {child}", depth + 1)

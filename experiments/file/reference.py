@@ -197,9 +197,8 @@ def written(value: object) -> str:
 def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
     """Lines from a ready-made experiment, or else made of the default and the limits."""
     parts = _split(key)
-    found = next((lines for document in _documents() for lines in _occurrences(document, parts, ())), None)
-    if found is not None:
-        return found
+    if found := [lines for document in _documents() for lines in _occurrences(document, parts, ())]:
+        return min(found, key=len)
     value = field.get("default")
     made = _made(field, definitions) if value in (None, {}, []) else value
     names = dict(_NAMES.values())
