@@ -124,8 +124,12 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Belief error, RMS", attrgetter("belief_rms"), 100.0),
         (f"Belief error, largest{over}", attrgetter("belief_max"), 100.0),
         (f"Closest two robots, between centres{over}", attrgetter("closest"), 100.0),
-        (f"Closest two robots, between surfaces{over}", lambda case: case.near and case.near.gap, 100.0),
-        (f"Closest to the arena{over}", lambda case: case.near_arena and case.near_arena.gap, 100.0),
+        (
+            f"Closest two robots, between surfaces{over}",
+            lambda case: None if case.near is None else case.near.gap,
+            100.0,
+        ),
+        (f"Closest to the arena{over}", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
         (f"Farthest outside the arena{over}", attrgetter("excursion"), 100.0),
     ]
     units: dict[str, list[Line]] = {
