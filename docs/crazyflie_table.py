@@ -82,13 +82,13 @@ def kalman() -> Callable[[], float]:
 
 def twin() -> Callable[[], float]:
     """Variance [m²] of the twin's estimate, tick by tick."""
-    estimator, tick = Estimator(1), 0
+    estimator, tick, no = Estimator(1), 0, np.array([False])
 
     def advance() -> float:
         nonlocal tick
         tick += 1
         estimator.add_external(0, DT * tick, (0.0, 0.0, 0.0))
-        estimator.advance(DT * tick, DT, np.zeros((1, 3)), np.array([False]), np.array([False]))
+        estimator.advance(DT * tick, DT, np.zeros((1, 3)), no, no, flying=no)
         return float(estimator.variance[0])
 
     return advance

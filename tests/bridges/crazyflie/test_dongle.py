@@ -142,6 +142,27 @@ def test_nothing_is_received_any_more(begins):
         assert not twin.device.flock.quadrotor.flying[:2].any()
 
 
+def test_a_gap_of_the_radio_that_carries_motion_capture():
+    """The estimator is blind, and drifts: it is down before it is far away."""
+    with flown(device=RADIO, external=True) as (twin, process):
+        tick = process.tick
+
+        def located():
+            process.body.locate(0, process.t, truth(twin), 0.0)
+            return tick()
+
+        process.tick = located
+        process.until(lambda: np.isfinite(process.state.position).all(), "settled")
+        process.takeoff(0.6)
+        process.setpoint = [(0.0, 0.0, 0.6, 0.0)]
+        process.run(1.0)
+        descent = Descent(twin, process)
+        twin.device.lines[0].silence(1e6)
+        process.until(lambda: truth(twin)[2] == 0.0, "down")
+        assert np.abs(truth(twin)[:2]).max() < 0.3
+        assert descent.fastest.max() < SINKS
+
+
 def test_the_neighbours_of_a_drone_in_a_gap_fly_on():
     with flown(rows=3, device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)

@@ -26,6 +26,7 @@ SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and vari
 PRECISE: Final = 1e-5  # [m²] final variance
 LOST: Final = 100.0  # [m²] variance after a reset
 GROWTH: Final = 1.0  # [m²/s] of the variance without measurements
+DRIFT: Final = np.array([0.05, -0.05, 0.0])  # [m/s²] along x, y: 0.3° of error in the attitude, twice
 UPWARDS: Final = np.array([False, False, True])
 FRESH_S: Final = 0.5  # older external positions are ignored
 
@@ -39,6 +40,7 @@ class Estimator:
         self.external = np.zeros((rows, 3))  # last external position [m]
         self.received = np.zeros(rows, dtype=np.intp)  # number of external positions
         self._external_time = np.full(rows, -np.inf)
+        self._drift = np.zeros((rows, 3))  # rate of the error [m/s]
 
     def reset(self, row: int, error: Array) -> None:
         """Restart the estimator of a row with an error (3,) [m]."""
@@ -49,7 +51,7 @@ class Estimator:
         self.external[row], self._external_time[row] = position, t
         self.received[row] += 1
 
-    def advance(self, t: float, dt: float, truth: Array, ready: Mask, flow: Mask) -> None:
+    def advance(self, t: float, dt: float, truth: Array, ready: Mask, flow: Mask, *, flying: Mask) -> None:
         """Advance one step of dt [s].
 
         Args:
@@ -58,6 +60,7 @@ class Estimator:
             truth: (N, 3) true positions [m].
             ready: (N,) rows with a working positioning system on board.
             flow: (N,) rows with a Flow deck: velocity and height are measured, so an error of the place stays.
+            flying: (N,) rows in the air: without measurements they integrate the error of their attitude.
         """
         outside = t - self._external_time <= FRESH_S
         share = -np.expm1(-dt / SETTLING_S)
@@ -65,6 +68,9 @@ class Estimator:
         measured = ready | outside
         axes = measured[:, None] | (flow[:, None] & UPWARDS)
         self.error += np.where(axes, share * (wanted - self.error), 0.0)
+        blind = flying & ~measured & ~flow
+        self._drift = np.where(blind[:, None], self._drift + dt * DRIFT, 0.0)
+        self.error += dt * self._drift
         settled = self.variance + share * (PRECISE - self.variance)
         growth = np.where(flow, 0.0, GROWTH * dt)
         self.variance = np.where(measured, settled, np.minimum(self.variance + growth, LOST))
@@ -234,7 +240,7 @@ class Flock:
             self.place[:, :2] += share[:, None] * self._jitter.displacement
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
-        self.estimator.advance(t, self.dt, self.place, self.ready(), self._flow)
+        self.estimator.advance(t, self.dt, self.place, self.ready(), self._flow, flying=quadrotor.flying)
         measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
         self.estimate = measured + self.estimator.error
         self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
