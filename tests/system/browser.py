@@ -25,7 +25,27 @@ FLAGS = (
 )  # fmt: skip
 
 FRAMES = 4
-SELDOM = "window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 250)"
+# A page without pixels, ten times a second: without a graphics card they would take all processors from the robots.
+BLIND = """
+window.requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 100);
+const constants = WebGL2RenderingContext, original = HTMLCanvasElement.prototype.getContext;
+const answers = {
+    getExtension: () => null, getSupportedExtensions: () => [], isContextLost: () => false, getError: () => 0,
+    getContextAttributes: () => ({ alpha: true, antialias: false, depth: true, stencil: false }),
+    getShaderPrecisionFormat: () => ({ precision: 23, rangeMin: 127, rangeMax: 127 }),
+    getParameter: what =>
+        [constants.VERSION, constants.SHADING_LANGUAGE_VERSION].includes(what) ? "WebGL 2.0"
+        : [constants.VIEWPORT, constants.SCISSOR_BOX].includes(what) ? new Int32Array([0, 0, 300, 150]) : 4096,
+    getShaderParameter: () => true, getShaderInfoLog: () => "", getProgramInfoLog: () => "",
+    getProgramParameter: (_, what) => what === constants.LINK_STATUS,
+    checkFramebufferStatus: () => constants.FRAMEBUFFER_COMPLETE,
+};
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+    if (!kind.startsWith("webgl")) return original.call(this, kind, ...rest);
+    const known = { canvas: this, drawingBufferWidth: this.width, drawingBufferHeight: this.height, ...answers };
+    return new Proxy(known, { get: (it, name) => it[name] ?? constants[name] ?? (() => ({})) });
+};
+"""
 
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
 
@@ -164,9 +184,9 @@ def _array(value: Any, arrays: list[bytes]) -> Any:
 
 @contextmanager
 def opened(
-    address: str | Callable[[], str], width: int = 900, height: int = 600, *, often: bool = False
+    address: str | Callable[[], str], width: int = 900, height: int = 600, *, drawn: bool = False
 ) -> Iterator[Page]:
-    """A page in a browser of its own; it is drawn four times a second, or as often as the browser can.
+    """A page in a browser of its own; its scene is `drawn` as often as the browser can, or has no pixels at all.
 
     An address may be waited for while the browser starts.
     """
@@ -175,8 +195,8 @@ def opened(
         browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=list(FLAGS))
         try:
             page = Page(browser.new_page(viewport={"width": width, "height": height}))
-            if not often:  # without a graphics card it would take all processors from the robots
-                page.page.add_init_script(SELDOM)
+            if not drawn:
+                page.page.add_init_script(BLIND)
             page.page.goto(address if isinstance(address, str) else address(), wait_until="commit")
             yield page
         finally:

@@ -145,7 +145,6 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
                 assert all(watcher.order(name, order).ok for name in names)
             page.until(lambda: everywhere(lambda status: status.phase == "running"), "running")
 
-            page.page.locator(".mantine-Notification-closeButton").click()  # it says that there is no graphics card
             page.page.get_by_label("Drag targets").check()
             page.until(lambda: "/targets/TB01" in page.nodes, "the target is shown")
             start = np.array(convoy.robots["TB01"].start[:2])
@@ -284,7 +283,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     moving = threading.Thread(target=move)
     moving.start()
     try:
-        with opened(f"http://127.0.0.1:{server.get_port()}", 480, 320, often=True) as page:
+        with opened(f"http://127.0.0.1:{server.get_port()}", 480, 320, drawn=True) as page:
             page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
             page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
             rates = []
