@@ -467,7 +467,7 @@ def words() -> Iterator[Target]:
 
 
 PLACES = {
-    "toml": Place(toml, 12_000, 60),
+    "toml": Place(toml, 12_000, 120),
     "resolved": Place(resolved, 8_000, 40),
     "arena": Place(arena, 8_000, 40),
     "overrides": Place(overrides, 12_000, 60),
