@@ -1,4 +1,4 @@
-"""External poses (motion capture), and the estimate of velocity from measured positions."""
+"""External poses (motion capture), and the estimate of velocity from positions, where nothing measures it."""
 
 from __future__ import annotations
 
@@ -64,6 +64,15 @@ class External:
         if np.isfinite(yaw):
             self.yaw[row] = yaw
         return True
+
+    def estimate(self, t: float, state: BodyState) -> None:
+        """Estimates, at `t` [s], the velocity of rows whose bodies measure none, from their positions."""
+        rows = np.flatnonzero(np.isnan(state.velocity).any(axis=1))
+        for row in rows.tolist():
+            self.update(row, float(state.time[row]), state.position[row], float(state.yaw[row]))
+        fresh = t - self.time[rows] < PATIENCE_S
+        state.velocity = state.velocity.copy()  # may be another field as well: a body has one array of unknowns
+        state.velocity[rows] = np.where(fresh[:, None], self.velocity[rows], np.nan)
 
     def fill(self, state: BodyState, rows: Index) -> None:
         """Replaces the poses of `rows` in a state of their bodies; a yaw that was never measured stays."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
-from math import ceil, floor
+from math import ceil, floor, isfinite
 from typing import Final
 
 import msgspec
@@ -22,6 +22,7 @@ import zenoh
 
 from agents.agent import Actions, Agent
 from agents.arrays import Index, some
+from agents.body.external_pose import External
 from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import uptime
@@ -63,6 +64,7 @@ class Runtime:
         self._leaving: set[int] = set()  # rows that were ordered to leave the run
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
+        self._estimator = External(len(self._names))
         self._state: BodyState | None = None  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
@@ -458,6 +460,8 @@ class Runtime:
         self._receive(t)
         state = self._body.read(t)
         self._airborne = some(state.flying)
+        if not isfinite(state.velocity.sum()):
+            self._estimator.estimate(t, state)
         if (located := self._located) is not None:
             known = np.isfinite(located.ahead)
             state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
