@@ -8,6 +8,7 @@ A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
@@ -132,10 +133,13 @@ def body_name(address: str) -> str:
     return address.partition("://")[0]
 
 
-def distributions() -> dict[str, str]:
-    """Installed distributions with plug-ins, and their versions, but for our own."""
+def distributions(text: str | None = None) -> dict[str, str]:
+    """Installed distributions with plug-ins, and their versions, but for our own; those that a text names, if given."""
     groups = (BODIES, DEVICES, TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)
     entries = [entry for group in groups for entry in _installed().select(group=group)]
+    if text is not None:
+        words = {*re.findall(r"[\w.-]+", text)}
+        entries = [entry for entry in entries if entry.name in words]
     owners = {entry.dist.name: entry.dist.version for entry in entries if entry.dist is not None}
     return {name: owners[name] for name in sorted(owners) if name != "zenpark"}
 

@@ -17,6 +17,9 @@ SILENCE_S: Final = 3.0
 LONGEST: Final = 4096  # of a line [bytes]
 
 
+GONE: Final = "the starter is gone"  # or has come to its end
+
+
 class Lifeline:
     """Watches a file descriptor in a daemon thread; the owner reacts to a loss: a robot lands first."""
 
@@ -53,7 +56,7 @@ class Lifeline:
             while waiting.poll(self._timeout_s * 1000):
                 data = os.read(self._fd, LONGEST)
                 if not data:
-                    return "the starter is gone"
+                    return GONE
                 if self._on_line is not None:
                     self._pass_on(data, self._on_line)
         except OSError as error:

@@ -24,7 +24,7 @@ from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
 from agents.runtime.command_line import on_termination
-from agents.runtime.lifeline import Lifeline
+from agents.runtime.lifeline import GONE, Lifeline
 
 EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connection would be back
 LOOK_S: Final = 0.1
@@ -79,7 +79,7 @@ def serve(
     with on_termination(stop.set):
         serve_router(endpoints, stop, link=link, ready=ready, rights=rights)
     if rope.reason is not None:
-        print(f"router: {rope.reason}", file=sys.stderr)
+        print(f"router: {'ends with its starter' if rope.reason == GONE else rope.reason}", file=sys.stderr)
     return 0
 
 

@@ -62,16 +62,19 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
         return code, ", ".join([*used, *added]), ", ".join([self.host, *filter(None, machine), *load, *clock])
 
     def differences(self, other: Provenance) -> list[str]:
-        """What differs in code and versions, in words; machines differ without being named."""
+        """What differs in code and versions, in words; machines differ without being named.
+
+        A library that one of them did without cannot have mattered; a distribution with plug-ins can.
+        """
         found = []
         if self.code != other.code:
             found.append(f"code {self.code[:SHOWN]}, not {other.code[:SHOWN]}")
         mine, theirs = ({"Python": each.python, **each.packages, **each.plugins} for each in (self, other))
-        return found + [
-            f"{name} {mine.get(name, 'missing')}, not {theirs.get(name, 'missing')}"
-            for name in sorted(mine.keys() | theirs.keys())
-            if mine.get(name) != theirs.get(name)
-        ]
+        shared = sorted(mine.keys() & theirs.keys())
+        found += [f"{name} {mine[name]}, not {theirs[name]}" for name in shared if mine[name] != theirs[name]]
+        found += [f"plug-ins of {name} {mine[name]}, the other without" for name in sorted({*self.plugins} - {*theirs})]
+        lacking = sorted({*other.plugins} - {*mine})
+        return found + [f"no plug-ins of {name}, the other with version {theirs[name]}" for name in lacking]
 
 
 @cache
@@ -89,8 +92,8 @@ def number() -> str:
     return _version("zenpark") or "unknown"
 
 
-def provenance() -> Provenance:
-    """Code, versions and machine of this process, now."""
+def provenance(text: str | None = None) -> Provenance:
+    """Code, versions and machine of this process, now; of plug-ins only those that the text of an experiment names."""
     packages = {name: found for name in LIBRARIES if (found := _version(name)) is not None}
     with suppress(OSError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
@@ -100,7 +103,7 @@ def provenance() -> Provenance:
         python=platform.python_version(),
         packages=packages,
         commit=_commit(),
-        plugins=registry.distributions(),
+        plugins=registry.distributions(text),
         host=socket.gethostname(),
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         cpu=_cpu(),

@@ -88,6 +88,16 @@ class PageFigure:
     caption: str
 
 
+COLUMN_PX: Final = 480.0  # [px] half of the page
+
+
+def _width(table: Table) -> float:
+    """About how wide a table is in a page [px]."""
+    lines = [table.head, *(row.cells for row in table.rows)]
+    texts = [[cell if isinstance(cell, str) else " ".join(cell) for cell in line] for line in lines]
+    return sum(24.0 + 7.0 * max(map(len, column)) for column in zip(*texts, strict=True))
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of the page; whatever it has is shown in this order."""
@@ -100,6 +110,11 @@ class Section:
     terms: tuple[tuple[str, str], ...] = ()
     more: tuple[str, Table] | None = None  # a folded table at the end, behind the text on which to click
     folded: str = ""  # what is in it, in a few words; then the whole section is folded
+
+    @property
+    def packed(self) -> bool:
+        """Whether its tables stand in two columns of the page: they are many, and each is narrow enough."""
+        return len(self.tables) > 2 and max(map(_width, self.tables)) <= COLUMN_PX
 
     @property
     def anchor(self) -> str:

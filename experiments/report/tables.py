@@ -7,6 +7,7 @@ a table for each case or with the cases side by side.
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -23,6 +24,7 @@ Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value 
 Column = tuple[str, Callable[[Sequence[T]], Cell]]  # head, cell of the same robot or link in all seeds
 
 MOST_EVENTS: Final = 200
+ALIKE_S: Final = 0.2  # [s] between the same event of two cases
 ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "says", "start")  # kinds that stand folded
 MOST_COLLISIONS: Final = 100
 
@@ -159,7 +161,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Hardest impulse [mN s]": [
             (f"of a collision{over}", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
-        "Cost": [("J2", attrgetter("j2"), 1.0)],
+        "Cost (a number without unit)": [("J2", attrgetter("j2"), 1.0)],
     }
     tables = [_across(unit, cases, lines) for unit, lines in units.items()]
     sums = [
@@ -317,7 +319,8 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
         for kind, group in groups.items()
     }
     rows = _Rows("Robot", _robots, lambda r: (f"({r.robot})" if r.robot in left_out else r.robot, r.kind), columns)
-    return rows.table(case, runs, sums)
+    table = rows.table(case, runs, sums)
+    return replace(table, note="In brackets: left out of the means.") if left_out else table
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -505,7 +508,7 @@ def clocks_table(traces: Sequence[Trace]) -> Table:
 
 def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | None]:
     """Hazards, phases and orders, case by case; and if there was more, all events behind how many they are."""
-    events = [(trace.case, event) for trace in traces for event in trace.events]
+    events = _merged_events(traces)
     head = ("Case", "t [s]", "Event", "Source", "")
 
     def table(chosen: Sequence[tuple[str, Event]]) -> Table:
@@ -516,6 +519,30 @@ def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | N
     short = table(telling) if telling else Table(head, (), note="No hazard, no leg of the timeline, no order.")
     hidden = len(events) > len(telling)
     return short, (f"All {len(events)} events", table(events)) if hidden else None
+
+
+def _merged_events(traces: Sequence[Trace]) -> list[tuple[str, Event]]:
+    """Case and event; an event that all cases have at the same time, within `ALIKE_S`, once, as of the first."""
+    of_case: list[dict[tuple[str, str, str, int], Event]] = []
+    for trace in traces:
+        times = Counter[tuple[str, str, str]]()
+        found = {}
+        for each in trace.events:
+            what = (each.kind, each.source, each.text)
+            times[what] += 1
+            found[*what, times[what]] = each
+        of_case.append(found)
+    alike = set[tuple[str, str, str, int]]()
+    if len(of_case) > 1:
+        for key in set.intersection(*(set(found) for found in of_case)):
+            stamps = [found[key].stamp for found in of_case]
+            alike |= {key} if max(stamps) - min(stamps) <= ALIKE_S else set()
+    return [
+        ("all" if key in alike else trace.case, event)
+        for k, (trace, found) in enumerate(zip(traces, of_case, strict=True))
+        for key, event in found.items()
+        if k == 0 or key not in alike
+    ]
 
 
 def _more(hidden: int, where: str) -> str:

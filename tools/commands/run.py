@@ -172,7 +172,7 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
         date=date_of(begun),
         title=read.experiment.title,
         begun=begun,
-        made_by=provenance(),
+        made_by=provenance(read.text),
     )
     keep_origin(folder, made)
     try:
@@ -189,13 +189,15 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
 
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording import bundle
+    from experiments.recording.run_folder import SOURCE
     from experiments.recording.version import provenance
 
     with TemporaryDirectory(prefix="zenpark-bundle-") as unpacked:
         former = Path(unpacked)
         origin = bundle.unpack(Path(asked.file), former)
         if origin.made_by is not None:
-            warn([f"{asked.file}: {each}" for each in provenance().differences(origin.made_by)])
+            text = (former / SOURCE).read_text("utf-8")
+            warn([f"{asked.file}: {each}" for each in provenance(text).differences(origin.made_by)])
         again = msgspec.structs.replace(
             origin,
             command=f"./zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
@@ -249,15 +251,22 @@ def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, wat
     from tools.progress import Bar
 
     first = read.experiment.seed
-    with Bar(passing=True) as bar:
-        return simulate_seeds(
-            read,
-            range(first, first + seeds),
-            cases=options.cases,
-            folder=folder,
-            progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
-            watch=watch,
-        )
+    try:
+        with Bar(passing=True) as bar:
+            return simulate_seeds(
+                read,
+                range(first, first + seeds),
+                cases=options.cases,
+                folder=folder,
+                progress=lambda case, done, of: bar.show(f"{case}, simulated s", done, of),
+                watch=watch,
+            )
+    except KeyboardInterrupt:
+        cases = ", ".join(sorted(file.stem for file in folder.glob("*.mcap")))
+        kept = f"kept is seed {first} of {cases}, in {folder}" if cases else "nothing is kept"
+        more = "; `./zenpark sweep` keeps every seed that is done, and goes on from there" if seeds > 1 else ""
+        print(f"\ninterrupted: {kept}{more}", file=sys.stderr)
+        raise
 
 
 def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) -> tuple[list[Run], str, int]:

@@ -322,7 +322,7 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
     films = [replaying.Film(tracks.read(file)) for file in files]
     server = live.open_server(port, "zenpark", dark=dark)
     page = replaying.ReplayView(server, films, str(folder), dark=dark)
-    _tell(server.get_port(), str(folder), open_page=open_page)
+    _tell(server.get_port(), f"{folder}; Ctrl-C ends it", open_page=open_page)
     try:
         page.run(ended.is_set)
     finally:
@@ -371,7 +371,7 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
         acting = Acting(session, watched) if may_act(watched) else None
         page = live.LiveView(server, session, watched, dark=dark, acting=acting)
         declared.append(page)
-        _tell(server.get_port(), watched.words, open_page=open_page)
+        _tell(server.get_port(), f"{watched.words}{'' if with_run else '; Ctrl-C ends it'}", open_page=open_page)
         try:
             page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
         finally:

@@ -67,7 +67,7 @@ def test_router_ends_with_its_starter():
     assert process.stdout.readline() == f"router ready on {endpoint}\n"
     _, said = process.communicate(timeout=30)
     assert process.returncode == 0
-    assert said == "router: the starter is gone\n"
+    assert said == "router: ends with its starter\n"
 
 
 def test_lines_are_passed_on_whole_and_heartbeats_are_not(pipe):

@@ -143,8 +143,12 @@ def test_other_code_and_versions_are_named() -> None:
     assert here.differences(other) == [
         f"code {here.code[:8]}, not 00000000",
         f"Python {here.python}, not 2.7",
-        "mine missing, not 1.0",
+        "no plug-ins of mine, the other with version 1.0",
     ]
+    assert other.differences(here)[-1] == "plug-ins of mine 1.0, the other without"
+    without = msgspec.structs.replace(here, packages={"numpy": here.packages["numpy"]})
+    assert here.differences(without) == without.differences(here) == []  # what it did without cannot have mattered
+    assert set(version.provenance('trigger = "periodic"').plugins) == set()
 
 
 def test_tags_are_words(flown: Path) -> None:

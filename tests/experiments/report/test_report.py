@@ -15,7 +15,7 @@ from experiments.metrics.measure import measure
 from experiments.metrics.statistics import spread
 from experiments.report import report
 from experiments.report.metrics_files import write_csv
-from experiments.report.page import date_of, inline, interval, number
+from experiments.report.page import Row, Section, Table, date_of, inline, interval, number
 from experiments.report.tables import events_tables, proof_tables, robot_tables, summary_table, whole_tables
 from experiments.report.verdict import findings, left_out
 from tests.experiments.traces import crowd, cut, experiment, park, trace
@@ -132,6 +132,22 @@ def test_only_telling_events_stand_open():
     quiet, every = events_tables([dataclasses.replace(known, events=said[1:])])
     assert len(quiet.rows) == 1
     assert every is None
+
+
+def test_an_event_of_all_cases_is_one_row():
+    legs = [Event(at, "phase", "conductor", "leader under way") for at in (5.0, 9.0)]
+    late = Event(7.0, "phase", "conductor", "leader under way")
+    first = dataclasses.replace(crowd(3, "a", duration=1.0), events=(legs[0], legs[1]))
+    second = dataclasses.replace(first, case="b", events=(Event(5.1, *msgspec.structs.astuple(legs[0])[1:]), late))
+    short, _ = events_tables([first, second])
+    assert [row.cells[:2] for row in short.rows] == [("all", "5.00"), ("a", "9.00"), ("b", "7.00")]
+
+
+def test_tables_that_do_not_fit_into_half_a_page_are_not_packed():
+    narrow, wide = Table(("Mean", "a"), (Row(("IAE", "1.0")),)), Table(("Mean", "a"), (Row(("IAE", "1.0 ± " * 20)),))
+    assert Section("Results", tables=(narrow,) * 3).packed
+    assert not Section("Results", tables=(narrow, narrow, wide)).packed
+    assert not Section("Results", tables=(narrow,) * 2).packed
 
 
 @pytest.mark.slow
