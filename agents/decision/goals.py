@@ -170,13 +170,23 @@ class GoalComputer:
             offset = law.offset(position, believed, neighbours.links)
         except FAILURES as error:
             raise PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}") from error
+        if np.shape(offset) != position.shape:
+            raise PluginError(_misshapen(law, "offset", "a vector for each robot", position.shape, offset))
         return offset if anchors is None else offset + anchors.offset(position)
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
-        """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them."""
-        neighbours = self.neighbours
+        """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them.
+
+        Raises:
+            PluginError: If the law gives something else than one error for each link.
+        """
+        law, neighbours = self._assignment.law, self.neighbours
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        error = self._assignment.law.error(position, believed, neighbours.links)
+        error = law.error(position, believed, neighbours.links)
+        if np.shape(error) != neighbours.links.receiver.shape:
+            raise PluginError(
+                _misshapen(law, "error", "one value for each link", neighbours.links.receiver.shape, error)
+            )
         both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
         if anchors is not None:
@@ -232,3 +242,7 @@ def _error_and_energy(error: Array) -> Array:
     both = np.empty((len(error), 2))  # `stack` takes three times as long
     both[:, 0], both[:, 1] = error, 0.5 * error * error
     return both
+
+
+def _misshapen(law: laws.Law, method: str, wanted: str, shape: tuple[int, ...], given: Array) -> str:
+    return f"`{method}` of the law {type(law).__name__} must give {wanted}, {shape}, not {np.shape(given)}"
