@@ -87,6 +87,8 @@ class Trajectories:
         self._sent: dict[int, bytes] = {}  # parts that are not confirmed yet
         self._upcoming: bytes | None = None  # polynomials that are not started yet,
         self._number = FIRST  # and their number
+        # the compressed one is of this flight: the firmware may start it before it has written the last one (two tasks)
+        self._current = False
 
     def define(self) -> None:
         """Tell the drone where its trajectories are; each is answered."""
@@ -97,6 +99,7 @@ class Trajectories:
 
     def note_answer(self, address: int, status: int) -> None:
         """Answer of the drone about a part that was written."""
+        self._current |= address == PLACES[COMPRESSED][0] and status == 0
         part = self._sent.pop(address, None)
         if part is not None and status == 0:
             self._written[address] = part
@@ -105,7 +108,9 @@ class Trajectories:
         """Send a setpoint that is held for some seconds, or a part of it; returns the number of packets."""
         if target[3] == 0.0 and max(map(abs, target[:3])) < FARTHEST:
             self._upcoming = None
-            return self._write_part(PLACES[COMPRESSED][0], compressed(target, seconds)) + self._start(COMPRESSED)
+            self._write_part(PLACES[COMPRESSED][0], compressed(target, seconds))
+            return 1 + (self._start(COMPRESSED) if self._current else 0)
+        self._current = False
         self._upcoming = self._upcoming or polynomials(target, seconds)
         packets = self._write(self._number, self._upcoming)
         if packets == 0:
@@ -115,6 +120,7 @@ class Trajectories:
 
     def climb(self, place: Target, climb: tuple[float, float], seconds: float) -> None:
         """Write a climb from a place to a height [m] in a time [s], or start it once the drone has confirmed it."""
+        self._current, self._upcoming = False, None  # of an earlier flight
         if self._write(TAKEOFF, polynomials(place, seconds, climb)) == 0:
             self._start(TAKEOFF)
 

@@ -106,6 +106,32 @@ def test_polynomials_are_started_when_all_of_them_is_confirmed(board):
     assert len(board.sent) == 2, "x of two pieces"
 
 
+def test_the_first_setpoint_is_started_when_it_is_confirmed(board):
+    """The firmware may start what its memory holds before the write that came first: a place of an earlier flight."""
+    board.client.hold((3.0, 3.0, 1.0, 0.0), HOLD_S)
+    while board.started[-1] != TAKEOFF:
+        board.client.climb((0.0, 0.0, 0.0, 0.0), (0.5, 1.5), HOLD_S)
+    board.lost = 2
+    for _ in range(2):
+        board.client.hold((0.0, 0.0, 0.5, 0.0), HOLD_S)
+    assert board.started[-1] == TAKEOFF
+    for x in (0.0, 0.1):
+        board.client.hold((x, 0.0, 0.5, 0.0), HOLD_S)
+        assert board.flown(DT)[0] == pytest.approx([x, 0.0, 0.5, 0.0])
+    assert board.started[-2:] == [COMPRESSED] * 2
+
+
+def test_polynomials_of_an_earlier_flight_are_not_started(board):
+    board.lost = 1
+    board.client.hold((3.0, 3.0, 1.0, 0.3), HOLD_S)
+    assert board.started == []
+    while not board.started:
+        board.client.climb((0.0, 0.0, 0.0, 0.3), (0.5, 1.5), HOLD_S)
+    while len(board.started) < 2:
+        board.client.hold((0.0, 0.0, 0.5, 0.3), HOLD_S)
+    assert board.flown(DT)[0] == pytest.approx([0.0, 0.0, 0.5, 0.3])
+
+
 def test_an_old_start_is_not_transmitted(board, monkeypatch):
     """cflib repeats a packet until it is answered, for as long as a gap takes; the counters of safelink stay."""
     transmitted = []
