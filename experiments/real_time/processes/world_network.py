@@ -89,7 +89,7 @@ class Exchange:
         self._done: dict[str, int] = {}  # number of the last executed command
         # session that owns the name of a robot: a new one numbers its commands from anew
         self._lives: dict[str, str] = {}
-        self._owners = pubsub.AliveWatch(session, keys.lives(keys.alive("*")))
+        self._owners = pubsub.AliveWatch(session, Keys.life(keys.alive("*"), "*"))
         self._strangers: set[str] = set()
         self._met: set[frozenset[str]] = set()
         self._started: dict[str, float] = {}

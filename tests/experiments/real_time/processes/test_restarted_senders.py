@@ -48,6 +48,20 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
         assert order(BEHIND, "stop")
 
 
+def test_a_world_of_many_robots_knows_who_owns_each_name():
+    names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
+    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    experiment = pair(robots={"F000": drone}, formation=Formation())
+    with Net().worn() as net:
+        world = Exchange(experiment, Population(experiment), net.session, OwnershipCheck([]))
+        for name in names:
+            alive = KEYS.alive(name)
+            for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
+                net.deliver(f"{token}\0\0".encode())
+        world.receive(0.0)
+    assert world._lives == dict.fromkeys(names, "one")
+
+
 def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
     experiment = pair(architecture="centralised")
     agent = Agent(Plan(experiment).assignment(("A",)))
