@@ -148,7 +148,7 @@ class OwnershipCheck:
     awake_at: float  # last run of the process, on `uptime` [s]
 
     def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S) -> None:
-        """Begins when the names are owned: liveliness keys `alive`, in a session whose lease is `lease_s` [s]."""
+        """Begin when the names are owned: liveliness keys `alive`, in a session whose lease is `lease_s` [s]."""
         self._alive, self._stood_s = alive, 0.5 * lease_s
         self.awake_at = uptime()
         self._taken = ""
@@ -178,12 +178,12 @@ class OwnershipCheck:
         return self._asking is None
 
     def stood_still(self) -> bool:
-        """Whether the process stood still since the last call, for so long that its names may have another owner."""
+        """Standstill of the process since the last call, so long that its names may have another owner."""
         last, self.awake_at = self.awake_at, uptime()
         return self.awake_at - last >= self._stood_s
 
     def settle(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
-        """Waits while a check runs, or for one if the process stood still since the last call; returns whether it did.
+        """Wait while a check runs, or for one if the process stood still since the last call; returns whether it did.
 
         For processes without a body, before they send anything: another process may send the same meanwhile.
 
