@@ -91,13 +91,16 @@ class CrazyflieSettings(Part, frozen=True):
     @property
     def down_hz(self) -> float:
         """Packets per second from the drone."""
-        ranges_hz = self.ranges_hz if self.multiranger else 0.0
-        return self.log_hz + self.status_hz + ranges_hz + SETPOINT_PACKETS * self.stream_hz
+        return self._logs_hz + SETPOINT_PACKETS * self.stream_hz
+
+    @property
+    def _logs_hz(self) -> float:
+        return self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
 
     @property
     def packets_hz(self) -> float:
-        """Packets per second over the radio, up and down."""
-        return self.up_hz + self.down_hz
+        """Packets per second over the radio, up and down, without answers, which are nearly empty."""
+        return self.up_hz + self._logs_hz
 
 
 def address(name: str, given: str) -> str:
@@ -163,7 +166,8 @@ def capacity(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> float:
     """
     usable = MEASURED_SHARE * exchanges_hz
     up, down = sum(one.up_hz for one in each), sum(one.down_hz for one in each)
-    return min(max(PACKETS_PER_RADIO, usable), usable * (up + down) / max(up, down))
+    asked = sum(one.packets_hz for one in each)
+    return min(max(PACKETS_PER_RADIO, usable), usable * asked / max(up, down))
 
 
 def fitting_rates(each: CrazyflieSettings, share: float) -> str:

@@ -253,19 +253,19 @@ def test_other_robots():
         open_crazyflie(request("tello", [RADIO.format(1)]))
 
 
-@pytest.mark.parametrize(("exchanges", "carried"), [(90.0, 91.0), (300.0, 250.0), (600.0, 420.0)])
+@pytest.mark.parametrize(("exchanges", "carried"), [(100.0, 70.0), (300.0, 210.0), (600.0, 420.0)])
 def test_what_a_radio_carries(exchanges, carried):
-    """Of 65 packets per second and robot, 45 come down: at most 70 % of the exchanges."""
+    """Of 65 packets per second and robot, 45 come down, 20 of them nearly empty: at most 70 % of the exchanges."""
     assert capacity([CrazyflieSettings()] * 5, exchanges) == pytest.approx(carried)
 
 
 def test_crowded_radio():
-    """Four robots at the defaults, 65 packets per second each, are more than 250; the rates that are named fit."""
-    assert overload("0", [CrazyflieSettings()] * 3, 250.0) == ""
-    text = overload("0", [CrazyflieSettings()] * 4, 250.0)
-    assert text.startswith("radio 0: 4 robots ask for 260 packets/s, up and down; it carries 250: ")
+    """Six robots at the defaults, 45 packets per second each, are more than 250; the rates that are named fit."""
+    assert overload("0", [CrazyflieSettings()] * 5, 250.0) == ""
+    text = overload("0", [CrazyflieSettings()] * 6, 250.0)
+    assert text.startswith("radio 0: 6 robots ask for 270 packets/s, up and down; it carries 250: ")
     assert "log_hz = 16, status_hz = 4, stream_hz = 9, or plug in another radio" in text
-    assert overload("0", [CrazyflieSettings(log_hz=16, status_hz=4, stream_hz=9)] * 4, 250.0) == ""
+    assert overload("0", [CrazyflieSettings(log_hz=16, status_hz=4, stream_hz=9)] * 6, 250.0) == ""
     with_positions = overload("0", [CrazyflieSettings(positioning=Outside())] * 8, 250.0)
-    assert "680 packets/s" in with_positions
-    assert "positioning.rate_hz = 7" in with_positions
+    assert "520 packets/s" in with_positions
+    assert "positioning.rate_hz = 9" in with_positions
