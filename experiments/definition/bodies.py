@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array
-from agents.body.interface import BodyRequest, Disturbance
+from agents.body.interface import BodyError, BodyRequest, Disturbance
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.plugins import registry
@@ -184,6 +184,9 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
     Args:
         experiment: A case.
         bodies: One of `BODIES`, or None.
+
+    Raises:
+        BodyError: See `behind_protocols`.
     """
     if bodies is None:
         return experiment
@@ -204,7 +207,15 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
 
 
 def behind_protocols(experiment: Experiment) -> Experiment:
-    """Put every robot behind its real bridge and a protocol twin, with simulated motion capture and radio."""
+    """Put every robot behind its real bridge and a protocol twin, with simulated motion capture and radio.
+
+    Raises:
+        BodyError: If the kind of a robot has no protocol twin.
+    """
+    if strangers := sorted({robot.kind for robot in experiment.robots.values()} - PROTOCOL.keys()):
+        known = ", ".join(sorted(PROTOCOL))
+        message = f"no protocol twin of {', '.join(map(repr, strangers))}, only of {known}"
+        raise BodyError(f"--bodies protocol: {message}; choose --bodies twin or world")
     robots = {}
     for name, robot in experiment.robots.items():
         body, process, position = PROTOCOL[robot.kind]

@@ -11,11 +11,13 @@ import numpy as np
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.bodies import DRIVES
+from experiments.definition.bodies import DRIVES, WORLD
 from experiments.definition.experiment import Arena, Experiment, Hybrid, Robot
 from experiments.file import consistency_formation, consistency_network
 from experiments.file.problems import Fault, after_the_end, unknown_robot
 from twins import scene as outlines
+from twins.models.differential import DRIVES as DRIVEN
+from twins.models.quadrotor import RESPONSES
 from twins.scene import Scene
 from twins.sensing.range_sensors import SENSORS
 
@@ -168,6 +170,9 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
         hint = f"write kind = '{driven}', or a body of a {robot.kind}: twin, world, {own}"
         yield Fault((*path, "body"), f"'{body}' drives a {driven}, and {name} is a {robot.kind}", hint)
+    elif body in ("twin", WORLD) and robot.kind in KINDS.keys() - DRIVEN.keys() - RESPONSES.keys():
+        hint = "add it to DRIVES or RESPONSES in twins/models (docs/plugins.md), or name another body"
+        yield Fault((*path, "kind"), f"no twin of '{robot.kind}'", hint)
     if robot.kind in KINDS:
         yield from _hover(experiment, path, robot)
     else:

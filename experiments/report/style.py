@@ -41,7 +41,8 @@ CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 # robots: Tol's muted colours, so that none of them is taken for a case
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
-KINDS: Final = {"turtlebot3": "#000000", "khepera4": "#44AA99", "crazyflie": "#AA4499", "tello": "#999933"}
+KIND_COLOURS: Final = {"turtlebot3": "#000000", "khepera4": "#44AA99", "crazyflie": "#AA4499", "tello": "#999933"}
+OTHER_KIND: Final = "#7a7a7a"  # of a kind that has no colour of its own
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
 BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
 
@@ -141,7 +142,7 @@ def robot_lines(trace: Trace) -> list[Line]:
         styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
         return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
     kinds = [trace.experiment.robots[name].kind for name in trace.robots]
-    return [{"color": KINDS.get(kind, "#7a7a7a"), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
+    return [{"color": KIND_COLOURS.get(kind, OTHER_KIND), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
 def robot_legend(

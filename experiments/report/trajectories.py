@@ -25,9 +25,10 @@ from experiments.report import scenery
 from experiments.report.style import (
     CASES,
     INK,
-    KINDS,
+    KIND_COLOURS,
     MAGENTA,
     MANY,
+    OTHER_KIND,
     PAPER,
     ROBOTS,
     STYLE,
@@ -107,7 +108,9 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
             style = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
             axes.plot(*target[[i, j], :2].T, color=MAGENTA, linewidth=0.8, linestyle=style, zorder=1)
         for row, robot in enumerate(known.names):
-            colour = ROBOTS[row % len(ROBOTS)] if len(known.names) <= MANY else KINDS[experiment.robots[robot].kind]
+            colour = ROBOTS[row % len(ROBOTS)]
+            if len(known.names) > MANY:
+                colour = KIND_COLOURS.get(experiment.robots[robot].kind, OTHER_KIND)
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
             axes.plot(*target[row, :2], "o", ms=3.5, mec="none", color=colour, zorder=3)

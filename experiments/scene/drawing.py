@@ -163,7 +163,7 @@ class SceneDrawing:
     def _add_kind(self, name: str) -> _Kind:
         stage = self.stage
         rows = np.array([row for row, kind in enumerate(stage.kinds) if kind.name == name], dtype=np.intp)
-        model = models.MODELS[name]
+        model = models.model(stage.kinds[rows[0]])
         colours, place = stage.colours[rows], chassis(stage)[rows]
         parts = [
             self._batch(f"robots/{name}/body", model.body, len(rows), place),

@@ -148,6 +148,13 @@ MODELS: Final[dict[str, Model]] = {
 }
 
 
+def model(kind: Kind) -> Model:
+    """Model of a kind; of one without its own, a quadrotor or a cylinder on two wheels of its size."""
+    if kind.name in MODELS:
+        return MODELS[kind.name]
+    return _quadrotor(kind, 0.36 * kind.radius, 0.14 * kind.radius) if kind.flies else _khepera(kind)
+
+
 def obstacle(scene: Scene, number: int) -> Mesh:
     """Mesh of an obstacle in its own frame [m]."""
     low, high, outline = float(scene.bottom[number]), float(scene.top[number]), scene.outline[number]

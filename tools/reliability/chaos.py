@@ -125,14 +125,14 @@ def _kinds(given: Sequence[str]) -> list[str]:
     """The kinds that were asked for, all without any."""
     from agents.plugins.registry import did_you_mean
     from experiments.file.problems import refusal
-    from tools.reliability.fault_script import KINDS
+    from tools.reliability.fault_script import FAULTS
 
     words = [word for part in given for word in part.split(",") if word]
     for word in words:
-        if word not in KINDS:
-            hint = f"{did_you_mean(word, KINDS)} there are: {', '.join(KINDS)}"
+        if word not in FAULTS:
+            hint = f"{did_you_mean(word, FAULTS)} there are: {', '.join(FAULTS)}"
             raise refusal(f"--kinds {word}", "no such fault", hint)
-    return words or list(KINDS)
+    return words or list(FAULTS)
 
 
 def _print(result: ChaosResult) -> None:

@@ -18,7 +18,7 @@ from experiments.recording.reader import RecordingError, recover
 from experiments.report import style
 from experiments.report.page import Finding, Section, Table, date_of, numbered, render
 from experiments.report.page import Row as Line
-from tools.reliability.fault_script import FAULT_KINDS, KINDS, Fault
+from tools.reliability.fault_script import FAULT_KINDS, FAULTS, Fault
 
 
 class FaultResult(msgspec.Struct, frozen=True):
@@ -114,7 +114,7 @@ class ChaosResult(msgspec.Struct, frozen=True):
 def table(result: ChaosResult) -> Table:
     """A row for each kind of fault."""
     lines = []
-    for kind in KINDS:
+    for kind in FAULTS:
         mine = [each for each in result.outcomes if each.fault.kind == kind]
         if mine:
             well = [each.begin_s for each in mine if each.recovered]
@@ -183,7 +183,7 @@ def write(folder: Path, result: ChaosResult, command: str) -> Path:
 @style.styled
 def figure(result: ChaosResult) -> Figure:
     """Recovery times by kind of fault."""
-    kinds = [kind for kind in KINDS if any(each.fault.kind == kind for each in result.outcomes)]
+    kinds = [kind for kind in FAULTS if any(each.fault.kind == kind for each in result.outcomes)]
     drawn, axes = plt.subplots(figsize=(6.3, 0.7 + 0.28 * max(1, len(kinds))), layout="constrained")
     for place, kind in enumerate(kinds):
         mine = [each for each in result.outcomes if each.fault.kind == kind]

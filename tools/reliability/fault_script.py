@@ -115,7 +115,7 @@ FAULT_KINDS: Final[Mapping[str, FaultKind]] = {
     "disk": FaultKind("The recording can grow no more.", victim=False, most=1, reported="recorder"),
     "corrupt": FaultKind("Payloads of nonsense on every key that a robot believes.", 1.0),
 }
-KINDS: Final = tuple(FAULT_KINDS)
+FAULTS: Final = tuple(FAULT_KINDS)
 
 
 class Fault(msgspec.Struct, frozen=True):
@@ -140,7 +140,7 @@ class Round(msgspec.Struct, frozen=True):
     stage: Stage = "plain"
 
 
-def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = KINDS) -> list[Fault]:
+def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = FAULTS) -> list[Fault]:
     """`count` faults, each kind as often as any other; the same seed gives the same script.
 
     Args:

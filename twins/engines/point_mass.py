@@ -61,7 +61,8 @@ class Models:
         kinds = stage.kinds
         unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
         if unknown:
-            raise BodyError(f"there is no twin of a {', '.join(unknown)}; name another body")
+            remedy = "add it to DRIVES or RESPONSES in twins/models (docs/plugins.md), or name another body"
+            raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {remedy}")
         flies = np.array([kind.flies for kind in kinds])
         air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
         self.in_air, self.on_floor = air, floor

@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 import tomllib
+from importlib import metadata
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from agents.body.kinds import KINDS
 from agents.formation.graph import edges, links
 from agents.formation.rigidity import rigidity
+from agents.plugins import registry
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import json_schema
@@ -113,10 +115,24 @@ def test_the_schema_is_draft_7_and_knows_the_plugins():
     assert "cases" not in schema["definitions"][case]["properties"]
 
 
-def test_every_field_of_the_schema_is_described():
+class Undescribed(msgspec.Struct, frozen=True):
+    """A law of a user, whose parameters have no description."""
+
+    largest: float = 0.05
+
+
+@pytest.mark.parametrize("foreign", [[], [metadata.EntryPoint("clamped", f"{__name__}:Undescribed", registry.LAWS)]])
+def test_every_field_of_zenpark_in_the_schema_is_described(monkeypatch, foreign):
+    installed = registry._registered
+    more = {registry.LAWS: {entry.name: [entry] for entry in foreign}}
+    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | more.get(group, {}))
+    own = {entry.name for entry in metadata.distribution("zenpark").entry_points}
+
     def undescribed(node, path):
         if isinstance(node, dict):
             fields = node.get("properties", {})
+            if fields.get("kind", {}).get("const", "") not in {"", *own}:
+                return  # parameters of a user's plug-in
             yield from (f"{path}.{name}" for name, each in fields.items() if not {"description", "const"} & set(each))
             for key, each in node.items():
                 yield from undescribed(each, f"{path}.{key}")

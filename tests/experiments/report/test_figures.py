@@ -124,7 +124,7 @@ def test_delays_are_shown_where_they_differ():
 
 def test_cases_and_robots_have_palettes_of_their_own():
     assert not set(style.CASES[:-1]) & set(style.ROBOTS)
-    assert not set(style.CASES[:-1]) & set(style.KINDS.values())
+    assert not set(style.CASES[:-1]) & set(style.KIND_COLOURS.values())
 
 
 def test_figures_show_themselves_in_notebooks():

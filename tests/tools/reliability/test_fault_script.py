@@ -5,7 +5,7 @@ import pytest
 from experiments.file.document import load
 from tools.reliability import chaos_round
 from tools.reliability.chaos import ALWAYS, AVOIDANCE, defaults
-from tools.reliability.fault_script import FAULT_KINDS, KINDS, script, take_round
+from tools.reliability.fault_script import FAULT_KINDS, FAULTS, script, take_round
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -20,7 +20,7 @@ def test_every_kind_comes_as_often_as_any_other(count):
     drawn = script(ROBOTS, count, 1)
     assert len(drawn) == count
     often = Counter(fault.kind for fault in drawn)
-    assert max(often.values()) - min(often[kind] for kind in KINDS) <= 1
+    assert max(often.values()) - min(often[kind] for kind in FAULTS) <= 1
 
 
 def test_rounds_can_be_flown():
@@ -54,9 +54,9 @@ def test_only_the_kinds_that_were_asked_for():
 
 def test_every_kind_is_known_to_those_that_do_it_and_that_look_after_it():
     tables = {name for name, kind in FAULT_KINDS.items() if kind.signal or kind.cuts or kind.clock}
-    assert set(KINDS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
+    assert set(FAULTS) - tables == {"double", "read-error", "disk", "corrupt"}, "done by functions of their own"
     looked_after = {name.removeprefix("_after_").replace("_", "-") for name in vars(chaos_round.ChaosRound)}
-    assert {kind for kind in KINDS if kind in looked_after} == {
+    assert {kind for kind in FAULTS if kind in looked_after} == {
         "kill", "clock", "read-error", "clock-behind", "double", "frozen-router", "mocap-clock"
     }  # fmt: skip
 

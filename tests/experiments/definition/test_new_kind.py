@@ -1,0 +1,52 @@
+"""A kind of robot that has only its sizes yet: refused in the file where it needs a twin, and drawn like others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from agents.body.interface import BodyError
+from agents.body.kinds import KINDS
+from experiments.check.analysis import analyse
+from experiments.check.ideal_run import predict
+from experiments.definition.bodies import choose_bodies
+from experiments.file.document import load, loads
+from experiments.file.problems import DocumentError
+from experiments.report import style, trajectories
+from twins.models.differential import DRIVES
+
+KIND = "alphabot"
+ROVERS = (
+    'title = "Rovers"\nduration_s = 2.0\n[arena]\nsize = [12.0, 4.0, 2.0]\n'
+    + "".join(f'[robots.R{k}]\nkind = "{KIND}"\nstart = [{k - 5}.0, 0.0]\n' for k in range(style.MANY + 1))
+    + "[formation.links]\n"
+    + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(style.MANY))
+)
+
+
+@pytest.fixture(autouse=True)
+def known(monkeypatch):
+    monkeypatch.setitem(KINDS, KIND, replace(KINDS["khepera4"], name=KIND))
+
+
+def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
+    with pytest.raises(DocumentError) as caught:
+        loads(ROVERS)
+    first = caught.value.problems[0]
+    assert (first.line, first.message) == (6, f"no twin of '{KIND}'")
+    assert "DRIVES or RESPONSES" in first.hint
+
+
+def test_a_kind_without_a_protocol_twin_is_refused_by_name(monkeypatch):
+    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):
+        choose_bodies(loads(ROVERS).experiment, "protocol")
+    assert choose_bodies(load("triangle").experiment, "protocol")
+
+
+def test_many_robots_of_a_kind_without_a_colour_are_drawn(monkeypatch):
+    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    cases = loads(ROVERS).cases()
+    figure = trajectories.expected_motion({name: analyse(case, predict(case)) for name, case in cases.items()})
+    assert style.OTHER_KIND in {line.get_color() for line in figure.axes[0].lines}
