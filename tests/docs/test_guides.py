@@ -17,7 +17,7 @@ from tools.main import main
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 GUIDES = (
     *("first-hour", "from-a-paper", "mixed-reality", "shadow-twin", "teaching"),
-    *("two-crazyflies", "three-machines", "lab-certificates"),
+    *("two-crazyflies", "vicon", "three-machines", "lab-certificates"),
 )
 STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
@@ -28,6 +28,7 @@ REAL = (
     "run way.toml",
     "run shadow.toml --out runs/shadow --open",
     "run two.toml --bodies protocol",
+    "run measured.toml",
     "run three.toml --here",
 )
 

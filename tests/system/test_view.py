@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -198,6 +199,8 @@ def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_pa
     assert title.startswith("event: ")
     assert {row.split()[0] for row in rows[:3]} == {"KH01", "KH02", "CF01"}
     assert all(row.count("%") == 2 for row in rows[:3]), f"CPU and battery: {heads} {rows}"
+    shown = json.loads(zenpark("top", "--json", "--connect", endpoint, "--lab", lab).stdout)
+    assert (shown["case"], {row["name"] for row in shown["robots"]}) == ("event", {"KH01", "KH02", "CF01"})
     missing = zenpark("top", "--connect", endpoint)
     assert missing.returncode == 2
     assert "--lab" in missing.stderr, missing.stderr

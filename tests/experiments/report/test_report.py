@@ -312,6 +312,13 @@ def test_verdict_says_what_was_measured(run):
     said = {finding.text: finding.mark for finding in findings(cases)}
     fewer = 100.0 * (1.0 - cases[1].mean["f_hz"] / cases[0].mean["f_hz"])
     assert any(text.startswith(f"event needs {fewer:.1f} % fewer transmissions than periodic: 4.") for text in said)
+    same = {
+        finding.text: finding.mark for finding in findings([cases[0], msgspec.structs.replace(cases[0], case="again")])
+    }
+    (mark,) = [
+        mark for text, mark in same.items() if text.startswith("again needs as many transmissions as periodic: ")
+    ]
+    assert mark == "plain"
     ratio = cases[1].mean["iae"] / cases[0].mean["iae"]
     assert [mark for text, mark in said.items() if f"IAE {ratio:.3f}" in text] == ["plain"]
     first, again = cases[0].acquired_s

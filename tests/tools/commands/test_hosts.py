@@ -181,8 +181,9 @@ def test_install_puts_this_one_there_once(home, tmp_path, capsys, bootstrap):
     assert command.read_bytes() == (ROOT / "zenpark").read_bytes()
     assert not (home / "zenpark" / "agents" / "removed.py").exists()
     assert not (home / "zenpark" / ".incoming").exists()
-    assert tool.install(file) == 0
-    assert f"lab1: has it already ({version.digest()[:8]})" in capsys.readouterr().out
+    assert tool.install(file, as_json=True) == 0
+    (row,) = json.loads(capsys.readouterr().out)["hosts"]
+    assert row == {"host": "lab1", "ok": True, "zenpark": f"has it already ({version.digest()[:8]})"}
 
 
 @pytest.mark.system
