@@ -63,6 +63,7 @@ class Agent:
     begun: bool  # whether the first row has begun to run
     decision_due: bool  # whether goals are decided on this tick; known from its first half on
     goal_computer: GoalComputer  # of rows that are not guided
+    neighbours: NeighbourStates  # received poses, and the links that enter the law
     guidance: Guidance | None  # goals of the guided rows; None: no row is guided
     all_guided: bool
     lifecycle: Lifecycle
@@ -86,6 +87,7 @@ class Agent:
         if some(self._guided):
             self.guidance = Guidance(self._guided, flies, assignment.limits.link_silence_s)
         self.goal_computer = GoalComputer(assignment, ~self._guided)
+        self.neighbours = self.goal_computer.neighbours
         self.all_guided = bool(self._guided.all())
         self._holding = StationKeeping(self.goal_computer.ground)
         self.lifecycle = Lifecycle(flies, assignment.hover, assignment.duration)
@@ -122,11 +124,6 @@ class Agent:
     def last_transmission(self) -> LastEvent:
         """Last transmission of each row."""
         return self._transmitter.last_event
-
-    @property
-    def neighbours(self) -> NeighbourStates:
-        """Received poses, and the links that enter the law."""
-        return self.goal_computer.neighbours
 
     def hold(self, row: int) -> str:
         """Order to stay in place; returns the reason of a refusal, empty when accepted."""

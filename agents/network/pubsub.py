@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
+from itertools import chain
 from typing import Final, Generic, Protocol, Self, TypeVar
 
 import zenoh
@@ -124,7 +125,7 @@ class Inbox(Generic[M]):
     ) -> None:
         """Reads `kind` from the queue of a subscription."""
         self._subscription, self._kind, self._keys, self._on_refusal = subscription, kind, keys, on_refusal
-        self._queue = subscription.handler  # made anew by Zenoh whenever it is asked for
+        self._next = subscription.handler.try_recv  # the handler is made anew by Zenoh whenever it is asked for
         self._robots = robots
         self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
         self.malformed, self.trouble = 0, ""
@@ -140,16 +141,16 @@ class Inbox(Generic[M]):
 
         Empty, and false, if nothing is queued.
         """
-        waiting = received(self._queue)
-        return self._decoded(waiting, check, wanted) if waiting else ()
+        first = self._next()
+        return () if first is None else self._decoded(first, check, wanted)
 
     def _decoded(
         self,
-        waiting: Iterable[zenoh.Sample],
+        first: zenoh.Sample,
         check: Callable[[M], object] | None,
         wanted: Callable[[str], bool] | None,
     ) -> Iterator[tuple[M, zenoh.Sample]]:
-        for sample in waiting:
+        for sample in chain((first,), iter(self._next, None)):
             key = str(sample.key_expr)
             if wanted is not None and not wanted(key):
                 continue

@@ -236,10 +236,11 @@ class ModelledInbox:
                 else:
                     self._channel.forget(sender.links)
                     self._states.mark_lost(sender.links, t)
-        arrived: list[tuple[int, ReceivedPose]] = []
+        now, arrived = utc + t, list[tuple[int, ReceivedPose]]()
         for sender in self.senders:
-            for received in sender.new_poses(utc + t):
-                sender.lost += received.missed if self._counted(received.pose.stamp - utc) else 0
+            for received in sender.new_poses(now):
+                if received.missed and self._counted(received.pose.stamp - utc):
+                    sender.lost += received.missed
                 self.arrived += sender.name not in own
                 if received.anew:
                     self._begin(sender)
