@@ -9,6 +9,8 @@ A tick has two halves, `transmit` and `act`; the caller may deliver the new tran
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 
@@ -29,6 +31,7 @@ from agents.plugins.triggers import LastEvent, Trigger
 from agents.safety.detection import Detector, RowStatus
 from agents.safety.hazards import Hazards, Outcome
 from agents.safety.landing import Landing
+from agents.safety.obedience import Continuity
 from agents.safety.preflight import Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.safety.situation import ProcessHealth, Situation
@@ -99,7 +102,7 @@ class Agent:
         self._decided = self._asked = -1
         self._commands: BodyCommands | None = None
         self._ordered = np.zeros(rows, dtype=bool)
-        self._controller = PositionController(assignment.kinds)
+        self._controller, self._continuity = PositionController(assignment.kinds), Continuity(assignment.kinds)
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
         self._perception = None if assignment.avoidance is None else Perception(assignment)
         self._landing = Landing(assignment)
@@ -133,8 +136,9 @@ class Agent:
         return ""
 
     def resume(self, row: int) -> None:
-        """Order to go on after a hold."""
+        """Order to go on after a hold, from where the row is now."""
         self._ordered[row] = False
+        self._continuity.forget(row)
 
     def go(self, row: int, goal: tuple[float, float], t: float) -> str:
         """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
@@ -216,8 +220,12 @@ class Agent:
         """First half of a tick: advance the phases, and decide which rows transmit their measured pose."""
         self.goal_computer.update_links(t)
         life = self.lifecycle
+        watched = self._every_row if life.all_running else (life.phase == AIRBORNE) | (life.phase == RUNNING)
+        jump = self._continuity.jumps(state.time, state.position, watched)
+        if jump is not None:
+            state = replace(state, position=np.where(np.isnan(jump)[:, None], state.position, np.nan))
         where = self._safety.validate_poses(state.position, state.yaw, t - state.time)
-        self._now = Situation(t, state, where, self.neighbours, self.health)
+        self._now = Situation(t, state, where, self.neighbours, self.health, jump)
         ready = self._ready(self._now) if life.waiting else self._no_row  # all rows have taken off
         commands = life.advance(t, ready, state.position, state.velocity, state.flying)
         if commands is not None or self._landing.any_aside:
@@ -243,6 +251,7 @@ class Agent:
 
     def act(self, t: float, state: BodyState, transmission: Transmission) -> Actions:
         """Second half of a tick: goals, setpoints and commands."""
+        state = state if self._now.jump is None else self._now.state
         held = self.hazards.held
         self._apply_hazards(self._now)
         if self.decision_due:

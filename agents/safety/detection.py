@@ -189,6 +189,8 @@ class Detector:
         t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
         def age(row: int) -> str:
+            if now.jump is not None and np.isfinite(now.jump[row]):
+                return f"it jumped by {now.jump[row]:.2f} m"
             return f"the last is {t - state.time[row]:.2f} s old" if np.isfinite(state.position[row]).all() else "none"
 
         def excess(limit: float, row: int) -> str:

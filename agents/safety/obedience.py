@@ -1,4 +1,4 @@
-"""Obedience of bodies: rows that are told to move and do not, and rows that move and are not told to. Pure, row-wise.
+"""Obedience of bodies: rows that are told to move and do not, that move and are not told to, or that jump. Row-wise.
 
 The told motion is that of the setpoint: the speed at which a body closes a position error, a velocity, or a twist along
 the nose. Told and measured motion are compared over pieces of half a second, so that neither the rate of the measured
@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm, some
+from agents.arrays import Array, Mask, every, norm, some
 from agents.body.kinds import Kind
 
 SAMPLE_S: Final = 0.1  # between two samples of the setpoint
@@ -23,7 +23,51 @@ WITHOUT_S: Final = 1.5  # at a kind's top speed: so much way told and not moved 
 LEAST_WITHOUT_S: Final = 2.0  # and at least so long
 FORGET_S: Final = 5.0  # after which motion that was not told is forgotten
 RUSH_S: Final = 0.5  # at a kind's top speed, and its size, is what it may move without being told
+JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
+GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
+REACH: Final = 1.5  # share of a kind's speed: what it can move
 TURN: Final = 1.5  # [rad] what it may turn without being told, on wheels
+
+
+class Continuity:
+    """Jumps of the measured positions of N rows.
+
+    A robot does not jump: its position comes from something else now (swapped markers, another origin), or it was put
+    somewhere by hand. A row has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
+    """
+
+    def __init__(self, kinds: Sequence[Kind]) -> None:
+        self._fastest = REACH * np.array([kind.speed for kind in kinds])
+        self._place, self._time = np.full((len(kinds), 3), np.nan), np.zeros(len(kinds))  # last plausible ones
+        self._out: Mask = np.zeros(len(kinds), dtype=bool)
+
+    def jumps(self, time: Array, position: Array, watched: Mask) -> Array | None:
+        """Lengths (N,) [m] of the jumps of rows, NaN of those that have not; None if no row has.
+
+        Args:
+            time: (N,) of the measurement [s].
+            position: (N, 3) measured [m].
+            watched: (N,) rows that follow their setpoints: the others may be carried, and begin anew.
+        """
+        moved = position - self._place
+        squared = np.vecdot(moved, moved)
+        if every(watched) and every(squared < JUMP_M**2):
+            self._place, self._time = position.copy(), time.copy()
+            if some(self._out):
+                self._out = np.zeros(len(time), dtype=bool)
+            return None
+        gap, unknown = np.sqrt(squared), watched & np.isnan(position).any(axis=1)
+        plausible = JUMP_M + np.where(self._out, 0.0, self._fastest * np.clip(time - self._time, 0.0, GAP_S))
+        self._out = watched & ((gap > plausible) | (unknown & self._out))
+        kept = self._out | unknown
+        self._place = np.where(kept[:, None], self._place, np.where(watched[:, None], position, np.nan))
+        self._time = np.where(watched & ~kept, time, self._time)
+        return np.where(self._out, gap, np.nan) if some(self._out) else None
+
+    def forget(self, row: int) -> None:
+        """A row is where its position says, wherever that is."""
+        self._place, self._out = self._place.copy(), self._out.copy()
+        self._place[row], self._out[row] = np.nan, False
 
 
 class Obedience:

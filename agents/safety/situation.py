@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from agents.arrays import Array
 from agents.body.interface import BodyState
 from agents.decision.neighbours import NeighbourStates
 from agents.safety.setpoint_filter import PoseValidity
@@ -69,3 +70,4 @@ class Situation(msgspec.Struct, frozen=True):
     where: PoseValidity  # validity of their poses
     neighbours: NeighbourStates  # of the rows
     health: ProcessHealth  # of the process around the decision
+    jump: Array | None = None  # (N,) [m] of rows whose position jumped: `state` has none of them; None: of no row

@@ -273,6 +273,7 @@ UNSAFE = {
 def test_a_drone_that(what):
     values, text, phase, ticks = UNSAFE[what]
     swarm = drone().running().run(0.3)
+    swarm.agent("F").resume(0)  # it is put there: no jump
     spoiled(swarm, **values)
     swarm.run(0.01)
     assert swarm.phase("F") in (RUNNING, LANDING, phase)
@@ -283,6 +284,46 @@ def test_a_drone_that(what):
     assert swarm.phase("F") == phase
     told = happened(swarm)["F"]
     assert any(each.startswith(text) for each in told) if text else told == []
+
+
+def jumped(swarm, name, at, until):
+    """The measured position of a robot is off by 1 m from `at` [s] on, before `until`."""
+    group = next(group for group in swarm.groups if name in group.names)
+
+    def spoil(t, state):
+        if at <= t < until:
+            state.position[group.names.index(name), 1] += 1.0
+        return state
+
+    group.spoil = spoil
+
+
+@pytest.mark.parametrize(("lasts_s", "phase"), [(0.01, RUNNING), (0.25, RUNNING), (0.5, LANDING)])
+def test_a_drone_whose_position_jumps_lands_unless_it_is_back_at_once(lasts_s, phase):
+    swarm = drone().running().run(0.3)
+    place = swarm.row("F", "truth")
+    jumped(swarm, "F", swarm.t, swarm.t + lasts_s)
+    swarm.run(2.0)
+    assert swarm.phase("F") >= phase
+    assert swarm.phase("F") == RUNNING or phase == LANDING
+    first = happened(swarm)["F"][0]
+    assert first.startswith("hold: its own position is lost: it jumped by 1.0")
+    assert np.linalg.norm((swarm.row("F", "truth") - place)[:2]) < 0.1
+
+
+def test_wheels_whose_position_jumps_stand_and_lead_nobody_astray_until_they_are_ordered_to_start():
+    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(10.0)
+    before = [swarm.row(name, "truth") for name in ("A", "B")]
+    jumped(swarm, "A", swarm.t, np.inf)
+    swarm.run(20.0)
+    after = [swarm.row(name, "truth") for name in ("A", "B")]
+    assert np.abs(np.array(after) - before).max() < 0.01
+    assert happened(swarm)["A"] == ["hold: its own position is lost: it jumped by 1.00 m"]
+    assert happened(swarm)["B"] == []
+    swarm.agent("A").resume(0)
+    swarm.run(2.0)
+    assert happened(swarm)["A"][-1].startswith("over: its own position is lost, after 19.9")
+    assert swarm.row("A", "setpoint").any()  # it believes its position
 
 
 def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
