@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from agents.arrays import Array
@@ -56,7 +56,8 @@ from experiments.report.style import (
 from experiments.report.trajectories import formation, has_heights, has_positions, plan_view
 
 BAND: Final = "#009E73"  # the tolerance
-LEAST_ERROR: Final = 1e-3  # [m] below this an error axis does not go
+LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
+WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
 MOST_SEEDS: Final = 50  # of a case, for the range of its errors
 ALIKE_S: Final = 2e-3  # [s] delays that differ by less are those of a fixed one and of ticks
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
@@ -102,41 +103,45 @@ def every(
 
 @styled
 def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
-    """Mean transmission rate and errors, over those of the first case (paper, figure 12).
+    """Mean transmission rate, and in an axis of their own mean errors, over those of the first case (paper, figure 12).
 
-    Cases of one name and several seeds become one bar, the mean of the ratios, with its 95 % confidence interval.
+    Cases of one name and several seeds become one bar, the mean of the ratios, with its 95 % confidence interval; the
+    first case is the line at 1.
     """
     grouped = by_case(cases)
-    first = next(iter(grouped.values()), [])
-    figure = Drawing(figsize=(width, 1.9 if len(grouped) <= 4 else 2.3), layout="constrained")
-    axes = figure.subplots()
-    share = 0.8 / max(1, len(grouped))
-    tops = [1.0]
-    for k, (name, runs) in enumerate(grouped.items()):
-        found = [spread(ratios(runs, first, index)) for index, _, _ in BARS]
-        x = np.arange(len(BARS)) + (k - 0.5 * (len(grouped) - 1)) * share
-        height, error = _bars(axes, x, found, width=share, k=k, label=plain(name))
-        for at, top, more in zip(x, height, error, strict=True):
-            if math.isfinite(top):
-                size = 6.0 if len(grouped) <= 3 else 5.0
-                turned = 0 if len(grouped) <= 4 else 90
-                axes.annotate(
-                    f"{top:.2f}",
-                    (at, top + more),
-                    (0, 1.5),
-                    textcoords="offset points",
-                    ha="center",
-                    va="bottom",
-                    fontsize=size,
-                    rotation=turned,
-                )
-                tops.append(top + more)
-    axes.set_xticks(np.arange(len(BARS)), [label for _, label, _ in BARS])
-    axes.tick_params(axis="x", length=0)
-    axes.set_ylabel(f"relative to {plain(next(iter(grouped), ''))}")
-    axes.set_ylim(0.0, 1.14 * max(tops))
-    axes.grid(axis="y")
-    legend_above(figure, axes.get_legend_handles_labels(), columns=3)
+    (reference, first), *others = grouped.items()
+    figure = Drawing(figsize=(width, 1.9 if len(others) <= 4 else 2.3), layout="constrained")
+    panels = figure.subplots(1, 2, width_ratios=(1, len(BARS) - 1))
+    share = min(0.8 / max(1, len(others)), 0.5)
+    for axes, indices in zip(panels, (BARS[:1], BARS[1:]), strict=True):
+        tops = [0.0]
+        for k, (name, runs) in enumerate(others):
+            found = [spread(ratios(runs, first, index)) for index, _, _ in indices]
+            x = np.arange(len(indices)) + (k - 0.5 * (len(others) - 1)) * share
+            height, error = _bars(axes, x, found, width=share, k=k + 1, label=plain(name))
+            for at, top, more in zip(x, height, error, strict=True):
+                if math.isfinite(top):
+                    axes.annotate(
+                        f"{top:.3f}",
+                        (at, top + more),
+                        (0, 1.5),
+                        textcoords="offset points",
+                        ha="center",
+                        va="bottom",
+                        fontsize=6.0 if len(others) <= 3 else 5.0,
+                        rotation=0 if len(others) <= 2 else 90,
+                    )
+                    tops.append(top + more)
+        axes.set_xticks(np.arange(len(indices)), [label for _, label, _ in indices])
+        axes.set_xlim(-0.5, len(indices) - 0.5)
+        axes.tick_params(axis="x", length=0)
+        axes.set_ylim(0.0, (1.14 if len(others) <= 2 else 1.3) * (max(tops) or 1.0))
+        if axes.get_ylim()[1] > 1.0:
+            axes.axhline(1.0, color=INK, linewidth=0.6, linestyle=(0, (4, 3)), zorder=0.5)
+        axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+        axes.grid(axis="y")
+    panels[0].set_ylabel(f"relative to {plain(reference)}")
+    legend_above(figure, panels[1].get_legend_handles_labels(), columns=3)
     return figure
 
 
@@ -150,6 +155,8 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     panels = figure.subplots(len(BARS), 1, sharex=True, squeeze=False)[:, 0]
     share = 0.8 / max(1, len(grouped))
     for axes, (index, label, unit) in zip(panels, BARS, strict=True):
+        known = [value for case in cases for robot in case.robots if (value := getattr(robot, index))]
+        wide = index == "f_hz" and bool(known) and max(known) > WIDE * min(known)
         for k, (name, runs) in enumerate(grouped.items()):
             robots = [robot for run in runs for robot in run.robots]
             found = [spread([getattr(each, index) for each in robots if each.robot == name]) for name in names]
@@ -157,7 +164,14 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
             _bars(axes, x, found, width=share, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
         axes.tick_params(axis="x", length=0)
-        axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        if wide:  # beside fifty messages a second two are seen on a logarithmic axis alone
+            axes.set_yscale("log")
+            axes.set_ylim(0.5 * min(known), 1.3 * max(known))
+            axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
         axes.grid(axis="y")
     name_ticks(panels[-1], [f"({name})" if name in out else name for name in names])
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
@@ -199,7 +213,7 @@ def errors(
                 axes.plot(band.time, mine, color=line["color"], linewidth=0.4, alpha=0.45)
         axes.plot(band.time, band.middle, **line, linewidth=1.3, zorder=3)
         handles[plain(name)] = Line2D([], [], **line, linewidth=1.3)
-        known = band.low[np.isfinite(band.low) & (band.low > 0.0)]
+        known = band.middle[np.isfinite(band.middle) & (band.middle > 0.0)]
         lowest = min(lowest, float(known.min(initial=np.inf)))
         highest = max(highest, float(np.nanmax(band.high, initial=0.0)))
         at = _acquisitions([case for case in cases if case.case == name])

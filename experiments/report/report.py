@@ -284,7 +284,7 @@ def _pictures(
         "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.{recorded}",
         "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
-        "plan_view": f"From above: start hollow, end full, links of the end grey.{scenery.caption(shown)}{seed}",
+        "plan_view": f"From above: start hollow, end full, with its links.{scenery.caption(shown)}{seed}",
         "delays": f"Delays of poses from stamp to arrival, all links; vertical: 95 % are shorter.{seed}",
     }
     drawn = figures.every(cases, traces, bands=bands)

@@ -145,6 +145,17 @@ def robot_lines(trace: Trace) -> list[Line]:
     return [{"color": KIND_COLOURS.get(kind, OTHER_KIND), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
+def case_line(k: int) -> Line:
+    """Style of the path of a case upon others: the first one broad and pale, so that the next ones are seen on it."""
+    if k == 0:
+        return {"color": CASES[0], "linewidth": 2.6, "alpha": 0.4, "solid_capstyle": "butt"}
+    return {
+        "color": CASES[k % len(CASES)],
+        "linewidth": 0.8,
+        "linestyle": ("-", (0, (4, 1.5)), (0, (1, 1)))[(k - 1) % 3],
+    }
+
+
 def robot_legend(
     figure: Figure, traces: Sequence[Trace], more: tuple[Sequence[Artist], Sequence[str]] = ((), ())
 ) -> None:
@@ -161,9 +172,18 @@ def robot_legend(
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:
     """A legend above all panels, with as many columns as fit between the edges; none without entries."""
     if entries[1]:
-        widest = 28.0 + 3.3 * max(map(len, entries[1]))  # [pt]
-        columns = max(1, min(columns, len(entries[1]), int(72.0 * figure.get_figwidth() / widest)))
-        figure.legend(*entries, loc="outside upper center", ncols=columns)
+        figure.legend(*entries, loc="outside upper center", ncols=fitting(figure.get_figwidth(), entries[1], columns))
+
+
+def fitting(width: float, labels: Sequence[str], columns: int) -> int:
+    """Columns of a legend, at most `columns`, that fit into a width [in]; labels fill one column after the other."""
+    wide = [27.0 + 3.2 * len(label) for label in labels]  # [pt]
+    for count in range(min(columns, len(labels)), 1, -1):
+        rows = [len(part) for part in np.array_split(np.arange(len(labels)), count)]
+        ends = np.cumsum(rows)
+        if sum(max(wide[end - n : end]) for end, n in zip(ends, rows, strict=True)) <= 72.0 * width:
+            return count
+    return 1
 
 
 def name_ticks(axes: Axes, names: Sequence[str]) -> None:

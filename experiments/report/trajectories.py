@@ -7,13 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import matplotlib as mpl
+import msgspec
 import numpy as np
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
@@ -23,7 +26,6 @@ from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
-    CASES,
     INK,
     KIND_COLOURS,
     MAGENTA,
@@ -35,8 +37,11 @@ from experiments.report.style import (
     WIDTH,
     Drawing,
     Line,
+    case_line,
     edges,
+    fitting,
     last_known,
+    legend_above,
     plain,
     robot_legend,
     robot_lines,
@@ -46,45 +51,91 @@ from experiments.report.style import (
 from experiments.scene.stage import link_colours
 
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
+OVERLAID: Final = 3  # so many cases are told apart upon each other, from above
 FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor is, where tall things stand there
 
 
 @styled
 def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
-    """The trajectories from above, in the arena as it is; start hollow, end full, links of the end grey."""
-    columns = min(2, len(traces))
-    rows = math.ceil(len(traces) / columns)
-    x, y, _ = traces[0].experiment.arena.size
-    side = (width - 0.5) / columns
-    panel = min(side * y / x, 3.2) + 0.25
+    """The trajectories from above, and of the arena what is near them; start hollow, end full, links of the end.
+
+    A few cases in the same arena are laid upon each other, with a colour each, their robots named; more are side by
+    side, and their robots have a colour each.
+    """
+    arenas = {msgspec.json.encode(trace.experiment.arena) for trace in traces}
+    overlaid = 1 < len(traces) <= OVERLAID and len(arenas) == 1
+    panels = [list(traces)] if overlaid else [[trace] for trace in traces]
+    place = np.concatenate([trace.true_position.reshape(-1, 3)[:, :2] for trace in traces])
+    place = place[np.isfinite(place).all(axis=1)]
+    low, high = (place.min(axis=0), place.max(axis=0)) if len(place) else (np.zeros(2), np.zeros(2))
+    for trace in traces:
+        low, high = scenery.around(trace.experiment, low, high)
+    size = np.maximum(high - low, 0.4)
+    low, high = 0.5 * (low + high) - 0.56 * size, 0.5 * (low + high) + 0.56 * size
+    columns = min(2, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    panel = min((width - 0.5) / columns * float(size[1] / size[0]), min(0.62 * width, 3.6) if overlaid else 3.2) + 0.25
     things = scenery.legend([trace.experiment for trace in traces])
     figure = Drawing(figsize=(width, panel * rows + 0.7 + 0.17 * bool(things[1])), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, trace in zip(grid.flat, traces, strict=False):
-        x, y, _ = trace.experiment.arena.size
-        scenery.from_above(axes, trace.experiment)
-        few, net = thinned(trace, len(traces)), trace.plan.links
-        place, last = trace.true_position, last_known(trace)
-        for i, j in edges(net.receiver, net.sender):
-            axes.plot(*last[[i, j], :2].T, color="#8a8a8a", linewidth=0.5, zorder=1)
-        small = 3.0 if len(trace.robots) <= MANY else 2.0
-        for i, line in enumerate(robot_lines(trace)):
-            axes.plot(place[few, i, 0], place[few, i, 1], **{**line, "linewidth": 0.8})
-            axes.plot(*place[0, i, :2], "o", ms=small, mec=line["color"], mfc="none", mew=0.7)
-            axes.plot(*last[i, :2], "o", ms=small + 0.5, mec="none", color=line["color"])
+    for axes, shown in zip(grid.flat, panels, strict=False):
+        scenery.from_above(axes, shown[0].experiment)
+        for k, trace in enumerate(shown):
+            _draw_from_above(axes, trace, thinned(trace, len(traces)), case_line(k) if overlaid else None)
         axes.set_aspect("equal")
-        axes.set_xlim(-0.53 * x, 0.53 * x)
-        axes.set_ylim(-0.53 * y, 0.53 * y)
-        axes.set_title(plain(trace.case), pad=3.0)
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        axes.set_title("" if overlaid else plain(shown[0].case), pad=3.0)
         axes.spines[["left", "bottom"]].set_visible(False)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.yaxis.set_major_locator(MaxNLocator(5))
-    for axes in list(grid.flat)[len(traces) :]:
+    for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    figure.supxlabel("$x$ [m]", fontsize=8)
-    figure.supylabel("$y$ [m]", fontsize=8)
-    robot_legend(figure, traces, things)
+    if overlaid:
+        grid[0, 0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
+        entries = _case_entries(traces) | _end_entries()
+        legend_above(figure, ([*entries.values(), *things[0]], [*entries, *things[1]]), columns=6)
+    else:
+        figure.supxlabel("$x$ [m]", fontsize=8)
+        figure.supylabel("$y$ [m]", fontsize=8)
+        robot_legend(figure, traces, things)
     return figure
+
+
+def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
+    """One case from above: in one style, robots named, or with a colour for each robot."""
+    place, last, net = trace.true_position, last_known(trace), trace.plan.links
+    ink = "#8a8a8a" if style is None else style["color"]
+    for i, j in edges(net.receiver, net.sender):
+        axes.plot(*last[[i, j], :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
+    small = 3.0 if len(trace.robots) <= MANY else 2.0
+    for i, line in enumerate(robot_lines(trace)):
+        colour = line["color"] if style is None else ink
+        path = {**line, "linewidth": 0.8} if style is None else style
+        axes.plot(place[few, i, 0], place[few, i, 1], **path)
+        axes.plot(*last[i, :2], "o", ms=small + 0.5, mec="none", color=colour)
+        axes.plot(*place[0, i, :2], "o", ms=small, mec=colour, mfc="none", mew=0.7)
+        if style is not None and "alpha" in style and len(trace.robots) <= MANY and np.isfinite(last[i, :2]).all():
+            halo = [withStroke(linewidth=1.5, foreground=PAPER)]
+            axes.annotate(
+                trace.robots[i],
+                (float(last[i, 0]), float(last[i, 1])),
+                (0, 4),
+                textcoords="offset points",
+                fontsize=6,
+                ha="center",
+                path_effects=halo,
+            )
+
+
+def _case_entries(traces: Sequence[Trace]) -> dict[str, Artist]:
+    return {plain(trace.case): Line2D([], [], **case_line(k)) for k, trace in enumerate(traces)}
+
+
+def _end_entries() -> dict[str, Artist]:
+    black = to_rgb(INK)
+    start = Line2D([], [], color=black, marker="o", linestyle="", ms=3.0, mfc="none", mew=0.6)
+    return {"start": start, "end": Line2D([], [], color=black, marker="o", linestyle="", ms=3.5)}
 
 
 @styled
@@ -151,15 +202,9 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """
     shown = [trace for trace in traces if has_positions(trace)]
     things = scenery.legend([trace.experiment for trace in traces], space=True)
-    black = to_rgb(INK)
-    entries: dict[str, Artist] = {
-        plain(trace.case): Line2D([], [], color=CASES[k % len(CASES)]) for k, trace in enumerate(traces)
-    }
-    entries = entries if len(traces) > 1 else {}
-    entries["start"] = Line2D([], [], color=black, marker="o", linestyle="", ms=3.0, mfc="none", mew=0.6)
-    entries["end"] = Line2D([], [], color=black, marker="o", linestyle="", ms=3.5)
+    entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries()
     labels = [*entries, *things[1]]
-    fits = max(1, int(72.0 * width / (28.0 + 3.3 * max(map(len, labels)))))
+    fits = fitting(width, labels, 6)
     above = 0.12 + 0.15 * math.ceil(len(labels) / fits)
     height = min(0.7 * width, 3.9)
     whole = height + above
@@ -172,12 +217,27 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         return figure
     for k, trace in enumerate(traces):
         if has_positions(trace):
-            _draw_in_space(axes, trace, CASES[k % len(CASES)] if len(traces) > 1 else None)
+            _draw_in_space(axes, trace, case_line(k) if len(traces) > 1 else None)
     _frame(axes, shown)
-    figure.legend(
-        [*entries.values(), *things[0]], labels, loc="upper center", ncols=min(fits, 5), bbox_to_anchor=(0.5, 1.0)
-    )
+    figure.legend([*entries.values(), *things[0]], labels, loc="upper center", ncols=fits, bbox_to_anchor=(0.5, 1.0))
+    _crop(figure, axes, above)
     return figure
+
+
+def _crop(figure: Figure, axes: Axes3D, above: float) -> None:
+    """Take off what is empty above and below a picture of space, under `above` [in] for a legend."""
+    height = figure.get_figheight()
+    figure.draw_without_rendering()
+    parts = [*axes.lines, *axes.texts, axes.xaxis, axes.yaxis, axes.zaxis]
+    boxes = [box for part in parts if (box := part.get_tightbbox()) is not None]
+    box = Bbox.union([each for each in boxes if np.isfinite(each.extents).all() and each.height > 0.0])
+    bottom, top = box.y0 / figure.dpi, box.y1 / figure.dpi
+    place = axes.get_position(original=True)
+    whole = top - bottom + above + 0.2
+    figure.set_figheight(whole)
+    axes.set_position(
+        (place.x0, (place.y0 * height - bottom + 0.04) / whole, place.width, place.height * height / whole)
+    )
 
 
 TRAIL_S: Final = 12.0  # of motion that a frame of a film shows behind each robot
@@ -229,8 +289,9 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
     return figure, show
 
 
-def _draw_in_space(axes: Axes3D, trace: Trace, colour: str | None) -> None:
-    """One case, in one colour if it has one; the robots of the first case are named."""
+def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
+    """One case, in the style that it has among several, or its robots in theirs; those of the first case are named."""
+    colour = None if case is None else case["color"]
     place = trace.true_position
     known = np.asarray(np.isfinite(place).all(axis=2))
     starts, ends = place[known.argmax(axis=0), np.arange(place.shape[1])], last_known(trace)
@@ -245,8 +306,7 @@ def _draw_in_space(axes: Axes3D, trace: Trace, colour: str | None) -> None:
     named = not axes.texts
     for i, line in enumerate(robot_lines(trace)):
         ink = colour or line["color"]
-        style: Line = {"color": ink, "linewidth": 1.8 if named else 0.7} if colour else line  # seen below the others
-        axes.plot(*place[few, i].T, **{**style, "zorder": 3})
+        axes.plot(*place[few, i].T, **{**(line if case is None else case), "zorder": 3})
         axes.plot(*starts[i, :, None], "o", ms=size, mfc="none", mec=ink, mew=0.6, zorder=5)
         axes.plot(
             *ends[i, :, None], "o", ms=size + 0.5 + 1.5 * (named and bool(colour)), color=ink, mec="none", zorder=6

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from agents.arrays import Array
@@ -18,11 +19,13 @@ from experiments.sweep.table import CellRow, short, words_of
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 MOST_CURVES: Final = 9  # a colour and a marker each; more could not be told apart, and are drawn as clouds
 LONG: Final = 14  # letters of a name of which three do not stand beside each other
+NAMED: Final = 12  # points of a curve that all have their value beside them, if it is the first one,
+CLOSE: Final = 0.06  # and are farther apart than this share
 SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 
 
 @styled
-def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True) -> Figure:
+def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, width: float = WIDTH) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
     Full markers: no other cell has fewer messages and no more error; these are joined by a grey line. Hollow: another
@@ -32,10 +35,11 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True) 
         rows: The cells; those whose ratios are unknown are left out.
         index: Of the error: `iae`, `itae` or `rmse`.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
+        width: [in]
     """
     known = [row for row in rows if not row.reference and _at(row, index) is not None]
     best = {id(row) for row in front(known, index)}
-    figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
+    figure = Figure(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
     _draw_front(axes, [row for row in known if id(row) in best], index)
     found = curves(known)
@@ -128,6 +132,22 @@ def _draw_curve(axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[
         axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "label": None})
     axes.plot([], [], **marker)
     along = _along(rows, rows[0].case) if joined else None
-    for row, at in ((rows[0], points[0]), (rows[-1], points[-1])):
-        words = "" if along is None else words_of(row.parameters[along])
-        axes.annotate(words, (at[0], at[1]), (3.0, 4.0), textcoords="offset points", fontsize=6, color=style["color"])
+    if along is not None:
+        _name_points(axes, rows, along, points[:, :2], style["color"])
+
+
+def _name_points(axes: Axes, rows: Sequence[CellRow], along: str, points: Array, colour: str) -> None:
+    """Name and value of a parameter at the first point of a curve, then its values; at all points if they are few."""
+    few = len(axes.texts) == 0 and len(rows) <= NAMED
+    last = np.array([np.inf, np.inf])
+    for k, (row, at) in enumerate(zip(rows, points, strict=True)):
+        ends = k in {0, len(rows) - 1}
+        away = float(np.abs(np.log(at / last)).max()) if np.isfinite(last).all() else np.inf
+        if not (ends or few) or (not ends and away < CLOSE):
+            continue
+        value = words_of(row.parameters[along])
+        words = (f"{short(along)} = {value}" if k == 0 else value).replace("-", "\N{MINUS SIGN}")
+        halo = [withStroke(linewidth=1.2, foreground=PAPER)]
+        style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color": colour, "path_effects": halo}
+        axes.annotate(plain(words), tuple(at), (3.0, 4.0), **style)
+        last = at

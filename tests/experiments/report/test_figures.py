@@ -4,10 +4,12 @@ import dataclasses
 import itertools
 import re
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
 from experiments.report import figures, style
 from tests.experiments.traces import crowd, cut, experiment, park, trace
@@ -43,7 +45,7 @@ def test_motions_are_drawn_in_one_column(draw, run):
     figure = draw(run)
     assert figure.get_figwidth() == 3.5
     assert 1.0 < figure.get_figheight() <= 9.3
-    assert len(figure.axes) >= (len(run) if draw in (figures.events, figures.plan_view) else 1)
+    assert len(figure.axes) >= (len(run) if draw is figures.events else 1)
     assert draw(run, width=7.16).get_figwidth() == 7.16
     assert "<metadata" not in figures.svg(figure)
 
@@ -62,21 +64,54 @@ def test_bars_are_drawn_in_one_column(draw, run):
 
 def test_global_bars_are_ratios_to_the_first_case():
     cases = [measure(park()), measure(park("event", 0.01))]
-    heights = [bar.get_height() for bar in figures.global_bars(cases).axes[0].patches]
-    assert heights[:4] == [1.0] * 4
+    rate, errors = figures.global_bars(cases).axes
+    heights = [bar.get_height() for axes in (rate, errors) for bar in axes.patches]
     expected = [cases[1].mean[index] / cases[0].mean[index] for index in ("f_hz", "iae", "itae", "rmse")]
-    assert heights[4:] == pytest.approx(expected)
+    assert heights == pytest.approx(expected)  # without bars of the first case, which are 1
+    assert rate.get_ylim()[1] < 1.5 * heights[0]  # a small rate is seen in an axis of its own
+
+
+def test_rates_far_apart_are_on_a_logarithmic_axis():
+    measured = [measure(park(duration=5.0)), measure(park("event", 0.2, duration=5.0))]
+    assert figures.robot_bars(measured).axes[0].get_yscale() == "log"
+    assert figures.robot_bars(measured[:1]).axes[0].get_yscale() == "linear"
+
+
+def test_the_plan_shows_what_is_near_the_robots_with_a_few_cases_upon_each_other():
+    traces = [park(f"case {k}", duration=3.0) for k in range(4)]
+    hall = msgspec.structs.replace(traces[0].experiment, arena=Arena(size=(30.0, 30.0, 3.0)))
+    wide = [dataclasses.replace(trace, experiment=hall) for trace in traces]
+    (axes,) = figures.plan_view(wide[:3]).axes
+    for limits, k in ((axes.get_xlim(), 0), (axes.get_ylim(), 1)):
+        place = traces[0].true_position[..., k]
+        assert np.ptp(limits) == pytest.approx(1.12 * np.ptp(place))
+        assert limits[0] < place.min() < place.max() < limits[1]
+    assert [text.get_text() for text in axes.texts] == list(traces[0].robots)
+    paths = [line for line in axes.lines if len(line.get_xdata()) > 2]
+    assert len({(line.get_color(), line.get_linewidth()) for line in paths}) == 3
+    assert len(figures.plan_view(wide).axes) == 4
+
+
+def test_an_error_axis_reaches_the_curves():
+    (axes,) = figures.errors([park(duration=30.0)]).axes
+    (thick,) = [line for line in axes.lines if line.get_linewidth() == 1.3]
+    assert axes.get_ylim()[0] <= max(np.nanmin(thick.get_ydata()), figures.LEAST_ERROR)
+
+
+def test_a_legend_has_the_columns_that_fit():
+    assert style.fitting(3.5, ["periodic", "event", "within 5 cm", "acquired by all"], 4) == 4
+    assert style.fitting(3.5, ["a name of thirty-two characters."] * 4, 4) == 1
 
 
 def test_several_seeds_become_one_bar_with_its_interval():
     cases = [measure(park("a", seed=seed, duration=5.0)) for seed in (1, 2, 3)]
     cases += [measure(park("b", 0.01, seed=seed, duration=5.0)) for seed in (1, 2, 3)]
-    axes = figures.global_bars(cases).axes[0]
+    axes = figures.global_bars(cases).axes[1]
     ratio = [b.mean["iae"] / a.mean["iae"] for a, b in zip(cases[:3], cases[3:], strict=True)]
-    assert axes.patches[5].get_height() == pytest.approx(np.mean(ratio))
+    assert axes.patches[0].get_height() == pytest.approx(np.mean(ratio))
     segments = axes.collections[-1].get_segments()
     half = 4.302653 * np.std(ratio, ddof=1) / np.sqrt(3.0)
-    assert np.ptp(segments[1][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
+    assert np.ptp(segments[0][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
 
 
 def test_errors_of_all_cases_share_a_logarithmic_axis_with_tolerance_and_acquisition():
@@ -161,7 +196,7 @@ def test_every_figure_and_motions_of_the_first_seed():
     traces = [park("a", seed=seed, duration=22.0) for seed in (2, 1)]
     drawn = figures.every([measure(each) for each in traces], traces)
     assert list(drawn) == ["plan_view", "formation", "errors", "robot_bars", "events", "intervals"]
-    line = drawn["plan_view"].axes[0].lines[-1].get_xdata()
+    line = drawn["plan_view"].axes[0].lines[-2].get_xdata()
     assert line[0] == traces[0].true_position[-1, -1, 0]
     small = crowd(3, duration=1.0)
     flat = dataclasses.replace(small, true_position=small.true_position * [1.0, 1.0, 0.0])

@@ -197,7 +197,7 @@ def test_curves_go_along_the_first_parameter(tmp_path):
     assert [row.parameters["trigger.threshold"] for row in drawn["event, gain=2"]] == [0.005, 0.02]
     axes = pareto(found.rows).axes[0]
     assert axes.get_xlabel() == "messages relative to periodic"
-    assert [text.get_text() for text in axes.texts] == ["0.005", "0.02"] * 2
+    assert [text.get_text() for text in axes.texts] == ["threshold = 0.005", "0.02"] * 2
 
 
 def test_a_figure_of_nothing_but_the_reference(done):
