@@ -65,5 +65,7 @@ def test_the_reference_has_every_key_command_topic_and_column(site):
     assert {"run", "check", "explain", *named} <= set(commands.split())
     assert all(topic.name in text(site / "reference" / "recordings.html") for topic in TOPICS)
     assert all(field in text(site / "reference" / "metrics.html") for field in RobotMetrics.__struct_fields__)
+    assert "float | None" in text(site / "reference" / "metrics.html")
+    assert "\\|" not in text(site / "reference" / "metrics.html")
     assert "park/CF01/pose" in text(site / "reference" / "network.html")
     assert "simulate" in text(site / "reference" / "api.html")
