@@ -268,18 +268,18 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
             names = [axes.text(0, 0, 0, name, fontsize=6, ha="center", **halo) for name in trace.robots if few]
             plan = trace.plan
             error = errors_over_time(plan.law, plan.formation, trace.time, trace.true_position)
-            parts.append((trace, links, trails, dots, names, link_colours(error) / 255.0))
+            parts.append((trace, links, trails, dots, names, error))
         if any(len(trace.robots) > MANY for trace in shown):
             robot_legend(figure, shown)
 
     def show(t: float) -> None:
         clock.set_text(f"{t:.1f} s")
-        for trace, links, trails, dots, names, colours in parts:
+        for trace, links, trails, dots, names, error in parts:
             last = max(0, int(np.searchsorted(trace.time, t + 1e-9)) - 1)
             first = int(np.searchsorted(trace.time, t - TRAIL_S))
             place, net = trace.true_position, trace.plan.links
             links.set_segments(np.stack([place[last, net.sender], place[last, net.receiver]], axis=1))
-            links.set_color(colours[last])
+            links.set_color(link_colours(error[last]) / 255.0)
             for row, (trail, dot) in enumerate(zip(trails, dots, strict=True)):
                 trail.set_data_3d(*place[first : last + 1, row].T)
                 dot.set_data_3d(*place[last, row, :, None])
