@@ -76,19 +76,15 @@ def _keys(entries: Sequence[Any], owner: str) -> Iterator[str]:
     yield from ("| key | meaning | value | default | example |", "|---|---|---|---|---|")
     for entry in entries:
         value = entry.type + (f", {entry.limits}" if entry.limits else "")
-        default = _code(entry.default) if entry.default else ("**required**" if entry.required else "–")
-        example = "<br>".join(_code(line) for line in entry.example.splitlines())
+        default = _cell(f"`{entry.default}`") if entry.default else ("**required**" if entry.required else "–")
+        example = "<br>".join(_cell(f"`{line}`") for line in entry.example.splitlines())
         key = entry.key.removeprefix(owner).lstrip(".")
         yield f"| `{key}` | {_cell(entry.text)} | {_cell(value)} | {default} | {example} |"
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n\n", " ").replace("<", "&lt;").replace("\n", " ")
-
-
-def _code(text: str) -> str:
-    """Code in a cell, where nothing has to be escaped."""
-    return f"`{text.replace(chr(10), ' ')}`"
+    parts = text.replace("\n\n", " ").replace("\n", " ").split("`")  # every second one is code, which stays as it is
+    return "`".join(part if k % 2 else part.replace("|", "\\|").replace("<", "&lt;") for k, part in enumerate(parts))
 
 
 def commands() -> Iterator[str]:
@@ -199,7 +195,7 @@ def _structs(module: ModuleType) -> Iterator[str]:
         yield from ("| field | type | meaning |", "|---|---|---|")
         for each in fields:
             text = _comment(each, lines)
-            yield f"| `{ast.unparse(each.target)}` | {_code(ast.unparse(each.annotation))} | {_cell(text)} |"
+            yield f"| `{ast.unparse(each.target)}` | {_cell(f'`{ast.unparse(each.annotation)}`')} | {_cell(text)} |"
 
 
 def _comment(node: ast.stmt, lines: Sequence[str]) -> str:
