@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -29,6 +30,7 @@ from experiments.report.tables import (
     gaps_table,
     links_table,
     network_tables,
+    over_seeds,
     proof_tables,
     robot_tables,
     shadow_tables,
@@ -172,9 +174,23 @@ def labelled(runs: Sequence[tuple[str, Sequence[CaseMetrics]]]) -> list[CaseMetr
     ]
 
 
-def result_tables(cases: Sequence[CaseMetrics]) -> list[Table]:
-    """The tables of the section "Results", and those of each robot."""
-    return [summary_table(cases), *whole_tables(cases), *robot_tables(cases)]
+def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> list[Table]:
+    """The tables of the section "Results", and those of each robot, each with the number of seeds; some indices alone.
+
+    Args:
+        cases: The first one is the reference.
+        chosen: Indices of the first table, which is then the only one.
+    """
+    summary, seeds = summary_table(cases, chosen), max(map(len, by_case(cases).values()))
+    if chosen:
+        return [summary]
+    whole, robots = whole_tables(cases), robot_tables(cases)
+    if seeds > 1:
+        whole = tuple(
+            table if table.head[0].startswith("Sum ") else replace(table, note=over_seeds(seeds)) for table in whole
+        )
+        robots = tuple(replace(table, note=f"Means over {seeds} seeds. {table.note}".strip()) for table in robots)
+    return [summary, *whole, *robots]
 
 
 def compare(

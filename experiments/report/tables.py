@@ -29,13 +29,13 @@ ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "says"
 MOST_COLLISIONS: Final = 100
 
 SUMMARY: Final = (
-    ("f_hz", "Transmissions per second f [Hz]"),
+    ("f_hz", "Transmission rate f [Hz]"),
     ("messages", "Transmissions"),
     ("bytes", "Payload [bytes]"),
     ("iae", "IAE [m s]"),
     ("itae", "ITAE [m s²]"),
     ("rmse", "RMSE [m]"),
-    ("acquired_s", "Acquired, mean over followers [s]"),
+    ("acquired_s", "Acquired, mean [s]"),
 )
 TROUBLES: Final = (
     ("lost", "Lost samples"),
@@ -98,8 +98,8 @@ def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
     return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
 
 
-def summary_table(cases: Sequence[CaseMetrics]) -> Table:
-    """The indices of each case, averaged over the followers, and their ratios to the first case."""
+def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> Table:
+    """The indices of each case, averaged over the followers, and their ratios to the first case; some, if `chosen`."""
     grouped = by_case(cases)
     first = next(iter(grouped.values()))
 
@@ -109,11 +109,17 @@ def summary_table(cases: Sequence[CaseMetrics]) -> Table:
             return text
         return text, f"× {share.mean:.3f}" + ("" if share.ci95 is None else f" ± {share.ci95:.3f}")
 
-    rows = [Row((label, *(cell(runs, index) for runs in grouped.values()))) for index, label in SUMMARY]
+    shown = [(index, label) for index, label in SUMMARY if not chosen or index in chosen]
+    rows = [Row((label, *(cell(runs, index) for runs in grouped.values()))) for index, label in shown]
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
-    note += f" Means over {seeds} seeds with their 95 % confidence intervals." if seeds > 1 else ""
-    return Table(("Mean per robot", *grouped), tuple(rows), note=note)
+    note += f" {over_seeds(seeds)}" if seeds > 1 else ""
+    return Table(("Mean per robot", *grouped), tuple(rows), note=note.strip())
+
+
+def over_seeds(seeds: int) -> str:
+    """Meaning of values and intervals over several seeds."""
+    return f"Means over {seeds} seeds ± half-width of the 95 % confidence interval (Student's t)."
 
 
 def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:

@@ -10,6 +10,7 @@ from typing import Final
 from experiments.report import style
 from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.page import Row as Line
+from experiments.report.tables import over_seeds
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import front, pareto
 from experiments.sweep.sweep import SweepResult
@@ -72,7 +73,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
 def _swept(found: SweepResult) -> list[Section]:
     folded = "Show the table" if len(found.rows) > MOST_LINES else ""
     return [
-        Section("Messages against error", pictures=_pictures(found.folder, found.rows, joined=True)),
+        Section("Messages against error", pictures=pictures(found.folder, found.rows, joined=True)),
         Section("All cells", tables=(table(found.rows),), folded=folded),
     ]
 
@@ -80,10 +81,10 @@ def _swept(found: SweepResult) -> list[Section]:
 def _searched(tuned: TuningResult) -> list[Section]:
     reference = [row for row in tuned.rows if row.reference]
     seeds, searched = seeds_in_words(tuned.seeds), seeds_in_words(tuned.searched)
-    pictures = _pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
+    drawn = pictures(tuned.folder, [*reference, *tuned.tried], joined=False)
     return [
         Section("Result", (f"On seeds {seeds}, which no choice has seen.",), (table(tuned.rows),)),
-        Section("All points of the search", (f"On seeds {searched}.",), pictures=pictures),
+        Section("All points of the search", (f"On seeds {searched}.",), pictures=drawn),
         Section("Table of the search", tables=(table(tuned.tried),), folded="Show the table"),
     ]
 
@@ -113,9 +114,19 @@ def table(rows: Sequence[CellRow]) -> Table:
     return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
 
 
-def _pictures(folder: Path, rows: Sequence[CellRow], *, joined: bool) -> tuple[PageFigure, ...]:
-    """Messages against IAE and against ITAE; also as files."""
-    drawn = {index: pareto(rows, index, joined=joined) for index in ("iae", "itae")}
+def paper_table(title: str, rows: Sequence[CellRow]) -> Table:
+    """The cells for a paper: case and parameters in one column."""
+    reference = next((row.case for row in rows if row.reference), "the reference")
+    seeds = max((row.seeds for row in rows), default=0)
+    note = f"Messages, IAE and ITAE are relative to {reference} with the same seed. {over_seeds(seeds)}"
+    return Table(("Cell", *NUMBERS), tuple(Line((row.label, *numbers(row))) for row in rows), title=title, note=note)
+
+
+def pictures(
+    folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH
+) -> tuple[PageFigure, ...]:
+    """Messages against IAE and against ITAE, so wide [in]; also as files."""
+    drawn = {index: pareto(rows, index, joined=joined, width=width) for index in ("iae", "itae")}
     for index, each in drawn.items():
         style.save(each, folder / "figures", f"pareto_{index}")
     return numbered((each, caption) for each, caption in zip(drawn.values(), CAPTIONS, strict=True))

@@ -98,6 +98,19 @@ def write_json(path: Path, table: Mapping[str, Any]) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(table), indent=2) + b"\n")
 
 
+def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
+    """A table that `write_json` has written, and its rows.
+
+    Raises:
+        ValueError: If there is none, or that of another version.
+    """
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+        return found, msgspec.convert(found.get("cells"), list[CellRow])
+    except (OSError, RecursionError) as error:
+        raise ValueError(str(error)) from None
+
+
 NUMBERS: Final = ("f [Hz]", "messages ratio", "IAE ratio", "ITAE ratio", "acquired", "gap [ms]", "dropped")  # heads
 
 
@@ -139,7 +152,7 @@ def with_interval(value: Spread) -> str:
     """A ratio and its interval, to four places: a per mille of error is what triggers differ by."""
     if value.mean is None:
         return NONE
-    return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ±{value.ci95:.3f}")
+    return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ± {value.ci95:.3f}")
 
 
 def words_of(value: object) -> str:

@@ -26,28 +26,36 @@ def report(
         list[str],
         typer.Argument(
             metavar="RUN...",
-            help="Folders of runs.",
+            help="Folders of runs, or that of a sweep.",
             autocompletion=completion.folders,
         ),
     ],
-    out: Annotated[str | None, typer.Option(metavar="FILE", help="Where the report goes. [the run's folder]")] = None,
+    out: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Where the report, or the tables, go. [the run's folder]")
+    ] = None,
     *,
     label: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Of each run of a comparison, in order. [A, B, ...]")
     ] = None,
     width: Annotated[
-        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of the files in figures/: 3.5 or 7.16.")
+        float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
     as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs) instead.")] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
+    metrics: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="With --latex or --markdown: these alone, as f,iae,itae.")
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Write the report of one run, or compare several."""
+    """Write the report of one run, or compare several; of a sweep, its figures or its table."""
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
     from experiments.run import reopen_seeds
 
+    chosen = _chosen(metrics)
+    if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
+        return _report_sweep(Path(runs[0]), out, width, as_latex=as_latex, as_markdown=as_markdown, as_json=as_json)
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
     _refuse_labels(labels, runs)
     read = [reopen_seeds(folder) for folder in runs]
@@ -60,7 +68,8 @@ def report(
     ]
     if as_latex or as_markdown:
         cases = pages.labelled(named) if len(read) > 1 else named[0][1]
-        print((typeset.latex if as_latex else typeset.markdown)(pages.result_tables(cases)))
+        tables = pages.result_tables(cases, chosen)
+        _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
         return 0
     target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
     try:
@@ -78,6 +87,64 @@ def report(
         print_json({"report": page, "runs": [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read]})
     else:
         print(page)
+    return 0
+
+
+def _chosen(metrics: str | None) -> list[str]:
+    """Indices by the names that people give them; `f` is the rate of transmissions."""
+    from experiments.file.problems import refusal
+    from experiments.report.tables import SUMMARY
+
+    known = [name for name, _ in SUMMARY]
+    given = ["f_hz" if name.strip() == "f" else name.strip() for name in (metrics or "").split(",") if name.strip()]
+    if wrong := [name for name in given if name not in known]:
+        raise refusal("--metrics", f"no {wrong[0]!r} among the metrics", f"known: f, {', '.join(known[1:])}")
+    return given
+
+
+def _put(text: str, out: str | None) -> None:
+    """Print a text, or write it into a file and print where that is."""
+    from experiments.recording.reader import RecordingError
+
+    if out is None:
+        print(text)
+        return
+    try:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        Path(out).write_text(f"{text}\n", encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{out}: cannot be written: {error.strerror}; choose another file with --out") from None
+    print(out)
+
+
+SWEEP: Final = "sweep.json"
+
+
+def _report_sweep(
+    folder: Path, out: str | None, width: float, *, as_latex: bool, as_markdown: bool, as_json: bool
+) -> int:
+    """The table of a sweep for a paper, or its figures anew, so wide [in]."""
+    from experiments.recording.reader import RecordingError
+    from experiments.report import typeset
+    from experiments.sweep import page as pages
+    from experiments.sweep import table
+
+    try:
+        document, rows = table.read_json(folder / SWEEP)
+    except ValueError as error:
+        raise RecordingError(f"{folder / SWEEP}: cannot be read: {error}; make the sweep again") from None
+    if as_latex or as_markdown:
+        tables = [pages.paper_table(str(document.get("experiment", folder.name)), rows)]
+        _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
+        return 0
+    if "tuning" in document:
+        raise RecordingError(f"{folder}: a search: its figures show all that was tried; --latex prints its result")
+    target = Path(out or folder)
+    pages.pictures(target, rows, width=width)
+    if as_json:
+        print_json({"figures": target / "figures", "cells": len(rows)})
+    else:
+        print(target / "figures")
     return 0
 
 
@@ -341,7 +408,10 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     if as_json:
         print_json(found)
         return
-    if not found:
+    places = [Path(each) for each in below or ["runs"]]
+    sweeps = sorted({file.parent for place in places for file in (*place.glob(SWEEP), *place.glob(f"*/{SWEEP}"))})
+    sweeps = [folder for folder in sweeps if all(word.lower() in folder.name.lower() for word in words)]
+    if not found and not sweeps:
         print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
         return
     head = ("when, UTC", "run", "case", "1/s", "IAE", "RMSE, m", "acquired, s", "MB", "tags")
@@ -353,8 +423,11 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
             values = ["-" if value is None else f"{value:.3g}" for value in figures.values()] or ["-"] * 4
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
-    print("\n".join(columns([head, *rows])))
-    print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB")
+    print("\n".join(columns([head, *rows])) if rows else "no run")
+    for folder in sweeps:
+        day = time.strftime("%Y-%m-%d %H:%M", time.gmtime((folder / SWEEP).stat().st_mtime))
+        print(f"{day}  {folder}  a sweep: `./zenpark report {folder}`")
+    print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB; sweeps: {len(sweeps)}")
 
 
 @app.command(epilog=example("clean --older 30", "clean --older 30 --recordings --yes"))

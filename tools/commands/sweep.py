@@ -91,7 +91,7 @@ def sweep(
         words += [part for name in case or [] for part in ("--case", name)]
         words += [part for setting in changes for part in ("--set", setting)]
         page = pages.write(found, shlex.join([*words, *(["--optimize", optimize] if optimize else [])]))
-        lines.append(f"page: {page}")
+        lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
     if as_json:
         print_json(table)
     else:

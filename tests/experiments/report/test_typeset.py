@@ -10,7 +10,10 @@ TABLE = Table(
 
 def test_latex_is_a_booktabs_table_with_signs_escaped():
     assert latex([TABLE, Table(("empty",), ())]).splitlines() == [
-        "% a|b",
+        r"\begin{table}",
+        r"\centering\footnotesize\setlength{\tabcolsep}{3pt}",
+        r"\caption{Robots, a|b.}",
+        r"\label{tab:robots-a-b}",
         r"\begin{tabular}{lr}",
         r"\toprule",
         r"Robot & IAE [m s] \\",
@@ -20,7 +23,19 @@ def test_latex_is_a_booktabs_table_with_signs_escaped():
         r"mean & $-$3 \\",
         r"\bottomrule",
         r"\end{tabular}",
+        r"\end{table}",
     ]
+
+
+def test_a_wide_table_fits_a_column():
+    ratios = Row(("IAE [m s]", "4.100 ± 0.005", ("4.42 ± 0.01", "× 1.078 ± 0.004"), ("4.50 ± 0.01", "× 1.100 ± 0.004")))
+    below = latex([Table(("Mean per robot", "a", "b", "c"), (ratios,))])
+    assert r" &  & $\times$ 1.078 $\pm$ 0.004 & $\times$ 1.100 $\pm$ 0.004 \\" in below.splitlines()
+    many = Table(("Robot", *(f"column {k}" for k in range(9))), (Row(("tb2", *("1.00",) * 9)),))
+    split = latex([many])
+    assert (split.count(r"\begin{tabular}"), split.count(r"\begin{table}"), split.count("tb2")) == (2, 1, 2)
+    wide = latex([many], width=7.16)
+    assert (wide.count(r"\begin{tabular}"), wide.count(r"\begin{table*}")) == (1, 1)
 
 
 def test_markdown_is_a_pipe_table():

@@ -77,3 +77,26 @@ def test_the_console_gives_the_digits_that_an_interval_bears(three: tuple[Path, 
     assert half is not None
     assert len(half[1]) == len(half[2])
     assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
+
+
+def test_tables_for_papers_go_into_a_file_and_have_the_chosen_metrics(three: tuple[Path, str], tmp_path: Path) -> None:
+    file = tmp_path / "paper" / "t.tex"
+    assert zenpark("report", str(three[0]), "--latex", "--out", str(file), "--metrics", "f,iae").strip() == str(file)
+    rows = [line for line in file.read_text().splitlines() if line.startswith(("Transmission", "IAE", "ITAE", "RMSE"))]
+    assert [row.split(" [")[0] for row in rows] == ["Transmission rate f", "IAE"]
+    done = CliRunner().invoke(app, ["report", str(three[0]), "--latex", "--metrics", "speed"])
+    assert "no 'speed' among the metrics" in str(done.exception)
+
+
+def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp_path: Path) -> None:
+    folder = tmp_path / "swept"
+    axis = ["trigger.threshold=0.01,0.05", "seeds=2", "--out", str(folder)]
+    said = zenpark("sweep", str(three[0].parent / "short.toml"), *axis)
+    assert f"figures: {folder / 'figures'}" in said
+    narrow = (folder / "figures" / "pareto_iae.svg").read_text()
+    assert zenpark("report", str(folder), "--width", "7.16").strip() == str(folder / "figures")
+    assert (folder / "figures" / "pareto_iae.svg").read_text() != narrow
+    text = zenpark("report", str(folder), "--latex")
+    assert r"\caption{Cells, Two, for three seconds." in text
+    assert "threshold=0.05" in text
+    assert f"a sweep: `./zenpark report {folder}`" in zenpark("runs", "--past", "--in", str(tmp_path))
