@@ -37,6 +37,7 @@ class Prediction:
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
     incidents: tuple[Incident, ...] = ()  # hazards of robots on the way
+    transmissions: int = 1  # of all robots in the run
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
 
 
@@ -101,7 +102,8 @@ def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
     for k in range(count):
         first, end = k * len(names), (k + 1) * len(names)
         mine = tuple(each._replace(row=each.row - first) for each in begun if first <= each.row < end)
-        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine))
+        sent = len(sent_in_run(log.sent, bare.duration_s))  # of all flights: none is none in each
+        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine, sent))
     return flights
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from agents.arrays import Array, Mask, norm
 from agents.decision.position_control import REACHED
 from agents.formation.graph import BY_DISTANCE
+from agents.plugins import registry
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Claim
@@ -102,6 +103,15 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
         remedy = "begin later, start nearer to the shape, or raise the gain"
         yield Claim("warning", "acquired-late", message, remedy, path)
+    elif not prediction.transmissions and experiment.architecture == "distributed":
+        moved = float(norm(prediction.position - prediction.position[0]).max())
+        kind = registry.split(experiment.trigger)[0]
+        message = (
+            f"no robot transmits after its first pose: the trigger '{kind}' fires at nothing, though robots move by up "
+            f"to {moved:.2g} m, so neighbours are believed at their starts; {left} {allowed}"
+        )
+        remedy = "look at the trigger's parameters: thresholds are in metres; maximum_silence_s bounds the silence"
+        yield Claim("error", "silent", message, remedy, ("trigger",))
     elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
         yield stopped
     elif analysis.shapes[0].worst > OFF:

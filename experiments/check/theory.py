@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from agents.arrays import Index, Mask
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, components, reachable
+from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Claim, Severity, join_names
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
@@ -251,15 +253,39 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
     return f"it stays rigid without any one {what} but {join_names(needed)}"
 
 
+def _uses_gain(analysis: Analysis) -> bool:
+    """Whether the law, or an anchor, pulls by the gains of the file."""
+    law, links = analysis.assignment.law, analysis.asked
+    place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
+    single = law.offset(place, place[links.sender], links)
+    double = law.offset(place, place[links.sender], replace(links, gain=2.0 * links.gain))
+    return analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True)
+
+
 def stability(analysis: Analysis) -> Iterator[Claim]:
     """Check that the sampled loop is stable near the shape."""
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF:
         return
+    law, choice = analysis.assignment.law, registry.split(formation.law)[0]
+    if not math.isfinite(loop.gain):
+        place = shape.position
+        offset = law.offset(place, place[analysis.asked.sender], analysis.asked)
+        bad = join_names([analysis.names[row] for row in np.flatnonzero(~np.isfinite(offset).all(axis=1))])
+        what = f"for {bad} no number" if bad else "numbers that jump between neighbouring places"
+        message = f"the law '{choice}' gives {what} where the formation is met"
+        remedy = "look for a length of 0 and for fields of `links` that are NaN (docs/plugins.md)"
+        yield Claim("error", "not-finite", message, remedy, ("formation", "law"))
+        return
     name = "gain" if _measured(analysis).any() or not analysis.standing.any() else "stiffness"
     path, gain = ("formation", name), float(getattr(formation, name))
     took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
     calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"
+    if not _uses_gain(analysis):
+        own = ", ".join(registry.struct(registry.LAWS, choice).__struct_fields__)
+        took = f"one decision takes {loop.gain:.3g} of the stiffest error"
+        calm = f"let it ask for less by its own parameters ({own})" if own else "give it a parameter to ask for less by"
+        calm, path = f"the law '{choice}' does not use `links.gain`: {calm}", ("formation", "law")
     if loop.gain >= HUNTS:
         yield Claim("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:

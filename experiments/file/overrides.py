@@ -185,7 +185,7 @@ def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -
     """Distance [m], offset [m] or bearing of a link between places.
 
     Raises:
-        _NoPlace: If one of the two has no place, or both have the same.
+        _NoPlace: If one of the two is no robot or has no place, or both have the same.
     """
     if not _ends(text):
         return 1.0 if word == "distance" else [1.0, 0.0]
@@ -194,6 +194,8 @@ def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -
     for name in (first, second):
         place = shape.get(name)
         if not (isinstance(place, list) and 2 <= len(place) <= 3 and all(type(x) in (int, float) for x in place)):
+            if isinstance(robots, Mapping) and name not in robots:
+                raise _NoPlace(f"no robot is called '{name}'", registry.did_you_mean(name, robots))
             hint = f"add {name} = [0.5, 0.0] to [formation.shape], or give the link a distance"
             raise _NoPlace(f"{name} has no place in the shape", hint)
         robot = robots.get(name) if isinstance(robots, Mapping) else None

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import msgspec
@@ -14,8 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.arrays import norm
 from agents.body.interface import Disturbance, Jitter
 from agents.decision.position_control import REACHED
+from agents.plugins import registry
 from experiments.check.check import Figures, check, figures
 from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions, undisturbed
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
@@ -239,6 +242,60 @@ def test_gains(gain, code):
     if code:
         assert found[code][0] == ("error" if code == "hunts" else "warning")
         assert "below 5.9" in found[code][2]
+
+
+class Steep(msgspec.Struct, frozen=True):
+    """A law with a gain of its own."""
+
+    largest: float = 30.0
+
+    def offset(self, position, sender_position, links):
+        way = position[links.receiver] - sender_position
+        length = np.maximum(norm(way), 1e-6)
+        pull = self.largest * (links.distance - length) / length
+        return links.sum_by_receiver(pull[:, None] * way, len(position))
+
+    def error(self, position, sender_position, links):
+        return np.abs(links.distance - norm(position[links.receiver] - sender_position))
+
+
+class Undefined(Steep, frozen=True):
+    """A law that divides by the error, which is 0 where the formation is met."""
+
+    def offset(self, position, sender_position, links):
+        off = links.distance - norm(position[links.receiver] - sender_position)
+        return (
+            super().offset(position, sender_position, links) * links.sum_by_receiver(0.0 / off, len(position))[:, None]
+        )
+
+
+@pytest.mark.parametrize(
+    ("law", "code", "message", "remedy"),
+    [
+        (
+            "Steep",
+            "hunts",
+            "of the stiffest error, and from 2",
+            "does not use `links.gain`: let it ask for less",
+        ),
+        ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
+    ],
+)
+def test_the_remedy_of_a_law_of_ones_own_is_in_the_law(monkeypatch, law, code, message, remedy):
+    installed = registry._registered
+    mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)]}}
+    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
+    found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
+    assert message in found[1]
+    assert remedy in found[2]
+    assert found[3] == "--set formation.law=mine"
+
+
+def test_a_trigger_that_never_fires_is_named():
+    found = bad(TRIANGLE, "trigger={ kind = 'send-on-delta', threshold = 15 }", "duration_s=10")
+    assert "lags" not in found
+    assert "no robot transmits after its first pose: the trigger 'send-on-delta' fires at nothing" in found["silent"][1]
+    assert "metres" in found["silent"][2]
 
 
 @pytest.mark.parametrize(
