@@ -62,6 +62,7 @@ SUBJECTS: Final = (
     safety.architecture,
     safety.safety,
     safety.libraries,
+    safety.devices,
     chance,
 )
 

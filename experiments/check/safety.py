@@ -70,6 +70,20 @@ def libraries(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("warning", "library", message, "`./zenpark hardware` adds it", ("robots", name, "body"))
 
 
+def devices(analysis: Analysis) -> Iterator[Claim]:
+    """Report robots with the same address of a device, on one machine."""
+    experiment = analysis.experiment
+    host_of = {name: place for place, host in experiment.hosts.items() for name in host.robots}
+    drivers: dict[tuple[str, str], str] = {}
+    for name, robot in experiment.robots.items():
+        if "://" in robot.body:
+            device = host_of.get(name, ""), robot.body.rstrip("/").lower()
+            other = drivers.setdefault(device, name)
+            if other != name:
+                message = f"{other} and {name} have the same body, {robot.body}: one device gets the setpoints of both"
+                yield Claim("warning", "same-device", message, "give each its own address", ("robots", name, "body"))
+
+
 def architecture(analysis: Analysis) -> Iterator[Claim]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.experiment, ("architecture",)

@@ -17,8 +17,9 @@ import numpy as np
 
 from agents.arrays import norm
 from agents.formation.graph import Links
+from agents.network.messages import Event
 from agents.plugins.laws import Distance
-from agents.safety.hazards import failed
+from agents.safety.hazards import UNRESOLVED, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.formation import compile_anchors
 from experiments.metrics import centralised
@@ -69,11 +70,18 @@ def _mean(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
 def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
     """The first thing that kept each robot from its part of the experiment."""
     found: dict[str, str] = {}
+    blind: dict[str, Event] = {}  # begin of the last loss of its own position
     for event in trace.events:
         lost = event.kind == "lost" or (event.kind == "hazard" and failed(event.text))
+        if event.kind == "hazard" and event.text.startswith("hold: ") and is_blind(event.text):
+            blind[event.source] = event
         if lost and event.source in trace.robots and event.source not in found:
             what = f"was lost: {event.text}" if event.kind == "lost" else event.text.removeprefix("warn: ")
-            found[event.source] = f"{event.source} at {max(event.stamp, 0.0):.1f} s: {what}"
+            begin = event
+            if event.text.startswith(UNRESOLVED) and event.source in blind:
+                begin = blind[event.source]
+                what = f"{begin.text.removeprefix('hold: ')}, until the end"
+            found[event.source] = f"{event.source} at {max(begin.stamp, 0.0):.1f} s: {what}"
     for each in robots:
         if each.known < PRESENT:
             found.setdefault(each.robot, f"{each.robot}: its position was known for {each.known:.0%} of the time only")

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 
-from experiments.check.safety import libraries
+from experiments.check.safety import devices, libraries
+from experiments.definition.experiment import Robot
 from experiments.file.document import loads
 from tools.main import main
 
@@ -173,3 +175,18 @@ def test_a_missing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None
     (claim,) = libraries(SimpleNamespace(experiment=experiment))
     assert claim.message == "the body of CF01 needs cflib, which is not installed here"
     assert claim.remedy == "`./zenpark hardware` adds it"
+
+
+@pytest.mark.parametrize(("second", "same"), [("ROVER://192.0.2.7:5005/", True), ("rover://192.0.2.7:5006", False)])
+def test_two_robots_with_the_address_of_one_device_are_a_finding(second: str, same: bool) -> None:
+    robots = {name: Robot(kind="khepera4", start=[0.0, 0.0], body="world") for name in ("RV01", "RV02", "RV03", "RV04")}
+    for name, body in (("RV01", "rover://192.0.2.7:5005"), ("RV03", second)):
+        robots[name] = msgspec.structs.replace(robots[name], body=body)
+
+    def found(**more: object) -> list[tuple[str, str, tuple[object, ...]]]:
+        experiment = SimpleNamespace(robots=robots, **{"hosts": {}, **more})
+        return [(each.code, each.message, each.path) for each in devices(SimpleNamespace(experiment=experiment))]
+
+    message = f"RV01 and RV03 have the same body, {second}: one device gets the setpoints of both"
+    assert found() == ([("same-device", message, ("robots", "RV03", "body"))] if same else [])
+    assert found(hosts={"lab": SimpleNamespace(robots=["RV03"])}) == []

@@ -433,7 +433,7 @@ BLIND = "hold: its own position is lost: the last is 0.51 s old"
         (
             [(19.0, BLIND), (20.0, "unresolved at the end: its own position is lost, for 1.00 s")],
             0.95,
-            "F at 20.0 s: unresolved at the end: its own position is lost, for 1.00 s",
+            "F at 19.0 s: its own position is lost: the last is 0.51 s old, until the end",
         ),
     ],
 )
