@@ -187,6 +187,9 @@ def unfold_distances(links: Links, height: Array) -> Array:
     return np.column_stack([np.zeros((rows, 2 - plane.shape[1])), plane, height])
 
 
+@np.errstate(
+    over="ignore", invalid="ignore"
+)  # too far a step, or too high a height, is no better, whatever it comes to
 def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask) -> Shape:
     """Least squares of the residuals from a guess (N, 3) [m], by Levenberg's and Marquardt's method.
 
@@ -203,9 +206,8 @@ def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask
         step[own] = np.linalg.solve(normal[np.ix_(own, own)] + damping * np.eye(int(own.sum())), -slope[own])
         tried = position.copy()
         tried[rows, :axes] += step.reshape(-1, axes)
-        with np.errstate(over="ignore", invalid="ignore"):  # too far a step is no better, whatever it comes to
-            then = residuals(links, anchors, tried)
-            before, after = float(now.value @ now.value), float(then.value @ then.value)
+        then = residuals(links, anchors, tried)
+        before, after = float(now.value @ now.value), float(then.value @ then.value)
         if after < before:
             position, damping, now = tried, max(damping / 10.0, 1e-10), then
         else:
