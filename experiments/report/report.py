@@ -68,7 +68,7 @@ NETWORK: Final = (
 )
 SAME_STARTS: Final = (
     "All seeds begin at the same poses: intervals (±) are of noise and network alone; "
-    "`[start] scatter` varies the starts."
+    "start.scatter in the file varies the starts."
 )
 DIFFERENCES: Final = (
     "Experiment file, options, seeds, code and versions. What follows is to be read with these in mind."

@@ -15,7 +15,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from agents.network.messages import Event
 from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics, ShadowMetrics
-from experiments.metrics.statistics import by_case, ratios, spread
+from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.page import NONE, Cell, Row, Table, interval, number
 
@@ -107,7 +107,7 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
         text, share = _over_seeds([run.mean[index] for run in runs]), spread(ratios(runs, first, index))
         if runs is first or share.mean is None:
             return text
-        return text, f"× {share.mean:.3f}" + ("" if share.ci95 is None else f" ± {share.ci95:.3f}")
+        return text, f"× {ratio_words(share)}"
 
     shown = [(index, label) for index, label in SUMMARY if not chosen or index in chosen]
     rows = [Row((label, *(cell(runs, index) for runs in grouped.values()))) for index, label in shown]
@@ -115,6 +115,11 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
     note += f" {over_seeds(seeds)}" if seeds > 1 else ""
     return Table(("Mean per robot", *grouped), tuple(rows), note=note.strip())
+
+
+def ratio_words(share: Spread) -> str:
+    """A ratio to a per mille, by which triggers differ; over seeds with the digits that its interval bears."""
+    return interval(share) if share.ci95 else number(share.mean) if share.mean is None else f"{share.mean:.3f}"
 
 
 def over_seeds(seeds: int) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
 from experiments.report.page import Finding, Mark, interval, number
-from experiments.report.tables import dropped_share, mean_delay, shadowed
+from experiments.report.tables import dropped_share, mean_delay, ratio_words, shadowed
 
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
 UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
@@ -230,10 +230,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = f"{name} and {reference} are of different length: their errors are not compared."
             found.append(Finding("plain", text))
         elif known:
-            parts = [
-                f"{label} {each.mean:.3f}" + (f" ± {each.ci95:.3f}" if each.ci95 is not None else "")
-                for label, each in known
-            ]
+            parts = [f"{label} {ratio_words(each)}" for label, each in known]
             worse = max(each.mean for _, each in known if each.mean is not None)
             text = f"Its errors relative to {reference}: {_list(parts)}."
             found.append(Finding("good" if worse <= 1.0 else "plain" if worse < 1.25 else "fair", text))

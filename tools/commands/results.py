@@ -48,12 +48,15 @@ def report(
     as_json: AsJson = False,
 ) -> int:
     """Write the report of one run, or compare several; of a sweep, its figures or its table."""
+    from experiments.file.problems import refusal
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
     from experiments.run import reopen_seeds
 
     chosen = _chosen(metrics)
+    if chosen and not (as_latex or as_markdown):
+        raise refusal("--metrics", "chooses rows of a printed table", "add --latex or --markdown")
     if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
         return _report_sweep(Path(runs[0]), out, width, as_latex=as_latex, as_markdown=as_markdown, as_json=as_json)
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]

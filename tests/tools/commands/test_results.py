@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from experiments.metrics.statistics import spread
+from experiments.report.tables import ratio_words
 from tests.experiments.recording.test_bundle import SHORT
 from tools.main import app
 
@@ -100,3 +102,8 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
     assert r"\caption{Cells, Two, for three seconds." in text
     assert "threshold=0.05" in text
     assert f"a sweep: `./zenpark report {folder}`" in zenpark("runs", "--past", "--in", str(tmp_path))
+
+
+def test_a_ratio_has_the_digits_that_its_interval_bears() -> None:
+    assert ratio_words(spread([0.0610, 0.0611, 0.0612])) == "0.0611 ± 0.0002"
+    assert ratio_words(spread([1.0784])) == "1.078"
