@@ -36,6 +36,7 @@ FRESH_S: Final = 1.0  # an older status is ignored
 LOOP_SILENCE_S: Final = 1.0  # in flight, the robot's loop must command at least this often
 FLYING_FLAG_S: Final = 3.0  # from a take-off to the flag "flying" in the status
 LANDING_GAP_S: Final = 0.8  # after a longer gap the drone is landed: it has flown without control
+SLOWEST_HZ: Final = 2.5  # setpoints over a radio that has become slow
 REFRESH_S: Final = 0.25  # a setpoint that does not change is sent again after this
 PERIODS: Final = 2.5  # for so many periods of setpoints, and for `HOLD_S`, the last one is held
 MARGIN_S: Final = 2.0  # a drone that nothing reaches is down so long after its trajectory has reached the floor
@@ -78,7 +79,7 @@ class Flight:
         self._sent_at = -math.inf  # [s]
         self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
         self._top: Target | None = None  # end of the climb, held until the first setpoint
-        self._hold = max(HOLD_S, PERIODS / settings.stream_hz)  # [s]
+        self._stream_hz = settings.stream_hz
         self._span = 0.0  # duration of the take-off or landing [s]
 
     @property
@@ -95,6 +96,15 @@ class Flight:
     def publish_airborne(self) -> None:
         """Write `airborne` to the board."""
         self._telemetry.board.airborne[self._telemetry.row] = self.airborne
+
+    @property
+    def _hold(self) -> float:
+        """Time for which a setpoint is held before the descent [s]."""
+        return max(HOLD_S, PERIODS / self._stream_hz)
+
+    def slow_setpoints(self) -> None:
+        """Halve the rate of setpoints, down to `SLOWEST_HZ`, or to the rate chosen if that is lower."""
+        self._stream_hz = min(max(0.5 * self._stream_hz, SLOWEST_HZ), self._settings.stream_hz)
 
     # ------------------------------------------------------------------ orders
 
@@ -184,7 +194,7 @@ class Flight:
             return
         packets = self.link.trajectories.hold(target, self._hold)
         self._sent, self._sent_at = target, now
-        self._due = now + packets / (SETPOINT_PACKETS * self._settings.stream_hz) - 0.5 * POLL_S
+        self._due = now + packets / (SETPOINT_PACKETS * self._stream_hz) - 0.5 * POLL_S
         self._plan_end(now, target[2])
 
     def _plan_end(self, since: float, height: float) -> None:

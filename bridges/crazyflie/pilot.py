@@ -364,6 +364,7 @@ class CrazyfliePilot:
         if now - self._late_since > LATE_S:
             self._late_since = now + SLOWING_S
             self._slowed = link.slow_logs() or self._slowed
+            self._flight.slow_setpoints()
         self._flight.land_after_gap(gap)
 
     def _pause(self, seconds: float) -> None:

@@ -102,6 +102,19 @@ def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
     assert 15 < len([at for at in air.times("setpoint") if at > begin]) < 25
 
 
+def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
+    for _ in range(4):
+        air.flight.slow_setpoints()
+    places = iter(np.linspace(0.2, 0.8, 1000))
+    setpoint = air.flight.set_target
+    air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
+    begin = air.now
+    air.pass_(4.0)
+    sent = [at for at in air.times("setpoint") if at > begin]
+    assert np.diff(sent).min() > 0.9 / module.SLOWEST_HZ
+    assert np.diff(sent).max() < 0.5 * air.flight._hold
+
+
 def test_the_end_of_a_climb_is_held_until_the_first_setpoint(monkeypatch):
     """By the robot's loop, which may wait for others; without it, the drone is landed."""
     air = Air(monkeypatch)
