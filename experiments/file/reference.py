@@ -6,6 +6,7 @@ reference pages print the same entries.
 
 from __future__ import annotations
 
+import difflib
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,9 +15,11 @@ from typing import Any, Final
 
 import msgspec
 
+from agents.body.kinds import KINDS, Kind
 from experiments.catalogue.index import FOLDER
 from experiments.file.json_schema import schema
 
+NONE: Final[Mapping[str, object]] = {}
 _NAMES: Final = {  # tables whose keys are names, with the example of such a name
     "robots": ("ROBOT", "CF01"),
     "disturbance": ("KIND", "crazyflie"),
@@ -27,6 +30,7 @@ _NAMES: Final = {  # tables whose keys are names, with the example of such a nam
     "links": ("LINK", '"TB01 > KH01"'),
     "anchors": ("ROBOT", "TB01"),
 }
+_LISTS: Final = ("timeline", "changes", "outages")  # keys that are lists of tables
 _LIMITS: Final = {
     "minimum": "≥ {}",
     "exclusiveMinimum": "> {}",
@@ -71,16 +75,49 @@ def entries() -> tuple[Entry, ...]:
 
 def matching(asked: str) -> list[Entry]:
     """Entries of a key as a user writes it: names may be real ones, in capitals, or left out; a plug-in in the place
-    of its kind (`trigger.send-on-delta.threshold`) or left out; the end of a key is enough if no key is meant in full.
+    of its kind (`trigger.send-on-delta.threshold`) or left out; the end of a key is enough if no key is meant in full,
+    such as `plan.circle`, `circle`, and so is a kind of robot.
 
     A key of a table is followed by the keys of that table.
     """
+    if asked in KINDS:
+        return [_kind(KINDS[asked])]
     parts = [part for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part]
-    found = [entry for entry in entries() if _fits(entry, parts)]
-    if not found:
-        found = [entry for entry in entries() if entry.words[-len(parts) :] == tuple(parts)]
-    below = [each for each in entries() for entry in found if each.key.startswith((f"{entry.key}.", f"{entry.key}("))]
-    return found + [each for each in below if each not in found]
+    found = [entry for entry in entries() if parts and _fits(_split(entry.key), parts)]
+    if not found and parts:
+        ends = [entry for entry in entries() if any(_fits(end, parts) for end in _ends(_split(entry.key)))]
+        found = sorted(ends, key=lambda entry: len(entry.words))
+    tables = tuple(f"{entry.key}{sign}" for entry in found for sign in ".(")
+    return found + [each for each in entries() if each.key.startswith(tables) and each not in found]
+
+
+def nearest(asked: str, count: int = 3) -> list[str]:
+    """The keys most like `asked`, or like its last word, as users write them; the best first."""
+    end = asked.rpartition(".")[2]
+    known = dict.fromkeys(".".join(entry.words) for entry in entries())
+
+    def unlike(key: str) -> float:
+        pairs = ((asked, key), (end, key.rpartition(".")[2]))
+        return -max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+
+    return sorted(known, key=unlike)[:count]
+
+
+def tables() -> list[Entry]:
+    """The keys at the top of a file."""
+    return [entry for entry in entries() if not set(entry.key) & set(".(")]
+
+
+def _kind(kind: Kind) -> Entry:
+    """Entry of a kind of robot."""
+    text = (
+        f"A kind of robot that {'flies' if kind.flies else 'drives on wheels'} and takes a {kind.takes} as setpoint: "
+        f"radius {kind.radius:g} m, height {kind.height:g} m, {kind.mass:g} kg, at most {kind.speed:.3g} m/s and "
+        f"{kind.turn_rate:.3g} rad/s, {kind.endurance_s / 60.0:g} min with a full battery."
+    )
+    chosen = f"kind = {written(kind.name)}"
+    example = f"[robots.R01]\n{chosen}\nstart = [0.0, 0.0]" + "\nhover = 0.5" * kind.flies
+    return Entry(f"robots.ROBOT.{chosen}", text, "a kind of robot", "", "", False, example)
 
 
 def _split(key: str) -> list[str]:
@@ -88,8 +125,13 @@ def _split(key: str) -> list[str]:
     return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
 
 
-def _fits(entry: Entry, parts: Sequence[str]) -> bool:
-    """Whether the parts name the entry: literal words all, names and plug-ins matched or skipped."""
+def _ends(pattern: Sequence[str]) -> list[Sequence[str]]:
+    """The ends of a split key that begin with a word or a plug-in."""
+    return [pattern[k:] for k in range(1, len(pattern)) if not pattern[k].isupper()]
+
+
+def _fits(whole: Sequence[str], parts: Sequence[str]) -> bool:
+    """Whether the parts name a split key: literal words all, names and plug-ins matched or skipped."""
 
     def match(pattern: Sequence[str], rest: Sequence[str]) -> bool:
         if not pattern:
@@ -100,15 +142,18 @@ def _fits(entry: Entry, parts: Sequence[str]) -> bool:
             return match(later, rest) or (right and match(later, rest[1:]))
         return bool(rest) and rest[0] == first and match(later, rest[1:])
 
-    return match(_split(entry.key), parts)
+    return match(whole, parts)
 
 
-def _walk(node: Mapping[str, Any], definitions: Mapping[str, Any], path: str) -> Iterator[Entry]:
+def _walk(
+    node: Mapping[str, Any], definitions: Mapping[str, Any], path: str, needed: Mapping[str, object] = NONE
+) -> Iterator[Entry]:
+    """Entries below a path; in a plug-in with the parameters that it cannot do without."""
     for name, field in node.get("properties", {}).items():
         if name == "kind" and "const" in field:
             continue
         key = f"{path}.{name}" if path else name
-        yield _entry(key, field, name in node.get("required", []), definitions)
+        yield _entry(key, field, name in node.get("required", []), definitions, needed)
         if key != "cases":  # a case repeats what stands above
             yield from _below(key, name, field, definitions)
 
@@ -126,8 +171,10 @@ def _below(key: str, name: str, field: Mapping[str, Any], definitions: Mapping[s
         elif "kind" in inner.get("properties", {}) and "const" in inner["properties"]["kind"]:
             plugin = f"{key}({inner['properties']['kind']['const']})"
             text = _joined(inner.get("description", ""))
-            yield Entry(plugin, text, "a plug-in", "", "", False, _example(plugin, {}, definitions))
-            yield from _walk(inner, definitions, plugin)
+            needed = {each: _made(inner["properties"][each], definitions) for each in inner.get("required", [])}
+            needed.pop("kind", None)
+            yield Entry(plugin, text, "a plug-in", "", "", False, _example(plugin, {}, definitions, needed))
+            yield from _walk(inner, definitions, plugin, needed)
         else:
             yield from _walk(inner, definitions, key)
 
@@ -138,13 +185,14 @@ def _resolved(node: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mappin
     return node
 
 
-def _entry(key: str, field: Mapping[str, Any], required: bool, definitions: Mapping[str, Any]) -> Entry:
+def _entry(
+    key: str, field: Mapping[str, Any], required: bool, definitions: Mapping[str, Any], needed: Mapping[str, object]
+) -> Entry:
     inner = _resolved(field, definitions)
     text = _joined(field.get("description") or inner.get("description", ""))
     default = "" if "default" not in field or field["default"] is None else written(field["default"])
-    return Entry(
-        key, text, _type(field, definitions), _limits(inner), default, required, _example(key, field, definitions)
-    )
+    example = _example(key, field, definitions, needed)
+    return Entry(key, text, _type(field, definitions), _limits(inner), default, required, example)
 
 
 def _joined(text: str) -> str:
@@ -194,7 +242,7 @@ def written(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) and value != int(value) else str(value)
 
 
-def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
+def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any], needed: Mapping[str, object]) -> str:
     """Lines from a ready-made experiment, or else made of the default and the limits."""
     parts = _split(key)
     if found := [lines for document in _documents() for lines in _occurrences(document, parts, ())]:
@@ -202,7 +250,9 @@ def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any])
     value = field.get("default")
     made = _made(field, definitions) if value in (None, {}, []) else value
     names = dict(_NAMES.values())
-    return _lines([(names.get(part, "A"), None) if part.isupper() else (part, None) for part in parts], made)
+    return _lines(
+        [(names.get(part, "A"), None) if part.isupper() else (part, part in _LISTS) for part in parts], made, needed
+    )
 
 
 @cache
@@ -227,8 +277,8 @@ def _occurrences(value: object, parts: Sequence[str], path: tuple[Step, ...]) ->
     elif not isinstance(value, dict):
         return
     elif first.startswith("("):
-        if value.get("kind") == first.strip("()"):
-            yield from _occurrences(value, later, (*path, (first, None)))
+        if value.get("kind") == first.strip("()") and (not later or later[0] in value):  # in full: others may be needed
+            yield from _occurrences(value, (), (*path, (first, None)))
     elif first.isupper():
         for name, each in value.items():
             yield from _occurrences(each, later, (*path, (_quoted(name), None)))
@@ -240,16 +290,17 @@ def _quoted(name: str) -> str:
     return name if re.fullmatch(r"[\w-]+", name) else written(name)
 
 
-def _lines(path: Sequence[Step], value: object) -> str:
-    """A key and its value below the header of its table; a plug-in as a table in one line."""
+def _lines(path: Sequence[Step], value: object, needed: Mapping[str, object] = NONE) -> str:
+    """A key and its value below the header of its table; a plug-in as a table in one line, with what it needs."""
     *tables, (last, _) = path
     if tables and tables[-1][0].startswith("("):
         kind = tables.pop()[0].strip("()")
         *tables, (owner, _) = tables
-        last, value = owner, {"kind": kind, last: value}
+        last, value = owner, {"kind": kind, **needed, last: value}
     if last.startswith("("):
         *tables, (owner, _) = tables
-        last, value = owner, {"kind": last.strip("()")}
+        own = value if isinstance(value, Mapping) else needed
+        last, value = owner, {"kind": last.strip("()"), **own}
     header = ".".join(name for name, _ in tables)
     many = bool(tables and tables[-1][1])
     return (f"[[{header}]]\n" if many else f"[{header}]\n" if header else "") + f"{last} = {written(value)}"

@@ -97,7 +97,7 @@ COMMANDS = (
     ("check utf16.toml", "utf16.toml: is binary, no text", "name an experiment file"),
     ("check triangle.toml --plot x.doc", "--plot: x.doc", "must end in .svg, .pdf or .png"),
     ("explain disturbance.hover", "'disturbance.hover'", "did you mean 'disturbance.hover_jitter'?"),
-    ("explain xyzzy", "'xyzzy'", "known: title, robots, "),
+    ("explain xyzzy", "'xyzzy'", "the nearest: rates.body_hz, "),
     ("new triangle triangle.toml", "triangle.toml: exists already", "choose another name"),
     ("new --polygon 2", "--polygon 2: ", "needs 3 robots or more"),
     ("new --grid 5", "--grid 5: ", "such as 5x8"),

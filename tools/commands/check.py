@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
     from experiments.check.check import Figures, Finding
     from experiments.file.document import Document
+    from experiments.file.reference import Entry
     from experiments.real_time.conductor.preflight_checks import RobotChecks
 
 app: Final = typer.Typer()
@@ -273,25 +274,27 @@ def _spared(spare: int | None, vital: int) -> str:
     return "-" if spare is None else f"{spare} of {spare + vital}"
 
 
-@app.command(epilog=example("explain disturbance.hover_jitter", "explain safety"))
+@app.command(epilog=example("explain", "explain disturbance.hover_jitter", "explain plan.circle"))
 def explain(
-    key: Annotated[str, typer.Argument(help="such as disturbance.hover_jitter, trigger.threshold, safety")],
+    key: Annotated[
+        str, typer.Argument(help="such as disturbance.hover_jitter, safety, trigger, circle; left out: all at the top")
+    ] = "",
     as_json: AsJson = False,
 ) -> int:
-    """Explain a key of the experiment file: its text, unit, default, limits and an example."""
+    """Explain a key of the experiment file, a plug-in or a kind of robot: text, unit, default, limits, an example."""
     from agents.plugins.registry import did_you_mean
     from experiments.file import reference
 
-    found = reference.matching(key)
+    found = reference.matching(key) if key else reference.tables()
     if not found:
-        known = {".".join(entry.words): None for entry in reference.entries()}
-        hint = did_you_mean(key, known)
-        if hint.startswith("known: "):
-            hint = did_you_mean("", dict.fromkeys(entry.words[0] for entry in reference.entries()))
-        print(f"zenpark: no key of the experiment file is named {key!r}; {hint}", file=sys.stderr)
+        hint = did_you_mean(key, reference.nearest(key)).replace("known", "the nearest")
+        print(f"zenpark: nothing in the experiment file is named {key!r}; {hint}", file=sys.stderr)
         return 2
     if as_json:
         print_json(found)
+        return 0
+    if not key:
+        _print_entries(found)
         return 0
     first = found[0].text
     alike = [entry for entry in found if entry.text == first and not entry.key.startswith(f"{found[0].key}.")]
@@ -304,9 +307,15 @@ def explain(
     rest = [entry for entry in found if entry not in alike]
     if rest:
         print()
-    for entry in rest:
-        print(textwrap.shorten(f"{entry.key}  {entry.text}", WIDEST, placeholder=" ..."))
+    _print_entries(rest)
     return 0
+
+
+def _print_entries(entries: Sequence[Entry]) -> None:
+    """One line for each: cut at a terminal, in full for a file or a pipe."""
+    for entry in entries:
+        text = f"{entry.key}  {entry.text}"
+        print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))
 
 
 @app.command(epilog=example("new triangle mine.toml", "new --hemisphere 40 swarm.toml"))

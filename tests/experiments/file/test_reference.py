@@ -5,6 +5,7 @@ import tomllib
 import pytest
 from typer.testing import CliRunner
 
+from agents.plugins import registry
 from experiments.file import reference
 from tools.main import app
 
@@ -29,6 +30,10 @@ def test_an_example_is_a_part_of_a_file(entry):
         ("trigger.send-on-delta.threshold", "trigger(send-on-delta).threshold"),
         ("trigger(send-on-delta).threshold", "trigger(send-on-delta).threshold"),
         ("body_hz", "rates.body_hz"),
+        ("plan", "timeline.plan"),
+        ("plan.circle", "timeline.plan(circle)"),
+        ("send-on-delta", "trigger(send-on-delta)"),
+        ("tello", 'robots.ROBOT.kind = "tello"'),
     ],
 )
 def test_a_key_is_found_as_users_write_it(asked, first):
@@ -45,6 +50,41 @@ def test_an_entry_says_default_and_limits():
     (entry,) = reference.matching("rates.body_hz")
     assert (entry.type, entry.limits, entry.default) == ("a number", "> 0, ≤ 2000", "100.0")
     assert entry.example.startswith("[rates]\nbody_hz = ")
+
+
+GROUPS = {
+    "plan": registry.PLANNERS, "law": registry.LAWS, "trigger": registry.TRIGGERS, "update": registry.TRIGGERS,
+    "prediction": registry.PREDICTORS, "avoidance": registry.AVOIDANCES, "engine": registry.ENGINES,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("entry", [each for each in reference.entries() if "(" in each.key], ids=lambda each: each.key)
+def test_an_example_of_a_plug_in_has_all_that_it_needs(entry):
+    *tables, choice = entry.example.split("\n")
+    ((owner, parameters),) = tomllib.loads(choice).items()
+    registry.build(GROUPS[owner], parameters)
+    assert tables in ([], ["[[timeline]]"]) or not tables[0].startswith("[timeline")
+
+
+def test_no_key_is_explained_twice():
+    keys = [entry.key for entry in reference.matching("formation.law")]
+    assert len(keys) == len(set(keys)) > 4
+
+
+def test_a_pipe_receives_the_whole_texts():
+    said = CliRunner().invoke(app, ["explain", "formation.law"])
+    assert not any(line.endswith("...") for line in said.output.splitlines())
+
+
+def test_without_a_key_all_at_the_top_are_listed():
+    lines = CliRunner().invoke(app, ["explain"]).output.splitlines()
+    assert [line.partition(" ")[0] for line in lines] == list(reference.schema()["properties"])
+
+
+def test_of_a_stranger_the_three_nearest_keys_are_named():
+    said = CliRunner().invoke(app, ["explain", "qqqq.zzzz"])
+    assert said.exit_code == 2
+    assert said.output.count(",") == 2
 
 
 def test_the_command_explains_a_key():
