@@ -230,7 +230,7 @@ def errors(
     axes.grid()
     time_axis(axes, traces)
     axes.set_ylabel("error of the worst link [m]")
-    legend_above(figure, (list(handles.values()), list(handles)), columns=4)
+    legend_above(figure, (list(handles.values()), list(handles)), columns=6)
     return figure
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -17,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
-from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
+from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from agents.arrays import Array
@@ -231,9 +232,12 @@ def _crop(figure: Figure, axes: Axes3D, above: float) -> None:
     parts = [*axes.lines, *axes.texts, axes.xaxis, axes.yaxis, axes.zaxis]
     boxes = [box for part in parts if (box := part.get_tightbbox()) is not None]
     box = Bbox.union([each for each in boxes if np.isfinite(each.extents).all() and each.height > 0.0])
-    bottom, top = box.y0 / figure.dpi, box.y1 / figure.dpi
+    corners = np.array(list(itertools.product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
+    x, y, _ = proj3d.proj_transform(*corners.T, axes.get_proj())
+    height_of = axes.transData.transform(np.column_stack([x, y]))[:, 1]  # [px] of the corners of the grid
+    bottom, top = min(box.y0, height_of.min()) / figure.dpi, max(box.y1, height_of.max()) / figure.dpi
     place = axes.get_position(original=True)
-    whole = top - bottom + above + 0.2
+    whole = top - bottom + above + 0.08
     figure.set_figheight(whole)
     axes.set_position(
         (place.x0, (place.y0 * height - bottom + 0.04) / whole, place.width, place.height * height / whole)

@@ -287,3 +287,15 @@ def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path
     assert content.startswith(b"%PDF")
     assert b"/Type3" not in content
     assert b"/CreationDate" not in content
+
+
+def test_a_picture_of_space_is_as_high_as_what_it_shows():
+    for width in (3.5, 7.16):
+        figure = figures.formation([park(duration=5.0)], width)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        shown = np.asarray(canvas.buffer_rgba())[..., :3].min(axis=2) < 250
+        rows = np.flatnonzero(shown.any(axis=1))
+        empty = np.diff(rows).max(initial=0) / figure.dpi
+        assert max(rows[0], len(shown) - 1 - rows[-1]) / figure.dpi < 0.15
+        assert empty < 0.3  # between legend and picture

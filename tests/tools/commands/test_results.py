@@ -107,3 +107,25 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
 def test_a_ratio_has_the_digits_that_its_interval_bears() -> None:
     assert ratio_words(spread([0.0610, 0.0611, 0.0612])) == "0.0611 ± 0.0002"
     assert ratio_words(spread([1.0784])) == "1.078"
+
+
+def test_a_run_names_its_replay(three: tuple[Path, str]) -> None:
+    assert three[1].splitlines()[-1] == f"replay in the browser: ./zenpark view {three[0]}"
+
+
+@pytest.mark.parametrize(("made", "kept"), [([], "nothing is kept"), (["event"], "kept is seed 1 of event")])
+def test_an_interrupted_run_over_seeds_says_what_is_kept(
+    made: list[str], kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, folder: Path, **__: object) -> None:
+        for case in made:
+            (folder / f"{case}.mcap").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("experiments.run.simulate_seeds", interrupted)
+    (tmp_path / "short.toml").write_text(SHORT)
+    options = ["--virtual", "--seeds", "60", "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, ["run", str(tmp_path / "short.toml"), *options])
+    assert done.exit_code != 0
+    assert f"interrupted: {kept}" in done.stderr
+    assert "`./zenpark sweep` keeps every seed" in done.stderr
