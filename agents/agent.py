@@ -59,7 +59,7 @@ class Agent:
     tick: int  # number of the next tick; 0 at the common start, so that robots decide together
     goal: Array  # (N, 3) pursued [m]
     goal_yaw: Array  # (N,) wanted at the goal [rad], NaN for any
-    error: Array  # (N,) Σ of the link errors as the rows know them [m]; 0 for guided rows
+    error: Array  # (N,) Σ of the link errors as the rows know them [m]; 0 for guided rows, NaN without a position
     offset: Array  # (N, 3) decided last, before it was clamped [m]
     decisions: int  # since the common start
     updates: Index  # (N,) decisions at which each row computed its goal anew; of guided rows, received goals
@@ -242,10 +242,11 @@ class Agent:
         if question == self._asked:
             return Transmission(NO_ROWS, state.position, state.velocity)
         self._asked = question
-        self.error, energy = self.goal_computer.errors(t, state.position)
+        error, energy = self.goal_computer.errors(t, state.position)
+        self.error = error if where.all_valid else np.where(where.invalid, np.nan, error)
         return self._transmitter.transmit(
             t, state.position, state.velocity,
-            error=self.error, energy=energy, start=life.start_at, offset=self.offset,
+            error=error, energy=energy, start=life.start_at, offset=self.offset,
             setpoint=self._setpoint,
         )  # fmt: skip
 

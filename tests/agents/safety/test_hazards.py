@@ -286,6 +286,17 @@ def test_a_drone_that(what):
     assert any(each.startswith(text) for each in told) if text else told == []
 
 
+def test_wheels_whose_position_is_old_know_no_error():
+    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.3)
+    assert np.isfinite(swarm.agent("A").error).all()
+    spoiled(swarm, time=swarm.t)
+    swarm.run(0.4)
+    assert np.isfinite(swarm.agent("A").error).all()
+    swarm.run(0.3)
+    assert np.isnan(swarm.agent("A").error).all()
+    assert np.isfinite(swarm.agent("B").error).all()
+
+
 def jumped(swarm, name, at, until):
     """The measured position of a robot is off by 1 m from `at` [s] on, before `until`."""
     group = next(group for group in swarm.groups if name in group.names)
