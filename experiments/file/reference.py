@@ -94,11 +94,13 @@ def matching(asked: str) -> list[Entry]:
 def nearest(asked: str, count: int = 3) -> list[str]:
     """The keys most like `asked`, or like its last word, as users write them; the best first."""
     end = asked.rpartition(".")[2]
+    plugins = [entry for entry in entries() if entry.key.endswith(")")]
     known = dict.fromkeys(".".join(entry.words) for entry in entries())
+    known |= dict.fromkeys(".".join([*entry.words, _split(entry.key)[-1].strip("()")]) for entry in plugins)
 
-    def unlike(key: str) -> float:
+    def unlike(key: str) -> tuple[float, int]:
         pairs = ((asked, key), (end, key.rpartition(".")[2]))
-        return -max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+        return -max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs), len(key)
 
     return sorted(known, key=unlike)[:count]
 

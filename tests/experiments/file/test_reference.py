@@ -81,6 +81,11 @@ def test_without_a_key_all_at_the_top_are_listed():
     assert [line.partition(" ")[0] for line in lines] == list(reference.schema()["properties"])
 
 
+def test_a_misspelt_plug_in_is_recognised():
+    assert reference.nearest("plan.circl")[0] == "timeline.plan.circle"
+    assert reference.nearest("trigger.treshold")[0] == "trigger.threshold"
+
+
 def test_of_a_stranger_the_three_nearest_keys_are_named():
     said = CliRunner().invoke(app, ["explain", "qqqq.zzzz"])
     assert said.exit_code == 2
