@@ -17,7 +17,7 @@ from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Claim
 from experiments.check.ideal_run import approaches, fly_repeatedly, isolated, repetitions, undisturbed
-from experiments.check.theory import FAR_OFF, OFF
+from experiments.check.theory import FAR_OFF, GAIN, OFF, strength
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
@@ -101,7 +101,7 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         changes = any(each.at == departure for each in analysis.pattern.changes)
         what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
-        remedy = "begin later, start nearer to the shape, or raise the gain"
+        remedy = f"begin later, start nearer to the shape, or raise {strength(analysis)}"
         yield Claim("warning", "acquired-late", message, remedy, path)
     elif not prediction.transmissions and experiment.architecture == "distributed":
         moved = float(norm(prediction.position - prediction.position[0]).max())
@@ -123,10 +123,11 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         and np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED
     ):
         message = f"the formation lags behind its leader: {left} {allowed}"
-        yield Claim("warning", "lags", message, "lead more slowly, or raise the gain or the clamp", ("timeline",))
+        remedy = f"lead more slowly, or raise {strength(analysis)} or the clamp"
+        yield Claim("warning", "lags", message, remedy, ("timeline",))
     else:
         message = f"the formation is not acquired in time: {left} {allowed}"
-        remedy = "give a longer duration_s, start nearer to the shape, or raise the gain"
+        remedy = f"give a longer duration_s, start nearer to the shape, or raise {strength(analysis)}"
         yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
 
 
@@ -173,7 +174,7 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
         f"[disturbance] outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {count} flights "
         f"({seeds}): {worst_link}"
     )
-    remedy = "raise the gain, add links that stiffen the formation, or allow a larger tolerance"
+    remedy = f"raise {strength(analysis)}, add links that stiffen the formation, or allow a larger tolerance"
     yield Claim("warning", "soft", message, remedy, ("formation", "links"))
 
 
@@ -192,8 +193,10 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
     )
     name = "gain" if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else "stiffness"
     enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
-    remedy = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance"
-    return Claim("warning", "wheels-stop", message, remedy, ("formation", name))
+    remedy, path = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance", ("formation", name)
+    if (own := strength(analysis)) != GAIN:
+        remedy, path = f"raise {own}, or allow a larger tolerance", ("formation", "law")
+    return Claim("warning", "wheels-stop", message, remedy, path)
 
 
 def walls(analysis: Analysis) -> Iterator[Claim]:

@@ -20,6 +20,7 @@ from experiments.file.problems import Path
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 OFF: Final = 0.001  # [m] more than written digits explain
 FEW: Final = 6  # names that are listed
+GAIN: Final = "the gain"  # or the stiffness, of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
@@ -253,13 +254,16 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
     return f"it stays rigid without any one {what} but {join_names(needed)}"
 
 
-def _uses_gain(analysis: Analysis) -> bool:
-    """Whether the law, or an anchor, pulls by the gains of the file."""
+def strength(analysis: Analysis) -> str:
+    """What makes the law ask for more or less, in words: `GAIN`, or its own parameters if it goes by these alone."""
     law, links = analysis.assignment.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law.offset(place, place[links.sender], links)
     double = law.offset(place, place[links.sender], replace(links, gain=2.0 * links.gain))
-    return analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True)
+    if analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True):
+        return GAIN
+    plugin = registry.struct(registry.LAWS, registry.split(analysis.experiment.formation.law)[0])
+    return f"the law's own parameters ({', '.join(plugin.__struct_fields__) or 'it has none yet'})"
 
 
 def stability(analysis: Analysis) -> Iterator[Claim]:
@@ -281,11 +285,10 @@ def stability(analysis: Analysis) -> Iterator[Claim]:
     path, gain = ("formation", name), float(getattr(formation, name))
     took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
     calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"
-    if not _uses_gain(analysis):
-        own = ", ".join(registry.struct(registry.LAWS, choice).__struct_fields__)
+    if (own := strength(analysis)) != GAIN:
         took = f"one decision takes {loop.gain:.3g} of the stiffest error"
-        calm = f"let it ask for less by its own parameters ({own})" if own else "give it a parameter to ask for less by"
-        calm, path = f"the law '{choice}' does not use `links.gain`: {calm}", ("formation", "law")
+        calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
+        path = ("formation", "law")
     if loop.gain >= HUNTS:
         yield Claim("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:

@@ -259,6 +259,12 @@ class Steep(msgspec.Struct, frozen=True):
         return np.abs(links.distance - norm(position[links.receiver] - sender_position))
 
 
+class Weak(Steep, frozen=True):
+    """A law that hardly pulls."""
+
+    largest: float = 0.01
+
+
 class Undefined(Steep, frozen=True):
     """A law that divides by the error, which is 0 where the formation is met."""
 
@@ -276,9 +282,10 @@ class Undefined(Steep, frozen=True):
             "Steep",
             "hunts",
             "of the stiffest error, and from 2",
-            "does not use `links.gain`: let it ask for less",
+            "does not use `links.gain`: let it ask for less by the law's own",
         ),
         ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
+        ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],
 )
 def test_the_remedy_of_a_law_of_ones_own_is_in_the_law(monkeypatch, law, code, message, remedy):
@@ -288,7 +295,7 @@ def test_the_remedy_of_a_law_of_ones_own_is_in_the_law(monkeypatch, law, code, m
     found = bad(TRIANGLE, "formation.law=mine", "duration_s=1")[code]
     assert message in found[1]
     assert remedy in found[2]
-    assert found[3] == "--set formation.law=mine"
+    assert found[3] == ("--set duration_s=1" if code == "not-acquired" else "--set formation.law=mine")
 
 
 def test_a_trigger_that_never_fires_is_named():
