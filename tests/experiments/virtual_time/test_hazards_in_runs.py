@@ -38,7 +38,7 @@ def test_who_comes_too_near_holds_in_every_repetition(tmp_path):
     book.record(tmp_path / "case.mcap", 'title = "A pair"')
     read = [event for event in playback.read(tmp_path / "case.mcap").trace.events if event.kind == "hazard"]
     assert {(event.source, event.text) for event in read} == set(events(log, experiment, 1))
-    assert all(0.0 < event.stamp < 8.0 for event in read)
+    assert all(0.0 < event.stamp <= 8.0 for event in read)  # the hold is unresolved at the end
 
 
 def test_a_drone_lands_when_its_battery_is_low_and_says_so():
