@@ -100,7 +100,7 @@ class Drones(OnboardFlight):
         """Steps of `dt` [s] are divided so that the firmware runs at its own rate or faster.
 
         Raises:
-            BodyError: If MuJoCo is not installed.
+            BodyError: If MuJoCo is not installed, or has no airframe of a kind.
         """
         try:
             import mujoco  # noqa: PLC0415 - an extra
@@ -114,7 +114,8 @@ class Drones(OnboardFlight):
         self._ticks = max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._dt = dt / self._ticks
         if unknown := sorted({kind.name for kind in kinds} - AIRFRAMES.keys()):
-            raise BodyError(f"the engine mujoco has no airframe of a {', '.join(unknown)}; choose another engine")
+            remedy = "add it to AIRFRAMES in twins/engines/mujoco_model.py (docs/plugins.md), or choose another engine"
+            raise BodyError(f"the engine mujoco has no airframe of {', '.join(map(repr, unknown))}; {remedy}")
         frames = [AIRFRAMES[kind.name] for kind in kinds]
         step = self._dt / SUBSTEPS
         models = {frame: mujoco.MjModel.from_xml_string(mjcf(frame, scene, step, motor_lag)) for frame in frames}

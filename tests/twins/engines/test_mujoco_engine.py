@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -18,7 +19,7 @@ from tests.twins.runge_kutta import runge_kutta
 from twins.body import TwinBody
 from twins.engines.engine import Stage
 from twins.engines.mujoco_model import AIRFRAMES
-from twins.models.quadrotor import GRAVITY, Quadrotor
+from twins.models.quadrotor import GRAVITY, RESPONSES, Quadrotor
 from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
@@ -400,3 +401,10 @@ def test_the_reference_formation_needs_half_the_gain():
         error[gain] = np.abs(apart - links.distance).mean()
     assert error[1.5] < 0.02
     assert error[3.0] > 0.025
+
+
+def test_a_kind_without_an_airframe_is_refused_with_its_table(monkeypatch):
+    drone = replace(CRAZYFLIE, name="mine")
+    monkeypatch.setitem(RESPONSES, "mine", RESPONSES["crazyflie"])
+    with pytest.raises(BodyError, match="no airframe of 'mine'; add it to AIRFRAMES"):
+        RigidBody().build(stage((drone,)))
