@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
 from experiments.report import figures, style
-from tests.experiments.traces import crowd, cut, experiment, park, trace
+from tests.experiments.traces import crowd, cut, experiment, pair, park, trace
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -93,7 +93,7 @@ def test_the_plan_shows_what_is_near_the_robots_with_a_few_cases_upon_each_other
 
 
 def test_an_error_axis_reaches_the_curves():
-    (axes,) = figures.errors([park(duration=30.0)]).axes
+    (axes,) = figures.errors([pair(1.0 + np.exp(-np.arange(0.0, 9.0, 0.02)))]).axes  # down to 0.2 mm
     (thick,) = [line for line in axes.lines if line.get_linewidth() == 1.3]
     assert axes.get_ylim()[0] <= max(np.nanmin(thick.get_ydata()), figures.LEAST_ERROR)
 
