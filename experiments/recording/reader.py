@@ -168,10 +168,10 @@ class Records:
             self.header = Header.read(stream)
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
-            self.schemas[schema.id] = schema
+            self.schemas.setdefault(schema.id, schema)  # the summary repeats them, without a checksum
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
-            self.channels[channel.id] = channel
+            self.channels.setdefault(channel.id, channel)
         elif opcode == Opcode.ATTACHMENT:
             if zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
                 raise ValueError("damaged attachment")

@@ -175,6 +175,16 @@ def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
     survives(folder / "run.mcap", folder / "target.mcap")
 
 
+def test_of_schemas_that_contradict_each_other_the_first_holds(path, tmp_path, recorded):
+    """The summary at the end repeats them, and may be damaged."""
+    text = b"string robot"
+    content = bytearray(recorded)
+    content[recorded.rindex(text)] = 0
+    content[-1] = 0  # not finished
+    path.write_bytes(content)
+    assert survives(path, tmp_path / "target.mcap") == 82
+
+
 def test_a_damaged_chunk_costs_only_itself(path):
     write(path, begun(), *scattered(2000))
     whole = read(path)
