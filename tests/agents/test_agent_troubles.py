@@ -59,6 +59,7 @@ def test_a_drone_that_left_the_arena_lands(moment):
         swarm.agent("F").lifecycle.takeoff(0)
         swarm.run(0.5)
     blinded(swarm, "elsewhere", [2.2, 0.0, 0.5])  # the arena ends at 2 m
+    swarm.agent("F").resume(0)  # it is put there: no jump
     swarm.run(0.1)
     assert swarm.phase("F") < LANDING
     blinded(swarm, "elsewhere", [2.3, 0.0, 0.5])
@@ -110,6 +111,7 @@ def test_a_ground_robot_outside_the_arena_rolls_out():
         return state
 
     group.spoil = far
+    swarm.agent("A").resume(0)  # it is put there: no jump
     swarm.run(0.5)
     assert [swarm.phase(name) for name in "AB"] == [DONE, RUNNING]
     assert group.agent.lifecycle.reason[0] == "it left the arena"

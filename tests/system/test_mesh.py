@@ -22,7 +22,7 @@ from experiments.definition import access_rights, mesh
 from experiments.file.document import load
 from experiments.run import reopen
 from tests.system.lab import Flight, Started, Watcher
-from tools.commands import authority, estop
+from tools.commands import authority, orders
 from tools.commands.network import members
 
 pytestmark = pytest.mark.system
@@ -74,7 +74,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
         assert all(not watcher.status[name].missing for name in begun if "CF02" not in hears[name])
     finally:
         watcher.close()
-    assert estop.estop(connect=endpoints, realm="park", reason="a test", identity="operator") == 0
+    assert orders.estop(connect=endpoints, realm="park", reason="a test", identity="operator") == 0
     assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))}\n"
     flight.finish()
     run = reopen(flight.folder)

@@ -257,7 +257,7 @@ def test_a_row_can_be_put_elsewhere_at_rest():
 
 
 def test_a_kind_without_a_twin_is_an_error():
-    with pytest.raises(BodyError, match="no twin of a hovercraft"):
+    with pytest.raises(BodyError, match="no twin of 'hovercraft'"):
         Planar().build(stage([replace(KHEPERA4, name="hovercraft")], [[0, 0]]))
 
 
