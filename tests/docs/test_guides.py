@@ -19,6 +19,7 @@ GUIDES = (
     *("first-hour", "from-a-paper", "mixed-reality", "shadow-twin", "teaching"),
     *("two-crazyflies", "vicon", "three-machines", "lab-certificates"),
 )
+LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching")  # 10 to 30 s each
 STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
@@ -74,7 +75,7 @@ def call(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     "guide",
-    [pytest.param(guide, marks=pytest.mark.nightly) if guide == "first-hour" else guide for guide in GUIDES],  # 30 s
+    [pytest.param(guide, marks=pytest.mark.nightly) if guide in LONG else guide for guide in GUIDES],
 )
 def test_a_guide_can_be_followed(
     guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

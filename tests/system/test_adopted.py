@@ -87,7 +87,6 @@ def test_who_joins_in_a_lab_needs_its_own_files_alone(tmp_path: Path) -> None:
     assert not trace.lost.any()
 
 
-@pytest.mark.mechanism("adoption: way out")
 def test_who_joined_lands_when_the_conductor_is_dead(router: RouterProcess, tmp_path: Path) -> None:
     joined = RobotProcess(router.endpoint, "join", "KH02", "--once")
     flight = Flight(tmp_path / "run", experiment(tmp_path, router.endpoint), "--case", "event")

@@ -220,7 +220,6 @@ def test_who_was_started_by_hand_leaves_and_is_let_in_again(router: RouterProces
                 robot.end()
 
 
-@pytest.mark.mechanism("hot change: spare")
 def test_a_spare_takes_over_by_itself_when_a_robot_is_lost(lab: Lab) -> None:
     lab.fly("on_loss=replace")
     os.kill(lab.watcher.status["CF01"].pid, signal.SIGKILL)

@@ -25,7 +25,6 @@ pytestmark = pytest.mark.system
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
 
 
-@pytest.mark.mechanism("way out: frozen router")
 def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
     watcher = Watcher(router.endpoint)
     robot = RobotProcess(router.endpoint, "triangle", "KH01")

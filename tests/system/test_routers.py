@@ -138,6 +138,8 @@ def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: 
         flight.until_said(r"router conductor: no router answers for \d+\.\d s")
         until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
     flight.until_said(r"router conductor: a router answers again, after \d+\.\d s")
+    for name in ("CF01", "KH01", "KH02"):
+        flight.until_said(rf"hazard {name}: over: no connection to a router")
     flight.signal(signal.SIGINT)
     assert flight.finish()[0] == 130, flight.logs()
     assert_held_in_time(flight, "periodic", stopped)

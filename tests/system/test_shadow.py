@@ -15,7 +15,6 @@ from tests.system.lab import Flight
 pytestmark = pytest.mark.system
 
 
-@pytest.mark.mechanism("shadow twins beside protocol twins")
 def test_a_twin_beside_a_crazyflie_and_one_beside_a_khepera(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(

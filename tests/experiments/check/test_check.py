@@ -114,6 +114,7 @@ def robots_on_wheels(gain: float) -> Experiment:
     )
 
 
+@pytest.mark.nightly
 def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in_a_run():
     weak = robots_on_wheels(0.05)
     claims = {each.code: each for each in check(of(weak))}
@@ -438,6 +439,7 @@ def test_a_plan_for_ever_is_not_cut_off():
     assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}
 
 
+@pytest.mark.nightly
 def test_a_long_run_is_predicted_in_part():
     made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
     assert 200.0 < figures(made).predicted_s < 400.0

@@ -69,6 +69,7 @@ def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.nightly
 def test_the_potential_keeps_pairs_apart_as_well():
     whole = Outcome.joined([met(kinds, POTENTIAL, 10) for kinds in SOME])
     assert whole.collided.sum() == 0
@@ -92,6 +93,7 @@ def test_two_that_meet_exactly_head_on_pass_each_other(kinds):
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.nightly
 def test_one_that_does_not_avoid_is_avoided():
     whole = Outcome.joined([met(kinds, BARRIER, 10, stubborn=1) for kinds in SOME])
     assert whole.collided.sum() == 0
