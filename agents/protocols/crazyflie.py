@@ -16,6 +16,7 @@ from agents.protocols.crazyradio import software
 
 Positive = Annotated[float, Meta(gt=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
+StatusRate = Annotated[float, Meta(ge=2, le=100)]  # an older status than 1 s is not believed
 Wait = Annotated[float, Meta(gt=0, le=60)]
 # [1/s] up and down, that one Crazyradio carries without queues, unless more is measured: half of the 500 exchanges per
 # second of cflib's maintainers (issue 258), with which a queue on board grows to seconds
@@ -64,7 +65,7 @@ class CrazyflieSettings(Part, frozen=True):
 
     stream_hz: Rate = 10.0  # largest rate of setpoints
     log_hz: Rate = 20.0  # rate of the pose; a log period is a multiple of 10 ms
-    status_hz: Rate = 5.0  # rate of battery and supervisor
+    status_hz: StatusRate = 5.0  # rate of battery and supervisor
     multiranger: bool = False  # has a Multi-ranger deck
     ranges_hz: Rate = 10.0  # rate of its ranges
     # its positioning system; None: set up on board already
@@ -175,7 +176,7 @@ def fitting_rates(each: CrazyflieSettings, share: float) -> str:
     period = ceil(100.0 / (share * each.log_hz))
     lowered = {
         "log_hz": floor(100.0 / period),
-        "status_hz": max(1, floor(share * each.status_hz)),
+        "status_hz": max(2, floor(share * each.status_hz)),
         "stream_hz": max(1, floor(share * each.stream_hz)),
     }
     text = ", ".join(f"{name} = {hz:g}" for name, hz in lowered.items())
