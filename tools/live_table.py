@@ -30,7 +30,7 @@ BAR: Final = 20
 
 
 class Rank(IntEnum):
-    """What a robot needs, the most urgent first."""
+    """Needs of a robot, the most urgent first."""
 
     GONE = 0  # lost, dead, or stopped by an emergency stop
     SILENT = 1
@@ -73,7 +73,7 @@ class _Counters:
 
 
 class Trends:
-    """What statuses say by their differences: share of a core, and counters that grow."""
+    """Differences of statuses: share of a core, and counters that grow."""
 
     def __init__(self) -> None:
         self._known: dict[str, _Counters] = {}

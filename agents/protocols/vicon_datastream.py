@@ -174,7 +174,7 @@ def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def unpack_kinds(payload: bytes) -> set[int]:
-    """What `pack_kinds` packed.
+    """Kinds that `pack_kinds` packed.
 
     Raises:
         Malformed: If it is cut off; likewise the functions below.

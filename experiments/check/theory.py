@@ -255,7 +255,7 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
 
 
 def strength(analysis: Analysis) -> str:
-    """What makes the law ask for more or less, in words: `GAIN`, or its own parameters if it goes by these alone."""
+    """Parameters that make the law ask for more or less: `GAIN`, or its own if it goes by these alone."""
     law, links = analysis.assignment.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law.offset(place, place[links.sender], links)

@@ -128,7 +128,7 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
 
 
 def differences(repeated: Path, former: Path) -> list[str]:
-    """What differs between the results of two folders of one run in virtual time, to the last bit; empty if nothing."""
+    """Differences between the results of two folders of one run in virtual time, to the last bit; empty if nothing."""
     found = []
     mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
     if mine != theirs:

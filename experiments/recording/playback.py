@@ -60,7 +60,7 @@ class AboutRun:
 
     @classmethod
     def of(cls, records: Records) -> AboutRun:
-        """What `records`, whose messages were read, say.
+        """Content of `records`, whose messages were read.
 
         Raises:
             RecordingError: If there is nothing of the kind in it.

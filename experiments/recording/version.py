@@ -62,7 +62,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
         return code, ", ".join([*used, *added]), ", ".join([self.host, *filter(None, machine), *load, *clock])
 
     def differences(self, other: Provenance) -> list[str]:
-        """What differs in code and versions, in words; machines differ without being named.
+        """Differences of code and versions, in words; machines differ without being named.
 
         A library that one of them did without cannot have mattered; a distribution with plug-ins can.
         """

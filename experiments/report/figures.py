@@ -329,7 +329,7 @@ def _marks(trace: Trace, columns: int) -> list[tuple[Array, Array]]:
 
 
 def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
-    """What to say of a case whose marks all touch; empty if there is anything to see."""
+    """Caption of a case whose marks all touch; empty if there is anything to see."""
     span = max(float(trace.time[-1] - trace.time[0]), SHORTEST_S)
     if not marks or any((end - begin).sum() < SOLID * span for begin, end in marks):
         return ""

@@ -153,7 +153,7 @@ def write_bands(path: Path, bands: Mapping[str, Band]) -> None:
 
 
 def read_bands(path: Path) -> dict[str, Band]:
-    """What `write_bands` has written; empty if there is nothing of that kind."""
+    """Bands that `write_bands` has written; empty if there is nothing of that kind."""
     found: dict[str, list[list[float]]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:

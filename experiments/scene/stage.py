@@ -139,7 +139,7 @@ def _there(plug_in: Callable[[], T]) -> T | None:
 
 @dataclass(frozen=True)
 class Stage:
-    """What stays for a whole case: N robots, E links, M obstacles."""
+    """Parts of a scene that stay for a whole case: N robots, E links, M obstacles."""
 
     title: str
     names: tuple[str, ...]
@@ -200,7 +200,7 @@ class Stage:
 
     @cached_property
     def size(self) -> Array:
-        """What a picture of it shows (3,) [m]: the arena, up to the highest robot or obstacle."""
+        """Size of what a picture shows (3,) [m]: the arena, up to the highest robot or obstacle."""
         robots = () if self.experiment is None else self.experiment.robots.values()
         high = max([NAME_M, *(robot.hover or 0.0 for robot in robots), *self.tops.tolist()]) + NAME_M
         return np.array([*(self.scene.high - self.scene.low)[:2], high])

@@ -1,4 +1,4 @@
-"""What an observer learns of a run from the network alone: the experiment, poses, statuses, transmissions, events."""
+"""Knowledge of an observer about a run, from the network alone: experiment, poses, statuses, transmissions, events."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EVENTS: Final = 200  # kept
 
 @dataclass
 class RobotReport:
-    """What is known of one robot."""
+    """State of one robot, as far as it is known."""
 
     state: messages.State | None = None
     status: messages.Status | None = None

@@ -183,7 +183,7 @@ HEADS: Final = ("error", "tx/s", "battery", "missed", "delay")
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    """What is known of a robot, below `HEADS`."""
+    """Row of a robot in the table, below `HEADS`."""
     error = row.error
     return (
         "" if error is None else f"<span style='color:{css(_graded(error))}'>{100 * error:.1f} cm</span>",

@@ -83,7 +83,7 @@ class RobotChecks(msgspec.Struct, frozen=True):
 
 @dataclass
 class Observed:
-    """What a robot said of itself while it stood."""
+    """Reports of a robot about itself while it stood."""
 
     robot: Robot
     status: messages.Status | None = None  # the last one
@@ -109,7 +109,7 @@ class Observed:
 
 @dataclass
 class Tried:
-    """What came of a hop, a drive or a stop."""
+    """Result of a hop, a drive or a stop."""
 
     failure: str = ""  # why it could not be tried, or what went wrong on the way
     stopped_s: float = math.nan  # from the order to motors off
@@ -347,12 +347,12 @@ def _speeds(known: Sequence[messages.State]) -> tuple[float, float] | None:
 
 
 def hop_of(robot: Robot) -> Literal["hop", "drive"]:
-    """What a robot does where a drone hops."""
+    """Counterpart of a drone's hop for this robot."""
     return "drive" if robot.hover is None else "hop"
 
 
 def _drive_remedy(way: float) -> str:
-    """What to do about a drive of `way` [m]; nothing if that is right."""
+    """Remedy for a drive of `way` [m]; nothing if that is right."""
     if way < DRIVE_OFF_M:
         return "told to drive and does not: motors on, wheels free, server and message type right?"
     wrong = abs(way - DRIVE_M) > DRIVE_OFF_M
@@ -360,7 +360,7 @@ def _drive_remedy(way: float) -> str:
 
 
 def _hop_remedy(above: float, side: float) -> str:
-    """What to do about a hop `above` its height [m] and `side` [m] to the side; nothing if that is right."""
+    """Remedy for a hop `above` its height [m] and `side` [m] to the side; nothing if that is right."""
     if abs(above) > HOP_OFF_M:
         return "does not keep its height: propellers, battery, trim, height of its positioning system"
     drifts = side > HOP_DRIFT_M

@@ -1,4 +1,4 @@
-"""What viewers draw without settings: transforms and markers, as ROS 2 messages of standard types.
+"""Topics that viewers draw without settings: transforms and markers, as ROS 2 messages of standard types.
 
 Types and constants are those of tf2_msgs and visualization_msgs of ROS 2 Humble, in their public definitions.
 """

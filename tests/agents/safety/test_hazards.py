@@ -12,7 +12,7 @@ from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
 from agents.safety.detection import tilt_angle, tilted
 from agents.safety.hazards import RULES, Cause, Hazards, Observation, Outcome, rules
 from agents.safety.landing import PATIENCE_S
-from agents.safety.situation import LATE_SHARE, SILENT_S, ProcessHealth
+from agents.safety.situation import LATE_SHARE, ProcessHealth
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair, triangle
 from tests.agents.swarm import Swarm
@@ -215,7 +215,7 @@ def test_outcomes_only_become_harder_while_a_cause_lasts(story, lost):
 
 
 def happened(swarm):
-    """What was said of hazards, by robot."""
+    """Texts of hazards, by robot."""
     return {
         name: [each.text for each in group.agent.hazards.incidents if each.row == row]
         for name, (group, row) in swarm.where.items()
@@ -577,62 +577,3 @@ def test_whatever_happens_nobody_comes_up_again(story, lost, early):
     swarm.run(3.0)
     assert agent.lifecycle.phase[0] in (LANDING, DONE) or agent.lifecycle.phase[0] <= READY
     assert not group.actions.setpoint[1].any()
-
-
-# ---------------------------------------------------------------------------------------------------- a standstill
-
-
-def held(swarm, seconds):
-    """Ticks of so long on which A is held."""
-    count = 0
-    for _ in range(round(seconds / swarm.dt)):
-        swarm.step()
-        count += bool(swarm.agent("A").hazards.held[0])
-    return count
-
-
-def woken(slept=0.6, **parts):
-    """A and B run in processes of their own; that of A has just stood still."""
-    swarm = Swarm(pair(**parts), [["A"], ["B"]]).running()
-    swarm.run(3.0)
-    swarm.agent("A").health.mark_resumed(swarm.t, slept)
-    return swarm
-
-
-def test_a_process_that_stood_still_holds_until_it_has_heard_its_neighbours_again():
-    swarm = woken()
-    assert 1 <= held(swarm, 3.0) <= 4  # B speaks 50 times a second
-    told = [text.split(", after")[0] for text in happened(swarm)["A"]]
-    assert told == [
-        "hold: its process stood still: for 0.6 s; it waits for its neighbours",
-        "over: its process stood still",
-    ]
-
-
-@pytest.mark.parametrize("slept", [0.6, 1.5, 2.2])
-def test_who_is_silent_after_a_standstill_has_nothing_new_to_say(slept):
-    swarm = woken(slept, trigger={"kind": "send-on-delta", "threshold": 1.0})
-    assert held(swarm, 3.0) == pytest.approx(SILENT_S / swarm.dt, abs=1)
-
-
-def test_who_is_gone_is_not_waited_for_after_a_standstill():
-    swarm = woken(trigger={"kind": "send-on-delta", "threshold": 1.0}, safety=Safety(lost_neighbour="drop"))
-    swarm.agent("A").neighbours.mark_lost(np.array([0]), swarm.t)
-    assert held(swarm, 0.5) == 0
-
-
-def test_after_a_standstill_neighbours_are_waited_for_from_when_the_router_is_back():
-    swarm = woken(trigger={"kind": "send-on-delta", "threshold": 1.0})
-    outside = swarm.agent("A").health
-    outside.offline_since = swarm.t
-    assert held(swarm, 3.0) == round(3.0 / swarm.dt)
-    outside.offline_since = np.inf
-    assert held(swarm, 3.0) == pytest.approx(SILENT_S / swarm.dt, abs=1)
-    outside.offline_since = swarm.t  # much later: that standstill is over
-    assert held(swarm, 0.5) == 0
-
-
-def test_who_hears_nobody_does_not_hold_after_a_standstill():
-    swarm = Swarm(pair(formation=Formation()), [["A"], ["B"]]).running()
-    swarm.agent("A").health.mark_resumed(swarm.t, 0.6)
-    assert held(swarm, 0.5) == 0
