@@ -104,7 +104,7 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
 
 
 def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
-    """One case from above: in one style, robots named, or with a colour for each robot."""
+    """Paths of a case from above: in one style, robots named, or with a colour for each robot."""
     place, last, net = trace.true_position, last_known(trace), trace.plan.links
     ink = "#8a8a8a" if style is None else style["color"]
     for i, j in edges(net.receiver, net.sender):
@@ -294,7 +294,7 @@ def film(traces: Sequence[Trace]) -> tuple[Figure, Callable[[float], None]]:
 
 
 def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
-    """One case, in the style that it has among several, or its robots in theirs; those of the first case are named."""
+    """Paths of a case in space: in its style among several, or in those of its robots; the first case names them."""
     colour = None if case is None else case["color"]
     place = trace.true_position
     known = np.asarray(np.isfinite(place).all(axis=2))

@@ -76,7 +76,7 @@ def _obstacles(stage: Stage, since: float) -> list[Marker]:
 
 
 def _links(stage: Stage, tracker: LinkTracker, since: float, position: np.ndarray) -> list[Marker]:
-    """One list of lines; those whose ends are not known lie out of sight, so that none of before stays."""
+    """Marker of a list of lines; those whose ends are not known lie out of sight, so that none of before stays."""
     net = stage.links
     if not len(net):
         return []

@@ -106,7 +106,7 @@ finally:
 
 
 def loaded(*words, cwd=ROOT, **environment):
-    """What a command prints, and the modules that it has imported when it ends."""
+    """Output of a command, and the modules that it has imported when it ends."""
     done = subprocess.run(
         [sys.executable, "-c", LOADED, *words],
         cwd=cwd,

@@ -312,7 +312,7 @@ def explain(
 
 
 def _print_entries(entries: Sequence[Entry]) -> None:
-    """One line for each: cut at a terminal, in full for a file or a pipe."""
+    """Lines of a table, one for each entry: cut at a terminal, in full for a file or a pipe."""
     for entry in entries:
         text = f"{entry.key}  {entry.text}"
         print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))

@@ -462,7 +462,7 @@ def landing(**values):
     ids=["on the floor", "blind", "climbs"],
 )
 def test_a_landing_drone_that_does_no_good_is_cut(values):
-    """It comes down, but says that its motors are on; nobody knows where it is; it does not descend, but moves."""
+    """Landings with motors that stay on, without a position, or that move and do not descend."""
     swarm = landing(**values, **({"position": [0.0, 0.0, 0.5]} if "velocity" in values else {}))
     swarm.run(1.9)
     assert swarm.phase("F") == LANDING

@@ -120,7 +120,7 @@ while True:
 @pytest.mark.parametrize("link", ["udp", "radio"])
 @pytest.mark.system
 def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):
-    """It is suspended until its drone has come down; then its loop commands as before, and the drone stays down."""
+    """Suspension until the drone has come down: then the loop commands as before, and the drone stays down."""
     asked = request("crazyflie", ["crazyflie-twin"], device={"link": link})
     with Served(open_device, asked) as twin:
         child = subprocess.Popen([sys.executable, "-c", FLYING, *twin.addresses])

@@ -1,4 +1,4 @@
-"""What `./zenpark check` says of obstacles, range sensors, worlds, mirrors and shadows."""
+"""Findings of `./zenpark check` about obstacles, range sensors, worlds, mirrors and shadows."""
 
 from __future__ import annotations
 
