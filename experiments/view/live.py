@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import viser
 
 
-FRAME_S: Final = 1.0 / 30.0
+FRAME_S: Final = 1.0 / 25.0
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
 LOOPBACK: Final = "127.0.0.1"
