@@ -10,15 +10,12 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Array, Index, norm
-from agents.formation.rigidity import rigidity
 
 GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))  # [rad] no two multiples of it fall close together
 RIM: Final = math.cos(math.radians(75.0))  # a hemisphere ends here: below, robots would stand above one another
 SLIVER: Final = math.cos(math.radians(120.0))  # a triangle of the rim that is blunter only bridges a bay of it
 LOWEST: Final = 0.4  # [m] of a robot of a hemisphere, clear of the ground effect
 CANDIDATES: Final = 8  # nearest earlier robots that a Henneberg step chooses from
-SPLIT: Final = 40  # among as many first robots links are split: each split is measured, which takes time
-KEPT: Final = 0.9  # share of the stiffness that a split must leave
 
 
 class LayoutError(ValueError):
@@ -112,10 +109,8 @@ def hemisphere(count: int, spacing: float, apart: float) -> Layout:
 def henneberg(count: int, spacing: float, rng: np.random.Generator) -> Layout:
     """`count` robots with 2N − 3 links, none of which could be left out: minimally rigid in the plane.
 
-    Built by Henneberg's steps (Die graphische Statik der starren Systeme, 1911): a new robot hears two that are there,
-    or takes the place of a link between two and hears both and a third. By Laman's theorem each keeps what came
-    before rigid for places in general position; the places are a disc of points about `spacing` [m] apart, disturbed
-    by `rng`, and are checked.
+    Built by Henneberg's first step (Die graphische Statik der starren Systeme, 1911): a new robot is linked to two that
+    are there. The places are a disc of points about `spacing` [m] apart, disturbed by `rng`.
     """
     _at_least(count, 2, "Henneberg construction")
     number = np.arange(count)
@@ -125,9 +120,7 @@ def henneberg(count: int, spacing: float, rng: np.random.Generator) -> Layout:
     links = {(0, 1)}
     for new in range(2, count):
         near = np.argsort(norm(place[:new] - place[new]))[:CANDIDATES]
-        one, other = _firmest(place, new, near)
-        plain = links | {(one, new), (other, new)}
-        links = _split(place, links, plain, near, rng) if 2 < new < SPLIT else plain
+        links |= {(row, new) for row in _firmest(place, new, near)}
     position = np.column_stack([place - place.mean(axis=0), np.zeros(count)])
     return Layout(f"{count} robots, minimally rigid (Henneberg)", position, _each_once(np.array(sorted(links))))
 
@@ -159,32 +152,8 @@ def _firmest(place: Array, new: int, near: Index) -> tuple[int, int]:
     unit = way / length[:, None]
     across = np.abs(unit[:, None, 0] * unit[None, :, 1] - unit[:, None, 1] * unit[None, :, 0])
     best = int(np.argmax(across / (length[:, None] + length[None, :])))
-    one, other = sorted(int(near[k]) for k in divmod(best, len(near)))
-    return one, other
-
-
-def _split(
-    place: Array, links: set[tuple[int, int]], plain: set[tuple[int, int]], near: Index, rng: np.random.Generator
-) -> set[tuple[int, int]]:
-    """The links with the newest point put in for one of them, if that is nearly as stiff; else the `plain` ones."""
-    known = {int(row) for row in near}
-    new = max(max(pair) for pair in plain)
-    inside = sorted(pair for pair in links if known >= set(pair))
-    if not inside:
-        return plain
-    one, other = inside[rng.integers(len(inside))]
-    third = next(int(row) for row in near if row not in (one, other))
-    tried = (links - {(one, other)}) | {(one, new), (other, new), (third, new)}
-    before, after = (_stiffness(place[: new + 1], each) for each in (plain, tried))
-    return tried if after > KEPT * before else plain
-
-
-def _stiffness(place: Array, links: set[tuple[int, int]]) -> float:
-    """Smallest singular value of the rigidity matrix in the plane, rigid motions left out [m]; 0 if flexible."""
-    position = np.column_stack([place, np.zeros(len(place))])
-    free = np.ones_like(position, dtype=bool)
-    free[:, 2] = False
-    return rigidity(position, np.array(sorted(links)), free).smallest
+    one, other = divmod(best, len(near))
+    return int(near[one]), int(near[other])
 
 
 def _nearest(points: Array) -> float:

@@ -1,4 +1,4 @@
-"""Results of a fault laboratory: a table of fault kinds, recovery times as a figure, and a page."""
+"""Results of a fault laboratory: a table of fault kinds, and a page."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ import statistics
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import matplotlib.pyplot as plt
 import msgspec
 
 from experiments.file.problems import DocumentError
 from experiments.recording import playback
 from experiments.recording.playback import NotStarted
 from experiments.recording.reader import RecordingError, recover
-from experiments.report import style
-from experiments.report.page import Finding, Section, Table, date_of, numbered, render
+from experiments.report.page import Finding, Section, Table, date_of, render
 from experiments.report.page import Row as Line
 from tools.reliability.fault_script import FAULT_KINDS, FAULTS, Fault
 
@@ -83,15 +81,8 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
     return wrong
 
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 PAGE: Final = "chaos.html"
 FILE: Final = "chaos.json"
-CAPTION: Final = (
-    "Time from the begin of each fault until all was well again, by kind; the bar is how long the fault itself lasted. "
-    "Crosses: not well in time. Hollow: the victim came down safely instead of coming back."
-)
 BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
 SMALL: Final = 20  # so many rows stand open
 
@@ -119,21 +110,15 @@ def table(result: ChaosResult) -> Table:
         if mine:
             well = [each.begin_s for each in mine if each.recovered]
             lines.append(
-                Line(
-                    (
-                        kind,
-                        str(len(mine)),
-                        str(len(well)),
-                        str(sum(each.ended for each in mine)),
-                        f"{statistics.median(well):.1f} s" if well else "–",
-                        f"{max(well):.1f} s" if well else "–",
-                        str(sum(len(each.violations) for each in mine)),
-                        "",
-                    )
+                (
+                    kind,
+                    *map(str, (len(mine), len(well), sum(each.ended for each in mine))),
+                    *(f"{what(well):.1f} s" if well else "–" for what in (statistics.median, max)),
+                    str(sum(len(each.violations) for each in mine)),
                 )
             )
-    head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations", "")
-    return Table(head, tuple(lines), note="Times count from the begin of the fault.")
+    head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations")
+    return Table(head, tuple(map(Line, lines)), note="Times count from the begin of the fault.")
 
 
 def findings(result: ChaosResult) -> list[Finding]:
@@ -156,10 +141,8 @@ def findings(result: ChaosResult) -> list[Finding]:
 
 
 def write(folder: Path, result: ChaosResult, command: str) -> Path:
-    """Write `chaos.json`, `chaos.html` and the figure into a folder."""
+    """Write `chaos.json` and `chaos.html` into a folder."""
     (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
-    drawn = figure(result)
-    style.save(drawn, folder / "figures", "recovery")
     rows = tuple(Line((line(each),)) for each in result.outcomes)
     return render(
         folder / PAGE,
@@ -169,7 +152,7 @@ def write(folder: Path, result: ChaosResult, command: str) -> Path:
         command=command,
         verdict=findings(result),
         sections=[
-            Section("By kind", tables=(table(result),), pictures=numbered([(drawn, CAPTION)])),
+            Section("By kind", tables=(table(result),)),
             Section(
                 "Every fault",
                 tables=(Table(("What",), rows, words=True),),
@@ -178,26 +161,3 @@ def write(folder: Path, result: ChaosResult, command: str) -> Path:
             Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in FAULT_KINDS.items())),
         ],
     )
-
-
-@style.styled
-def figure(result: ChaosResult) -> Figure:
-    """Recovery times by kind of fault."""
-    kinds = [kind for kind in FAULTS if any(each.fault.kind == kind for each in result.outcomes)]
-    drawn, axes = plt.subplots(figsize=(6.3, 0.7 + 0.28 * max(1, len(kinds))), layout="constrained")
-    for place, kind in enumerate(kinds):
-        mine = [each for each in result.outcomes if each.fault.kind == kind]
-        axes.barh(place, max(each.fault.lasts_s for each in mine), height=0.7, color="#dddddd", zorder=0)
-        for number, each in enumerate(mine):
-            y = place + 0.5 * (number / max(1, len(mine) - 1) - 0.5)
-            face = "none" if each.ended else "#0072b2"
-            if each.recovered:
-                axes.plot(each.begin_s, y, "o", markersize=3, color="#0072b2", markerfacecolor=face)
-            else:
-                axes.plot(each.begin_s, y, "x", markersize=4, color="#d55e00")
-    axes.set_yticks(range(len(kinds)), list(kinds))
-    axes.invert_yaxis()
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("recovery [s]")
-    axes.grid(visible=True, axis="x")
-    return drawn

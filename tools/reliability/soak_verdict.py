@@ -1,4 +1,4 @@
-"""Verdict of a soak: whether anything grows, is lost, slows down or dies; with its figure and its page."""
+"""Verdict of a soak: whether anything grows, is lost, slows down or dies; with its page."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import matplotlib.pyplot as plt
 import msgspec
 
-from experiments.report import style
-from experiments.report.page import Finding, Section, Table, date_of, numbered, render
+from experiments.report.page import Finding, Section, Table, date_of, render
 from experiments.report.page import Row as Line
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PAGE: Final = "soak.html"
 WARM_SHARE: Final = 0.1  # of the run that does not count, but not more than
@@ -27,11 +22,6 @@ GROWTH: Final = 0.02  # of the memory
 JUDGED_S: Final = 300.0  # memory of a shorter run says nothing: allocators are still filling their pools
 SLOWER: Final = 2.0  # times the delay at the beginning
 DELAY_S: Final = 0.005  # delays below are the noise of the machine
-CAPTION: Final = (
-    "Resident memory of each process relative to its own after the warm-up (shaded), and the delay of poses from "
-    "sender to receiver, median and largest of each sample. Robots thin, router, recorder and conductor thick."
-)
-THICK: Final = {"router": "#0072b2", "recorder": "#d55e00", "conductor": "#009e73", "world": "#cc79a7"}
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -212,9 +202,7 @@ def _punctual(soaked: Soaked) -> list[Finding]:
 
 
 def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: str) -> Path:
-    """Write `soak.html` and its figure into a folder."""
-    drawn = figure(soaked)
-    style.save(drawn, folder / "figures", "soak")
+    """Write `soak.html` into a folder."""
     return render(
         folder / PAGE,
         title=f"Soak: {soaked.title}",
@@ -227,10 +215,7 @@ def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: st
         ],
         command=command,
         verdict=findings,
-        sections=[
-            Section("Over time", pictures=numbered([(drawn, CAPTION)])),
-            Section("Processes", tables=(table(soaked),)),
-        ],
+        sections=[Section("Processes", tables=(table(soaked),))],
     )
 
 
@@ -259,32 +244,3 @@ def table(soaked: Soaked) -> Table:
         lines.append(Line(cells))
     head = ("Process", "MB first", "MB last", "Growth", "Threads", "Files", "CPU", "Lost", "Missed", "Delay [ms]")
     return Table(head, tuple(lines), note="CPU is the share of a core after the warm-up; memory is resident.")
-
-
-@style.styled
-def figure(soaked: Soaked) -> Figure:
-    """Memory of each process and delays over time."""
-    drawn, (memory, delay) = plt.subplots(2, 1, figsize=(6.3, 4.0), sharex=True, layout="constrained")
-    both = ends(soaked)
-    for process, rows in soaked.by_process().items():
-        warm = statistics.median(row.rss_mb for row in (both[process].first if process in both else rows))
-        line = {"color": THICK.get(process, "#7a7a7a"), "linewidth": 1.4 if process in THICK else 0.5}
-        minutes = [row.time_s / 60.0 for row in rows]
-        label = process if process in THICK else None
-        memory.plot(minutes, [100.0 * (row.rss_mb / warm - 1.0) for row in rows], label=label, **line)
-    delays: dict[float, list[tuple[float, float]]] = {}
-    for row in soaked.rows:
-        if row.delay_s is not None and row.longest_s is not None:
-            delays.setdefault(row.time_s, []).append((row.delay_s, row.longest_s))
-    at = [moment / 60.0 for moment in delays]
-    delay.plot(at, [1e3 * statistics.median(m for m, _ in each) for each in delays.values()], color="#000000")
-    delay.plot(at, [1e3 * max(m for _, m in each) for each in delays.values()], color="#d55e00", linewidth=0.5)
-    for axes in (memory, delay):
-        axes.axvspan(0.0, soaked.warm_s / 60.0, color="#dddddd", linewidth=0)
-        axes.grid(visible=True)
-    memory.set_ylabel("memory [%]")
-    memory.legend(ncols=4, loc="upper left")
-    delay.set_yscale("log")
-    delay.set_ylabel("delay [ms]")
-    delay.set_xlabel("$t$ [min]")
-    return drawn

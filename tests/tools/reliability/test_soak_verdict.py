@@ -2,7 +2,7 @@
 
 import pytest
 
-from tools.reliability.soak_verdict import Row, Soaked, figure, judge, passed, table
+from tools.reliability.soak_verdict import Row, Soaked, judge, passed, table
 
 ROBOTS = ("TB01", "CF02")
 SPAN = 3600.0
@@ -31,7 +31,6 @@ def test_nothing_is_wrong():
     made = soaked()
     assert passed(judge(made))
     assert [row.cells[0] for row in table(made).rows] == ["CF02", "TB01", "recorder", "router"]
-    figure(made)
 
 
 def test_memory_that_is_taken_before_the_warm_up_does_not_count():
