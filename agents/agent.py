@@ -125,7 +125,6 @@ class Agent:
 
     @property
     def last_transmission(self) -> LastEvent:
-        """Last transmission of each row."""
         return self._transmitter.last_event
 
     def hold(self, row: int) -> str:

@@ -99,7 +99,6 @@ class ExternalBody:
     # ------------------------------------------------------------------ Body
 
     def open(self) -> None:
-        """See `Body.open`."""
         deadline = time.monotonic() + OPEN_S
         try:
             name = f"body of {'+'.join(self._names)}"
@@ -120,7 +119,6 @@ class ExternalBody:
             raise BodyError("\n".join(missing))
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         self._clock_offset = min(self._clock_offset, self._now() - t)  # a late call only makes the difference larger
         self._read_positions()
         self._update_flying()
@@ -142,7 +140,6 @@ class ExternalBody:
         )
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         given = np.isfinite(setpoint).all(axis=1) & ~self._stopped
         values = setpoint.tolist()
         for row in np.flatnonzero(given).tolist():
@@ -187,7 +184,6 @@ class ExternalBody:
         """No effect: this body subscribes to the key `position` itself."""
 
     def close(self) -> None:
-        """See `Body.close`."""
         if self._session is not None:
             until, nothing = self._now() + STANDSTILL_S, np.full((len(self._names), 4), np.nan)
             while some(self._unconfirmed_stops()) and self._now() < until:

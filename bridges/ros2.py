@@ -135,7 +135,6 @@ class Graph:
                 robot.velocity.put(velocity(self._types, state, state.velocity))
 
     def _diagnostics_of_statuses(self) -> list[Message]:
-        """Received statuses as diagnostics."""
         return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
 
     def _forward_goal(self, name: str, robot: _Robot, message: Message) -> None:
@@ -198,7 +197,6 @@ def diagnosis(types: Types, status: messages.Status) -> Message:
 
 
 def diagnostic(types: Types, robot: str, level: int, text: str, values: dict[str, str]) -> Message:
-    """A DiagnosticStatus of a robot."""
     pairs = [types.make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
     return types.make(
         "diagnostic_msgs/msg/DiagnosticStatus",

@@ -16,7 +16,6 @@ from tools.reliability import chaos, soak
 
 
 def _exit(code: object, **_: object) -> None:
-    """A command returns its exit code; None is 0."""
     raise typer.Exit(code if isinstance(code, int) else 0)
 
 

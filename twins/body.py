@@ -71,7 +71,6 @@ class TwinBody:
         """See `Body.open`."""
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
@@ -83,26 +82,21 @@ class TwinBody:
         return self._state
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         if self._latency.present:
             self._command = np.where(np.isnan(setpoint), self._command, setpoint)
         else:
             self.engine.command(setpoint)
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`."""
         self.engine.takeoff(rows, height)
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         self.engine.land(rows)
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         self.engine.stop(rows)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
@@ -198,5 +192,4 @@ class TwinBody:
 
 
 def open_twin(request: BodyRequest) -> TwinBody:
-    """Entry point `twin` of the group `zenpark.bodies`."""
     return TwinBody(request)

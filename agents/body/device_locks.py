@@ -58,7 +58,6 @@ class Claims:
             raise
 
     def release(self) -> None:
-        """Releases all locks."""
         while self._locks:
             path, lock = self._locks.popitem()
             with suppress(OSError):

@@ -38,7 +38,6 @@ class Fleet:
             raise
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         states = [(group, body.read(t)) for group, body in self._parts]
         merged: dict[str, Any] = {}
         for field in fields(BodyState):
@@ -67,31 +66,25 @@ class Fleet:
         return column
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         for group, body in self._parts:
             body.command(setpoint[group])
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`."""
         for body, which in self._split(rows):
             body.takeoff(self._place[rows[which]], height[which])
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         call_all(partial(body.land, self._place[rows[which]]) for body, which in self._split(rows))
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         call_all(partial(body.stop, self._place[rows[which]]) for body, which in self._split(rows))
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`."""
         for group, body in self._parts:
             if row in group:
                 body.locate(int(self._place[row]), t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        """See `Inspectable.inspect`."""
         body = next(body for group, body in self._parts if row in group)
         return inspect(body, int(self._place[row]))
 

@@ -63,7 +63,6 @@ class BodyRequest:
     clock: Clock = field(default_factory=Clock)  # of stamps on the network
 
     def select(self, rows: Index) -> BodyRequest:
-        """The request for some of the rows."""
         per_row = ("names", "kinds", "addresses", "seeds", "disturbance", "external", "device")
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in per_row}
         return replace(self, start=self.start[rows], yaw=self.yaw[rows], **columns)
@@ -90,7 +89,6 @@ class Rays(Columns, frozen=True):
 
     @classmethod
     def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
-        """The scans of all rows; None if no row has one."""
         there = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
         if not there:
             return None
@@ -110,7 +108,6 @@ class Rays(Columns, frozen=True):
         return cls.joined(there) if there else None
 
     def scan_of(self, row: int) -> RangeScan | None:
-        """The scan of one row; None if it has no rays."""
         mine = self.row == row
         if not mine.any():
             return None

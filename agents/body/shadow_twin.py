@@ -49,12 +49,10 @@ class Shadowed:
         self._due = np.full(count, -np.inf)
 
     def open(self) -> None:
-        """See `Body.open`."""
         self._body.open()
         self._try(lambda twin: twin.open())
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         state = self._body.read(t)
         position, yaw = np.full_like(state.position, np.nan), np.full_like(state.yaw, np.nan)
         self._try(lambda twin: self._follow(twin, t, state, position, yaw))
@@ -66,26 +64,22 @@ class Shadowed:
         return replace(state, shadow_position=position, shadow_yaw=yaw, notes=shown)
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         self._body.command(setpoint)
         mine = setpoint[self._rows]
         self._driven |= np.isfinite(mine).all(axis=1) & (mine != 0.0).any(axis=1)
         self._try(lambda twin: twin.command(mine))
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`."""
         self._body.takeoff(rows, height)
         mine, which = self._among(rows)
         self._try(lambda twin: twin.takeoff(mine, height[which]))
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         self._body.land(rows)
         mine, _ = self._among(rows)
         self._try(lambda twin: twin.land(mine))
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         self._body.stop(rows)
         mine, _ = self._among(rows)
         self._try(lambda twin: twin.stop(mine))
@@ -99,7 +93,6 @@ class Shadowed:
         return inspect(self._body, row)
 
     def close(self) -> None:
-        """See `Body.close`."""
         try:
             self._body.close()
         finally:

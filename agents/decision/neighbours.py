@@ -94,21 +94,17 @@ class NeighbourStates:
         self.links = links.select(self.active)
 
     def receive(self, received: PoseTable) -> None:
-        """See `NeighbourPoses.receive`."""
         self.poses.receive(received)
 
     def mark_lost(self, at: Index, t: float) -> None:
-        """See `NeighbourPoses.mark_lost`."""
         self.poses.mark_lost(at, t)
         self.incomplete = True
 
     def mark_alive(self, at: Index) -> None:
-        """See `NeighbourPoses.mark_alive`."""
         self.poses.mark_alive(at)
         self.incomplete = True
 
     def discard_poses(self, at: Index) -> None:
-        """See `NeighbourPoses.discard`."""
         self.poses.discard(at)
         self.incomplete = True
 

@@ -96,7 +96,6 @@ class Links:
         return Links(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in both))  # type: ignore[arg-type]
 
     def _with_all_columns(self) -> Links:
-        """Links with every column."""
         if self.wants is not None:
             return self
         blank = np.full((len(self), 3), np.nan)

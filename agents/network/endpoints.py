@@ -145,7 +145,6 @@ def ends(endpoints: Sequence[str], name: str) -> Ends:
 
 
 def is_mesh(endpoints: Sequence[str]) -> bool:
-    """Whether endpoints are those of a mesh."""
     return any(map(owner, endpoints))
 
 
@@ -161,7 +160,6 @@ def owner(endpoint: str) -> str:
 
 
 def owners(endpoint: str) -> list[str]:
-    """Owners of an endpoint, one by one."""
     return owner(endpoint).split(TOGETHER)
 
 

@@ -17,8 +17,6 @@ class _RealmKey:
 
 
 def _robot_key(word: str) -> Callable[[Keys, str], str]:
-    """A key that each robot has."""
-
     def key(keys: Keys, robot: str) -> str:
         return f"{keys.realm}/{robot}/{word}"
 

@@ -204,7 +204,6 @@ class OwnershipCheck:
         return waited
 
     def end(self) -> None:
-        """Ends the check."""
         self._over.set()
 
     def _ask(self) -> None:

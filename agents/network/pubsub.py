@@ -195,7 +195,6 @@ class CallbackQueue(Generic[T]):
         self.callback = Callback(self._append, indirect=False)
 
     def try_recv(self) -> T | None:
-        """See `Polled`."""
         return self.waiting.popleft() if self.waiting else None
 
     def _append(self, item: T) -> None:
@@ -222,7 +221,6 @@ class ImmediateSubscriber:
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
-        """See `Polled`."""
         return self.waiting.popleft() if self.waiting else None
 
     def close(self) -> None:

@@ -309,7 +309,6 @@ class RouterWatch:
 
 
 def count_links(session: zenoh.Session) -> int:
-    """Number of links of a session."""
     return len(session.info.transports())
 
 

@@ -122,7 +122,6 @@ class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return links.sum_by_receiver(pull, len(position))
 
     def error(self, position: Array, sender_position: Array, links: Links) -> Array:
-        """Error of each link by its own law."""
         offset = position[links.receiver] - sender_position
         error = np.abs(links.distance - norm(offset))
         if links.wants is None:

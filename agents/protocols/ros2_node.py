@@ -99,7 +99,6 @@ class Publisher:
         self._token = _announce(participant, token)
 
     def put(self, message: Message) -> None:
-        """Publishes a message."""
         self.send(self._types.encode(message, self.kind))
 
     def send(self, payload: bytes) -> None:
@@ -147,7 +146,6 @@ class Subscriber:
                 self.malformed += 1
 
     def newest(self) -> Message | None:
-        """The last of them, or None."""
         last = None
         for last in self.received():  # noqa: B007
             pass

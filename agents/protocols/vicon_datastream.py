@@ -74,12 +74,10 @@ class Segment(NamedTuple):
 
 
 def block(kind: int, payload: bytes = b"") -> bytes:
-    """A block of a packet."""
     return _HEAD.pack(kind, len(payload)) + payload
 
 
 def packet(*blocks: bytes) -> bytes:
-    """A packet of blocks."""
     return block(MAGIC, b"".join(blocks))
 
 
@@ -108,7 +106,6 @@ def pack_subject(number: int, name: str) -> bytes:
 
 
 def pack_frame_number(number: int) -> bytes:
-    """The block that numbers a frame."""
     return block(Kind.FRAME_INFO, _WORD.pack(number & 0xFFFFFFFF))
 
 
@@ -201,7 +198,6 @@ def unpack_subject(payload: bytes) -> Subject:
 
 
 def unpack_frame_number(payload: bytes) -> int:
-    """The number of a frame."""
     (number,) = _unpack(_WORD, payload, 0)
     return int(number)
 

@@ -59,7 +59,6 @@ class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     lifeline: Annotated[bool, Meta(description="end when standard input ends or is silent")] = False
 
     def endpoints(self) -> list[str]:
-        """See `secured_endpoints`."""
         return secured_endpoints(self.connect, self.lab)
 
 
@@ -132,7 +131,6 @@ class Output(io.TextIOBase):
         return len(text)
 
     def writable(self) -> bool:
-        """True."""
         return True
 
 

@@ -38,7 +38,6 @@ class Lifeline:
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)
 
     def start(self) -> None:
-        """Starts to watch."""
         self._thread.start()
 
     def join(self, timeout_s: float | None = None) -> None:

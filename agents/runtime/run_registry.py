@@ -84,7 +84,6 @@ def own_entry(
     identity: str = "operator",
     robots: dict[str, str] | None = None,
 ) -> Run:
-    """An entry of this process."""
     pid = os.getpid()
     place = "" if folder is None else str(folder.absolute())
     return Run(

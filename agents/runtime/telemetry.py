@@ -47,7 +47,6 @@ class Counts:
 
     @classmethod
     def nothing(cls, rows: int) -> Counts:
-        """All zero."""
         return cls([0] * rows, *np.zeros((2, rows), dtype=np.intp))
 
     def begin(self) -> None:

@@ -44,7 +44,6 @@ class Watchdog:
         down_s: float = DOWN_S,  # from then until the motors are cut [s]
         end: Callable[[int], object] = os._exit,  # ends the process with an exit code
     ) -> None:
-        """Prepares the watchdog of a body with these rows."""
         self.tripped = ""
         self._body, self._rows, self._alarm, self._end = body, rows, alarm, end
         self._silence_s, self._down_s = silence_s, down_s

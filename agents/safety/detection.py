@@ -262,7 +262,6 @@ class Detector:
         yield Observation(Cause.TOUCHING, self._receivers(inner), detail)
 
     def _lost_neighbours(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
-        """Lost neighbours."""
         links, robots = self._assignment.links, self._assignment.robots
         since = now.neighbours.poses.lost_since
         lost = self._in_law & np.isfinite(since) & (now.t - since > self._limits.link_silence_s)

@@ -284,5 +284,4 @@ class Hazards:
         return texts[max(texts, key=lambda cause: int(self._level[cause, row]))] if texts else ""
 
     def outcome(self, row: int) -> Outcome:
-        """Outcome of the worst hazard of a row."""
         return Outcome(self._level[:, row].max())

@@ -86,7 +86,6 @@ class Preflight:
             yield away > limit, lambda row: text.format(away[row], *start[row], limit)
 
     def _at_rest(self, state: BodyState) -> Iterator[Failing]:
-        """Body at rest on the floor."""
         flies, height, least = self._flies, state.position[:, 2], self._limits.battery_min
         yield flies & (height > FLOOR_M), lambda row: f"it does not stand on the floor, but at z = {height[row]:.2f} m"
         fast = flies & (np.vecdot(state.velocity, state.velocity) > REST_M_S**2)

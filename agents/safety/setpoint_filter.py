@@ -89,7 +89,6 @@ class SetpointFilter:
         where: PoseValidity | None = None,  # validity of the pose, if known already
         avoidance: tuple[Avoidance, OwnState, Nearby] | None = None,  # applied after all limits, with its inputs
     ) -> FilteredSetpoint:
-        """Safe setpoints."""
         where = self.validate_poses(position, yaw, age) if where is None else where
         sane = np.abs(setpoint) < ABSURD
         no_row = self._no_row

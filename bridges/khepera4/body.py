@@ -56,7 +56,6 @@ class KheperaBody:
             raise BodyError("no Khepera answers: " + "; ".join(reasons))
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         now, self._read_at = time.monotonic(), uptime()
         odometry = [link.odometry for link in self._links]
         rows = len(odometry)
@@ -86,7 +85,6 @@ class KheperaBody:
         return state
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         for link, (v, turn, _, _) in zip(self._links, setpoint.tolist(), strict=True):
             if math.isfinite(v + turn):
                 link.drive(v, turn, self._read_at)
@@ -95,26 +93,21 @@ class KheperaBody:
         """See `Body.takeoff`: no effect on a ground robot."""
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         now = time.monotonic()
         for row in rows.tolist() if self._links else ():
             self._links[row].halt(now)
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         self.land(rows)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        """See `agents.body.interface.Inspectable`."""
         server = self._links[row].server if self._links else ""
         return Inspection(firmware=f"server {server}" if server else None)
 
     def close(self) -> None:
-        """See `Body.close`."""
         now = time.monotonic()
         for link in self._links:
             link.halt(now)
@@ -144,5 +137,4 @@ class KheperaBody:
 
 
 def open_khepera4(request: BodyRequest) -> KheperaBody:
-    """Entry points `khepera4` and `kteam` of the group `zenpark.bodies`."""
     return KheperaBody(request)

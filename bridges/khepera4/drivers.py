@@ -127,11 +127,9 @@ class Park:
         self.drive(0.0, 0.0)
 
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
-        """See `Driver`."""
         self._send(protocol.park_drive(v, turn) if v or turn else b"stop", b"stop", until)
 
     def move(self, odometer: Odometer) -> None:
-        """See `Driver`."""
         self._add(self._reports(self._wire.pending()), odometer)  # late answers, after a gap
         before, asked = self._sent, self._asked
         self._asked = self._send(b"p")
@@ -145,7 +143,6 @@ class Park:
             self._add_last(reports[-1], odometer, before, asked)
 
     def ranges(self) -> tuple[Array, Array]:
-        """See `Driver`."""
         self._send(b"get_data")
         try:
             answer = self._receive("get_data")
@@ -158,7 +155,6 @@ class Park:
         return protocol.SOUND_BEARING, protocol.sound_distance(np.array(sound))
 
     def battery(self) -> float:
-        """See `Driver`."""
         return math.nan
 
     def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
@@ -238,7 +234,6 @@ class GoalPark(Park):
         self.drive(0.0, 0.0)
 
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
-        """See `Driver`."""
         if self.server.posed:
             if v < 0.0:  # it drives ahead only: it turns about until the goal is before it
                 self._about = self._about or -math.copysign(1.0, turn)
@@ -327,24 +322,20 @@ class KTeam:
         self.ranged, self.patience_s = chosen.ranges is not False, chosen.silence_s
 
     def begin(self) -> None:
-        """See `Driver`."""
         self.drive(0.0, 0.0)
         self._request("B")
         if self.ranged:
             self._request("U,31")
 
     def drive(self, v: float, turn: float, until: float = NEVER) -> None:
-        """See `Driver`."""
         left, right = protocol.units(v, turn) if uptime() <= until else (0, 0)
         self._request(f"D,{left},{right}")
 
     def move(self, odometer: Odometer) -> None:
-        """See `Driver`."""
         left, right = self._request("R", 2)[:2]
         odometer.wheels(left, right, time.monotonic())
 
     def ranges(self) -> tuple[Array, Array]:
-        """See `Driver`."""
         sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
         distances = (
             protocol.sound_distance(np.array(self._request("G", sound)[:sound])),
@@ -353,7 +344,6 @@ class KTeam:
         return np.concatenate([protocol.SOUND_BEARING, protocol.LIGHT_BEARING]), np.concatenate(distances)
 
     def battery(self) -> float:
-        """See `Driver`."""
         return 0.01 * self._request("V,5", 1)[0]
 
     def _request(self, request: str, count: int = 0) -> list[float]:

@@ -84,7 +84,6 @@ class TelloBody:
             raise BodyError(f"{'; '.join(reasons)} ({remedy})")
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         rows = len(self._names)
         nowhere = np.full((rows, 3), np.nan)
         with self._lock:
@@ -114,7 +113,6 @@ class TelloBody:
         return state
 
     def command(self, setpoint: Array) -> None:
-        """See `Body.command`."""
         with self._lock:
             now = time.monotonic()
             for pilot, (x, y, z, turn) in zip(self._pilots, setpoint.tolist(), strict=True):
@@ -122,29 +120,24 @@ class TelloBody:
                     pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (x, y, z, turn), now
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`."""
         with self._lock:
             for row, to in zip(rows.tolist(), height.tolist(), strict=True):
                 self._pilots[row].take_off(to, time.monotonic())
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         with self._lock:
             now = time.monotonic()
             call_all(partial(self._pilots[row].land, now) for row in rows.tolist())
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         with self._lock:
             now = time.monotonic()
             call_all(partial(self._pilots[row].cut, now) for row in rows.tolist())
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
     def close(self) -> None:
-        """See `Body.close`."""
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
@@ -209,5 +202,4 @@ def _check_free(port: int) -> None:
 
 
 def open_tello(request: BodyRequest) -> TelloBody:
-    """Entry point `tello` of the group `zenpark.bodies`."""
     return TelloBody(request)

@@ -117,7 +117,6 @@ class TurtleBot3:
         return f"{robot.name}: no odometry on '{robot.odometry_key}': {hint}"
 
     def read(self, t: float) -> BodyState:
-        """See `Body.read`."""
         now = self._read_at = self._clock()
         robots = self._robots
         for robot in robots:
@@ -165,21 +164,17 @@ class TurtleBot3:
         """See `Body.takeoff`: no effect on a ground robot."""
 
     def land(self, rows: Index) -> None:
-        """See `Body.land`."""
         now = self._clock()
         if self._sessions:
             call_all(partial(self._robots[row].halt, now) for row in rows.tolist())
 
     def stop(self, rows: Index) -> None:
-        """See `Body.stop`."""
         self.land(rows)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """See `Body.locate`."""
         self._external.update(row, t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        """See `agents.body.interface.Inspectable`."""
         return Inspection(volts=number(self._robots[row].volts))
 
     def close(self) -> None:

@@ -86,7 +86,6 @@ class Robot:
 
     @property
     def odometry_key(self) -> str:
-        """Zenoh key of the odometry."""
         return self._odometry.key
 
     # ------------------------------------------------------------------ reception
@@ -141,7 +140,6 @@ class Robot:
 
     @property
     def standing(self) -> bool:
-        """Whether the robot stands, by odometry."""
         return abs(self.speed[0]) < STANDING[0] and abs(self.speed[1]) < STANDING[1]
 
     @property

@@ -116,7 +116,6 @@ class Reader:
                 return None
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()
 
     def _offered(self, deadline: float) -> set[int]:

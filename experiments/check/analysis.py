@@ -161,7 +161,6 @@ class Analysis:
         return np.flatnonzero(wheels & stands & (length > 0.1 * REACHED) & (length < 2.0 * REACHED))
 
     def link(self, number: int) -> str:
-        """A link in words."""
         links = self.assignment.links
         return f"{self.names[links.sender[number]]} - {self.names[links.receiver[number]]}"
 
@@ -171,7 +170,6 @@ class Analysis:
         return f"{self.names[first]} - {self.names[second]}"
 
     def link_path(self, number: int) -> Path:
-        """Path of a link in the file."""
         wanted = self.assignment.links.receiver[number], self.assignment.links.sender[number]
         ends = tuple(self.names[row] for row in wanted)
         return next(

@@ -122,12 +122,10 @@ def examine(
 
 
 def unreadable(problem: Problem) -> Finding:
-    """A problem of the file as a finding."""
     return Finding("error", "document", problem.message, problem.hint, problem.place)
 
 
 def figures(experiment: Experiment) -> Figures:
-    """Figures of one case."""
     return _figures(_analyses({"": experiment})[""])
 
 

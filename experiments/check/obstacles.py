@@ -157,7 +157,6 @@ def _avoids(analysis: Analysis) -> Mask:
 
 
 def _sensors(robot: Robot) -> tuple[str, ...]:
-    """Its range sensors."""
     return OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
 
 

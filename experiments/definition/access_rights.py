@@ -148,7 +148,6 @@ def _each(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
 
 
 def process_groups(experiment: Experiment) -> list[list[str]]:
-    """Robots by process."""
     groups: dict[str, list[str]] = {}
     for name, robot in experiment.robots.items():
         groups.setdefault(f"process {robot.process}" if robot.process else name, []).append(name)

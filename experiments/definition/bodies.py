@@ -50,7 +50,6 @@ def missing_library(body: str) -> str:
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
-    """Kinds of these robots."""
     return tuple(KINDS[experiment.robots[name].kind] for name in names)
 
 

@@ -82,7 +82,6 @@ class Plan:
 
     @cached_property
     def legs_by_robot(self) -> dict[str, tuple[Leg, ...]]:
-        """The timeline of each robot that has one."""
         found: dict[str, tuple[Leg, ...]] = {}
         for leg in self.experiment.timeline:
             planned = Leg(leg.at_s, registry.build(registry.PLANNERS, leg.plan))

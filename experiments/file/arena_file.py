@@ -46,11 +46,9 @@ class ArenaFile:
 
     @cached_property
     def places(self) -> dict[Keys, Place]:
-        """Places of all keys and values."""
         return places(self.text)
 
     def located(self, fault: Fault) -> Problem:
-        """The problem of a fault, with its place."""
         stands, place = nearest(self.places, fault.path)
         offset = place.key if fault.on_key and stands == fault.path else place.value
         return at_offset(self.label, self.text, offset, fault.message, fault.hint)
@@ -65,7 +63,6 @@ class Misnamed(ValueError):
 
 
 def arena_file_name(document: Mapping[str, Any]) -> str | None:
-    """Name of the arena file of a document, if it names one correctly."""
     arena = document.get("arena")
     name = arena.get("file") if isinstance(arena, dict) else None
     return name if isinstance(name, str) else None

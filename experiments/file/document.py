@@ -87,7 +87,6 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
 
 
 def load(file: str | Path, *overrides: str) -> Document:
-    """As `read`."""
     return read(file, overrides)
 
 

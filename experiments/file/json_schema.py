@@ -55,7 +55,6 @@ def schema() -> dict[str, Any]:
 
 
 def write_schema(path: File) -> None:
-    """Writes the schema to a file."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=2) + b"\n")
 
 

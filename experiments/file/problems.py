@@ -171,7 +171,6 @@ class Fault:
 
 
 def unknown_robot(path: Path, name: str, robots: Iterable[str], *, on_key: bool = False) -> Iterator[Fault]:
-    """The fault of a name that no robot has, if it has none."""
     if name not in (known := list(robots)):
         yield Fault(path, f"no robot is called '{name}'", did_you_mean(name, known), on_key)
 
@@ -223,7 +222,6 @@ def refusal(file: str, message: str, hint: str = "") -> DocumentError:
 
 
 def at_offset(file: str, text: str, offset: int, message: str, hint: str = "") -> Problem:
-    """A problem at an offset into the text."""
     line, column = line_column(text, offset)
     return Problem(file, line, column, message, hint, text.split("\n")[line - 1])
 

@@ -111,7 +111,6 @@ def tables() -> list[Entry]:
 
 
 def _kind(kind: Kind) -> Entry:
-    """Entry of a kind of robot."""
     text = (
         f"A kind of robot that {'flies' if kind.flies else 'drives on wheels'} and takes a {kind.takes} as setpoint: "
         f"radius {kind.radius:g} m, height {kind.height:g} m, {kind.mass:g} kg, at most {kind.speed:.3g} m/s and "

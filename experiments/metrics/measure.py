@@ -289,7 +289,6 @@ def _share(part: float, whole: float) -> float | None:
 
 
 def _nearest(approaches: Iterable[Approach | None]) -> Approach | None:
-    """The closest of all."""
     return min((each for each in approaches if each is not None), key=lambda each: each.gap, default=None)
 
 

@@ -63,7 +63,6 @@ class LinkErrors:
 
     @classmethod
     def of_trace(cls, trace: Trace) -> LinkErrors:
-        """The errors of a whole trace."""
         pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
         own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)

@@ -88,7 +88,6 @@ def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
 
 
 def is_bundle(file: str) -> bool:
-    """Whether a file is a bundle, by its name."""
     return file.lower().endswith(SUFFIX)
 
 

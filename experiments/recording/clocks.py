@@ -111,7 +111,6 @@ class Correction:
         return replace(status, stamp=self(status.robot, status.stamp), started=self(status.robot, status.started))
 
     def offsets(self) -> tuple[ClockOffset, ...]:
-        """The offset of each host."""
         return tuple(
             ClockOffset(
                 host,

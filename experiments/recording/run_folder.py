@@ -192,7 +192,6 @@ def _document(folder: Path) -> Any:  # noqa: ANN401 - whatever stands there
 
 
 def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
-    """Values of a document by their paths."""
     if isinstance(value, dict) and value:
         for key, each in value.items():
             yield from _flat(each, f"{path}.{key}" if path else str(key))

@@ -173,5 +173,4 @@ class Trace:
         return Plan(self.experiment)
 
     def sent_by(self, row: int) -> PoseTable:
-        """Poses that one robot sent."""
         return self.sent.take(self.sent.link == row)

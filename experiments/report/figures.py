@@ -427,7 +427,6 @@ def _bars(
 
 
 def first_seed(traces: Sequence[Trace]) -> list[Trace]:
-    """The first trace of each case."""
     return list({trace.case: trace for trace in reversed(traces)}.values())[::-1]
 
 

@@ -235,7 +235,6 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
 
 
 def architecture_of(case: CaseMetrics) -> str:
-    """The architecture, in words."""
     if case.guidance is None:
         return "every robot"
     guided = case.guidance.guided
@@ -272,7 +271,6 @@ class _Rows(Generic[T]):
         return Table((self.head, *(head for head, _ in self.columns)), tuple(rows), title=case)
 
     def side_by_side(self, cases: Sequence[CaseMetrics], unit: str) -> Table:
-        """One table of all cases, with their columns side by side."""
         grouped = {case: self.groups(runs) for case, runs in by_case(cases).items()}
         names = dict.fromkeys(name for groups in grouped.values() for name in groups)
         rows = [
@@ -467,7 +465,6 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
 
 def shadowed(cases: Sequence[CaseMetrics]) -> list[tuple[CaseMetrics, RobotMetrics, ShadowMetrics]]:
-    """Robots with a shadow twin."""
     return [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
 
 
@@ -475,7 +472,6 @@ def shadowed(cases: Sequence[CaseMetrics]) -> list[tuple[CaseMetrics, RobotMetri
 
 
 def collision_table(cases: Sequence[CaseMetrics]) -> Table:
-    """Contacts, case by case."""
     several = len({case.seed for case in cases}) > 1
     found = [(case, each) for case in cases for each in case.collisions]
     rows = []

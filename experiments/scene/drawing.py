@@ -125,7 +125,6 @@ class SceneDrawing:
         )
 
     def remove(self) -> None:
-        """Removes everything."""
         self._frame.remove()
 
     # ------------------------------------------------------------------ what does not move

@@ -37,7 +37,6 @@ class Mesh:
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """One mesh of several."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = [mesh.faces + np.uint32(start) for mesh, start in zip(meshes, starts, strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces).astype(np.uint32))

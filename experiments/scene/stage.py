@@ -155,7 +155,6 @@ class Stage:
 
     @classmethod
     def of_experiment(cls, experiment: Experiment) -> Stage:
-        """The stage of one case."""
         plan = Plan(experiment)
         avoidance = _there(lambda: plan.avoidance)
         formation = _there(lambda: plan.formation)

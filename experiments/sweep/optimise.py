@@ -221,12 +221,10 @@ class _Search:
     tuning: tuple[int, ...]
 
     def ranges(self, case: str, axes: Sequence[Axis]) -> list[Axis]:
-        """The axes that a case has."""
         lowest = self.cells({axis: axis.at(0.0) for axis in axes}, case)[-1]
         return [axis for axis in axes if axis.path in lowest.parameters]
 
     def cells(self, values: Mapping[Axis, str], case: str) -> list[Cell]:
-        """The reference and a case with these values."""
         return list(combination(self.read, self.file, self.settings, values, (case,)))
 
     def again(self, row: CellRow, axes: Sequence[Axis]) -> list[Cell]:

@@ -103,7 +103,6 @@ def verdict(tuned: TuningResult) -> list[Finding]:
 
 
 def table(rows: Sequence[CellRow]) -> Table:
-    """The cells for people."""
     paths = list(dict.fromkeys(path for row in rows for path in row.parameters))
     head = ("Case", *map(short, paths), *NUMBERS)
     lines = []

@@ -182,7 +182,6 @@ def combination(
 
 
 def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> dict[str, Experiment]:
-    """All cases with these values."""
     try:
         return document.read(file, [*settings, *(f"{axis.path}={value}" for axis, value in values.items())]).cases()
     except DocumentError as error:

@@ -156,5 +156,4 @@ def with_interval(value: Spread) -> str:
 
 
 def words_of(value: object) -> str:
-    """The value of a parameter."""
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -125,7 +125,6 @@ class Observer:
         return changed
 
     def _begin(self, stage: Stage, case: str = "") -> None:
-        """Another case."""
         self.stage, self.case = stage, case
         before, self.robots = self.robots, {}
         for name in stage.names:
@@ -211,7 +210,6 @@ class Observer:
         return heard.status.stamp + time.monotonic() - heard.heard_at
 
     def moment(self) -> Moment:
-        """The case as it is now."""
         now, stage = time.monotonic(), self.stage
         reports = [self.robots[name] for name in stage.names]
         states = [report.state for report in reports]

@@ -149,7 +149,6 @@ class Panel:
             self._bar.value = share
 
     def show_robots(self, rows: Sequence[Row]) -> None:
-        """The table of the robots."""
         _set(self._table, table(rows, self.stage))
 
     def show_links(self, error: Array, delay: Sequence[float | None]) -> None:
@@ -157,7 +156,6 @@ class Panel:
         _set(self._links, link_table(self.stage, error, delay))
 
     def show_plots(self) -> None:
-        """The curves as they are now."""
         if self._error is None or len(self.history.time) < 2:
             return
         self._error.data = self.history.curves(self.history.error)
@@ -174,7 +172,6 @@ def _set(handle: Any, text: str) -> None:  # noqa: ANN401
 
 
 def css(colour: Sequence[int]) -> str:
-    """Colour for a page."""
     red, green, blue = colour
     return f"rgb({red},{green},{blue})"
 

@@ -180,7 +180,6 @@ def _joined(tables: list[PoseTable], begin: float) -> PoseTable:
 
 
 def _goals(tables: list[PoseTable], begin: float) -> PoseTable:
-    """The same for goals."""
     found = _joined(tables, begin)
     return replace(found, extra=np.zeros((0, 1)) if found.extra is None else found.extra - begin)
 

@@ -181,7 +181,6 @@ def _found(folder: Path, days: float) -> Authority:
 
 
 def _opened(folder: Path) -> Authority:
-    """The authority of a lab."""
     file = folder / f"{AUTHORITY}.key"
     try:
         key = serialization.load_pem_private_key(file.read_bytes(), None)

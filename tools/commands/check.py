@@ -239,8 +239,6 @@ def _rows(numbers: Mapping[str, Figures]) -> list[str]:
 
 
 def _worded(of: Figures) -> dict[str, str]:
-    """Figures as they are printed."""
-
     from experiments.check.findings import join_names
 
     def number(value: float | None, form: str, unit: str = "") -> str:

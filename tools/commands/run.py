@@ -337,7 +337,6 @@ def sound(read: Document, *, seeds: int, as_json: bool) -> bool:
 
 
 def _command(origin: RunOrigin, options: RunOptions) -> str:
-    """The command that repeats the run."""
     parts = ["./zenpark", "run", origin.file, *(["--virtual"] if origin.virtual else [])]
     parts += [part for case in origin.cases for part in ("--case", case)]
     parts += [part for change in origin.changes for part in ("--set", f"'{change}'")]

@@ -47,7 +47,6 @@ class RoundResult(msgspec.Struct, frozen=True):
 
 
 def line(outcome: FaultResult) -> str:
-    """An outcome for people."""
     whom = f" {outcome.victim}" if outcome.victim else ""
     how = f"well after {outcome.begin_s:.1f} s" if outcome.recovered else "NOT WELL"
     how += ", came down" if outcome.ended else ""
@@ -98,7 +97,6 @@ class ChaosResult(msgspec.Struct, frozen=True):
 
     @property
     def violations(self) -> int:
-        """Number of violations."""
         return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
 
 
@@ -122,7 +120,6 @@ def table(result: ChaosResult) -> Table:
 
 
 def findings(result: ChaosResult) -> list[Finding]:
-    """The verdict."""
     done, rounds = len(result.outcomes), result.rounds
     wanted = len(result.script)
     found = [Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds")]

@@ -129,7 +129,6 @@ class Fault(msgspec.Struct, frozen=True):
 
     @property
     def properties(self) -> FaultKind:
-        """Its kind."""
         return FAULT_KINDS[self.kind]
 
 

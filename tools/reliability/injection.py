@@ -79,7 +79,6 @@ class Injector:
         return f"{self.spoil(victim, session, keys)} payloads of nonsense" if kind == "corrupt" else ""
 
     def end(self, fault: Fault) -> None:
-        """Lift a fault."""
         if fault.kind == "mocap-clock":
             self._switch("clock-positioning").write(0.0)
         elif fault.lasts_s:

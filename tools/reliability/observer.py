@@ -61,7 +61,6 @@ class Invariants:
         return np.asarray(self.position[self._row[name]]).copy()
 
     def in_the_air(self, name: str) -> bool:
-        """Whether a robot is in the air."""
         row = self._row[name]
         return bool(self.flies[row] and self.position[row, 2] > DOWN_M)
 

@@ -62,7 +62,6 @@ class CabledLauncher(Launcher):
         self._cables, self._switches = cables, switches
 
     def start(self, name: str, module: str, *arguments: str) -> Process:
-        """See `Launcher.start`."""
         own = next((ends for process, ends in self._cables.items() if name.endswith(f"-{process}")), {})
         if module == ROBOT:
             arguments = tuple(own.get(word, word) for word in arguments)
@@ -75,7 +74,6 @@ class EventLines(Lines):
     """Prints each event once, as a line of JSON."""
 
     def __call__(self, progress: Progress) -> None:
-        """Print new events."""
         if events := self._news.new_events(progress):
             sys.stdout.buffer.write(b"".join(messages.encode(event) + b"\n" for event in events))
             sys.stdout.buffer.flush()
@@ -123,7 +121,6 @@ class WatchedRun:
                 self.output.append(line)
 
     def processes(self) -> dict[int, str]:
-        """All processes of the run, with their roles."""
         return {pid: role_of(words) for pid, words in tagged(self.tag)}
 
     def close(self) -> None:

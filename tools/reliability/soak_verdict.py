@@ -60,7 +60,6 @@ class Soaked:
     interrupted: bool = False  # by the user
 
     def by_process(self) -> dict[str, list[Row]]:
-        """The rows of each process."""
         found: dict[str, list[Row]] = {}
         for row in self.rows:
             found.setdefault(row.process, []).append(row)

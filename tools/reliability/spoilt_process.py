@@ -54,7 +54,6 @@ class Switch:
     """A number in a file that processes share; 0 at first."""
 
     def __init__(self, file: Path) -> None:
-        """Make the file if there is none."""
         with file.open("a+b") as opened:
             if not opened.tell():
                 opened.write(bytes(_NUMBER.size))
@@ -67,7 +66,6 @@ class Switch:
         return float(value)
 
     def write(self, value: float) -> None:
-        """Set its value."""
         _NUMBER.pack_into(self._shared, 0, value)
 
 

@@ -71,9 +71,7 @@ class Device(Protocol):
         """True positions (n, 3) [m] and yaws (n,) [rad] of the robots."""
         ...
 
-    def close(self) -> None:
-        """Close the sockets."""
-        ...
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,6 @@ class ParkProgram:
         return 0.5 * protocol.PULSE * (left + right), protocol.PULSE * (right - left) / self.kind.base
 
     def _turn(self) -> None:
-        """One turn of the loop."""
         if self.kind.answer == "increments":  # it has no controller, and reads the encoders for `p` alone
             return
         self._way, turn = self._encoders()
@@ -320,17 +319,14 @@ class KheperaDevice:
         self.addresses = tuple(addresses)
 
     def sockets(self) -> Sequence[socket.socket]:
-        """See `Device.sockets`."""
         return [wire for server in self._servers for wire in server.sockets(silent=self._silent(server, self._t))]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        """See `Device.serve`."""
         for server in self._servers:
             if ready in server.sockets(silent=False):
                 server.serve(ready, t)
 
     def advance(self, t: float) -> None:
-        """See `Device.advance`."""
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
@@ -344,11 +340,9 @@ class KheperaDevice:
                 server.flush(t)
 
     def truth(self) -> tuple[Array, Array]:
-        """See `Device.truth`."""
         return self._model.position.copy(), self._model.yaw.copy()
 
     def close(self) -> None:
-        """See `Device.close`."""
         for server in self._servers:
             server.hang_up()
             server.listener.close()
@@ -401,5 +395,4 @@ def _listen(name: str, address: str) -> socket.socket:
 
 
 def open_device(request: DeviceRequest) -> KheperaDevice:
-    """Entry point `khepera4-twin` of the group `zenpark.devices`."""
     return KheperaDevice(request)

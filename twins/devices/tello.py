@@ -107,7 +107,6 @@ class _Drone:
         return t < self.silent_until or self.faults.silent(t)
 
     def lost(self) -> bool:
-        """Whether this packet is lost."""
         return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
 
     def send(self, text: str, to: tuple[str, int], t: float) -> None:
@@ -165,11 +164,9 @@ class TelloDevice:
         self._drones[row].silent_until = self._t + seconds
 
     def sockets(self) -> Sequence[socket.socket]:
-        """See `Device.sockets`."""
         return [drone.wire for drone in self._drones]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        """See `Device.serve`."""
         for row, drone in enumerate(self._drones):
             if drone.wire is ready:
                 try:
@@ -180,7 +177,6 @@ class TelloDevice:
                     self._receive(row, packet, sender, t)
 
     def advance(self, t: float) -> None:
-        """See `Device.advance`."""
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
@@ -196,11 +192,9 @@ class TelloDevice:
             drone.flush(t)
 
     def truth(self) -> tuple[Array, Array]:
-        """See `Device.truth`."""
         return self._truth.copy(), self._model.yaw.copy()
 
     def close(self) -> None:
-        """See `Device.close`."""
         for drone in self._drones:
             drone.wire.close()
 
@@ -422,7 +416,6 @@ def _require(answer: str, *, met: bool) -> None:
 
 
 def _whole(arguments: list[str], count: int) -> list[int]:
-    """Arguments as whole numbers."""
     try:
         values = [int(argument) for argument in arguments]
     except ValueError:
@@ -471,5 +464,4 @@ def _listen(name: str, address: str) -> socket.socket:
 
 
 def open_device(request: DeviceRequest) -> TelloDevice:
-    """Entry point `tello-twin` of the group `zenpark.devices`."""
     return TelloDevice(request)

@@ -129,7 +129,6 @@ class TurtleBot3Twin:
         """Never called."""
 
     def advance(self, t: float) -> None:
-        """See `Device.advance`."""
         steps = round((t - self._t) / self._dt)
         if steps * self._dt > CATCH_UP_S:
             steps = 1
@@ -157,7 +156,6 @@ class TurtleBot3Twin:
                 publisher.send(payload)
 
     def truth(self) -> tuple[Array, Array]:
-        """See `Device.truth`."""
         return self._model.position.copy(), self._model.yaw.copy()
 
     def close(self) -> None:

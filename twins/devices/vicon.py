@@ -115,11 +115,9 @@ class ViconTwin:
         self._faults = faults
 
     def sockets(self) -> Sequence[socket.socket]:
-        """See `twins.devices.device.Device.sockets`."""
         return [self._listener, *self._clients]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        """See `twins.devices.device.Device.serve`."""
         if ready is self._listener:
             self._accept()
         elif ready in self._clients:
@@ -138,7 +136,6 @@ class ViconTwin:
             self._flush(connection, client)
 
     def close(self) -> None:
-        """See `twins.devices.device.Device.close`."""
         for connection in (self._listener, *self._clients):
             connection.close()
         self._clients.clear()

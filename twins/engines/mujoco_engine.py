@@ -45,7 +45,6 @@ class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     motor_lag_s: Annotated[float, Meta(ge=0.01, le=0.1, description="time constant of a motor's thrust [s]")] = 0.03
 
     def build(self, stage: Stage) -> RigidBodyEngine:
-        """See `EngineFactory.build`."""
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
@@ -67,12 +66,10 @@ class RigidBodyEngine(PointMassEngine):
         self._update_attitude()
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """See `Engine.place`."""
         super().place(rows, position, yaw, flying)
         self._update_attitude()
 
     def advance(self, t: float, wobble: Array) -> None:
-        """See `Engine.advance`."""
         super().advance(t, wobble)
         self._update_attitude()
 
@@ -156,7 +153,6 @@ class Drones(OnboardFlight):
         super().takeoff(rows, height)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """See `Engine.place`."""
         self._orders.place(rows, position, yaw, flying)
         self._firmware.reset(rows)
         aloft = rows[flying]
@@ -234,7 +230,6 @@ class Drones(OnboardFlight):
             self.velocity[rests] = 0.0
 
     def _tilt_cosine(self, rows: Index | slice) -> Array:
-        """Cosine of the tilt."""
         turn = self._state[rows, TURN]
         return np.asarray(1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2))
 

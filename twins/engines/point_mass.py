@@ -31,7 +31,6 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
-        """See `EngineFactory.build`."""
         return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
 
 
@@ -71,29 +70,24 @@ class Models:
         self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
 
     def command(self, setpoint: Array) -> None:
-        """See `Engine.command`."""
         if len(self.in_air):
             self.quadrotor.command(setpoint[self.air])
         if len(self.on_floor):
             self.differential.command(setpoint[self.floor, :2])
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Engine.takeoff`."""
         flies = np.isin(rows, self.in_air)
         self.quadrotor.takeoff(np.searchsorted(self.in_air, rows[flies]), height[flies])
 
     def land(self, rows: Index) -> None:
-        """See `Engine.land`."""
         self.quadrotor.land(self._indices_in(self.in_air, rows))
         self.differential.halt(self._indices_in(self.on_floor, rows))
 
     def stop(self, rows: Index) -> None:
-        """See `Engine.stop`."""
         self.quadrotor.stop(self._indices_in(self.in_air, rows))
         self.differential.halt(self._indices_in(self.on_floor, rows))
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """See `Engine.place`."""
         for part, model in ((self.in_air, self.quadrotor), (self.on_floor, self.differential)):
             which = np.isin(rows, part)
             at = np.searchsorted(part, rows[which])
@@ -133,7 +127,6 @@ class PointMassEngine(Models):
             self.position[self._mirrored] = np.nan
 
     def advance(self, t: float, wobble: Array) -> None:
-        """See `Engine.advance`."""
         if len(self.on_floor):
             drive = self.differential
             drive.advance()
@@ -160,12 +153,10 @@ class PointMassEngine(Models):
         self.flying[air] = flight.flying
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """See `Engine.place`."""
         super().place(rows, position, yaw, flying)
         self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """See `Engine.mirror`."""
         at = np.searchsorted(self._mirrored, rows)
         self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 

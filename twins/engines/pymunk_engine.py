@@ -56,7 +56,6 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contacts: ClassVar[bool] = True
 
     def build(self, stage: Stage) -> PlanarEngine:
-        """See `EngineFactory.build`."""
         return PlanarEngine(stage, self)
 
 
@@ -145,7 +144,6 @@ class PlanarEngine(Models):
         self._stands = np.ones(len(feet), dtype=bool)
 
     def advance(self, t: float, wobble: Array) -> None:
-        """See `Engine.advance`."""
         state, step, dt = self._state, self._step, self._dt
         if len(self.on_floor):
             drive, wheels = self.differential, self._wheels
@@ -192,7 +190,6 @@ class PlanarEngine(Models):
             self.obstacles[:, self._movable] = state[self._things, POSE] + step * state[self._things, RATE]
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """See `Engine.place`."""
         super().place(rows, position, yaw, flying)
         self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
         slots = self._slots[rows]
@@ -203,12 +200,10 @@ class PlanarEngine(Models):
             copy.contacts.reset_rows(rows.tolist())
 
     def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """See `Engine.mirror`."""
         at = np.searchsorted(self._mirrored, rows)
         self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 
     def touches(self) -> list[Touch]:
-        """See `Engine.touches`."""
         found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))
         self._found.clear()
         return found

@@ -119,7 +119,6 @@ class OnboardFlight:
         self.flying = self._orders.flying  # (n,) motors on
 
     def command(self, setpoint: Array) -> None:
-        """See `FlightOrders.command`."""
         self._orders.command(setpoint)
 
     def takeoff(self, rows: Index, height: Array) -> None:

@@ -176,7 +176,6 @@ def _body(robot: Robot) -> tuple[str, str]:
 
 
 def _tools(park: Park, notes: list[str]) -> None:
-    """Notes on their tools, for which zenpark has its own."""
     if park.tool and park.mode != "physical":
         notes.append(
             f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena"

@@ -113,7 +113,6 @@ class Park:
 
     @property
     def tasks(self) -> list[tuple[Robot, Task]]:
-        """Robots that have a task."""
         return [(robot, robot.task) for robot in self.robots if robot.task is not None]
 
 
@@ -210,7 +209,6 @@ class Entry:
         return Entry(self.file, path, self.value[key] if self.has(key) else {})
 
     def tables(self) -> list[Entry]:
-        """Its values that are tables."""
         return [self.get(key) for key, value in self.typed(dict[str, Any]).items() if isinstance(value, dict)]
 
     def refused(self, message: str, hint: str = "") -> DocumentError:

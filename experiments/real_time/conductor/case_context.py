@@ -30,7 +30,6 @@ class CaseContext:
 
     @property
     def file(self) -> Path:
-        """The case as a file, for its processes."""
         return self.folder / f"{self.case}.json"
 
     @property
@@ -43,7 +42,6 @@ class CaseContext:
         return bool(self.emergency) or self.interrupted()
 
     def process(self, role: str) -> str:
-        """The name of a process of this case."""
         return f"{self.case}-{role}"
 
     def start(self, role: str, module: str, *arguments: str) -> Process:

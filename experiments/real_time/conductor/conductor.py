@@ -263,7 +263,6 @@ class Conductor:
                 self._view.report("late", name, f"began {tardy:.2f} s after the common start")
 
     def _land(self) -> None:
-        """Land all robots."""
         self._view.refuse_joining()
         self._changes.close()
         self._progress.phase = "stopped" if self._context.emergency else "landing"

@@ -195,7 +195,6 @@ class HotChanges:
     # ------------------------------------------------------------------ what is done
 
     def _steps(self, order: messages.RunOrder, names: tuple[str, ...]) -> Steps:
-        """The change that an order asks for."""
         match order.order:
             case "remove":
                 return self._remove(names)

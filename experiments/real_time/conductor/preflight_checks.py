@@ -77,7 +77,6 @@ class RobotChecks(msgspec.Struct, frozen=True):
 
     @property
     def red(self) -> bool:
-        """Whether one of them is bad."""
         return any(check.verdict == "bad" for check in self.checks)
 
 

@@ -66,7 +66,6 @@ class RobotView:
         return self.status.phase if self.status is not None else "starting"
 
     def reached(self, phase: str) -> bool:
-        """Whether it is in this phase or beyond."""
         return self.status is not None and ORDER.index(self.status.phase) >= ORDER.index(phase)
 
     def forget_process(self) -> None:

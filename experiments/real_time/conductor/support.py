@@ -210,7 +210,6 @@ class Router:
 
 
 def start_router(launcher: Launcher, endpoints: Sequence[str], rights: Path | None = None) -> None:
-    """Start one router, which listens at all of these."""
     Router(ROUTER, endpoints).start(launcher, rights)
 
 

@@ -185,7 +185,6 @@ class Station:
 
     @property
     def same_version(self) -> bool:
-        """Whether its zenpark is this one."""
         return self.hello.zenpark == version.digest()
 
     def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
@@ -241,7 +240,6 @@ class Station:
         return self.host.lab.removeprefix("~/")
 
     def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
-        """Start the process of some robots there."""
         while len(self._under_way()) >= HANDSHAKES:
             time.sleep(POLL_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
@@ -317,7 +315,6 @@ class Hosts:
         return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
 
     def station_of(self, robot: str) -> Station | None:
-        """Host of a robot; None: this machine."""
         return self._robots.get(robot)
 
     def clocks(self) -> tuple[list[HostClock], list[str]]:

@@ -79,7 +79,6 @@ class Process:
 
 
 def is_router(process: str) -> bool:
-    """Whether a process of this name is a router."""
     return process.removeprefix(ROUTER).isdecimal() if process != ROUTER else True
 
 
@@ -161,7 +160,6 @@ class Launcher:
                 self._write(process)
 
     def get(self, name: str) -> Process:
-        """The process of that name."""
         return self._processes[name]
 
     def running(self, name: str) -> bool:

@@ -73,7 +73,6 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def answer(question: Question, clock: float) -> Answer:
-    """Answer one question."""
     code = version.digest()
     match question.ask:
         case "clock":

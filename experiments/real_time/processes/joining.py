@@ -145,7 +145,6 @@ class ConductorWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """Stops watching."""
         self._over.set()
         self._thread.join()
 

@@ -49,7 +49,6 @@ class LossyLink:
 
     @property
     def address(self) -> str:
-        """Address for cflib."""
         return f"udp://{HOST}:{self.socket.getsockname()[1]}"
 
     def lost(self) -> bool:
@@ -130,11 +129,9 @@ class CrazyflieTwin:
         return wires
 
     def sockets(self) -> Sequence[socket.socket]:
-        """See `Device.sockets`."""
         return list(self._row) if self._air is None else [self._air.socket]
 
     def serve(self, ready: socket.socket, t: float) -> None:
-        """See `Device.serve`."""
         if self._air is not None:
             self._air.serve(t, self._deliver)
             return
@@ -155,7 +152,6 @@ class CrazyflieTwin:
             return  # not a packet of this protocol
 
     def advance(self, t: float) -> None:
-        """See `Device.advance`."""
         locked = self.flock.advance(t)
         for line, drone in zip(self.lines, self.drones, strict=True):
             line.t = t
@@ -167,11 +163,9 @@ class CrazyflieTwin:
             line.send_due()
 
     def truth(self) -> tuple[Array, Array]:
-        """See `Device.truth`."""
         return self.flock.place.copy(), self.flock.quadrotor.yaw.copy()
 
     def close(self) -> None:
-        """See `Device.close`."""
         for used in self.sockets():
             used.close()
 

@@ -53,7 +53,6 @@ class LogBlocks:
         ]
 
     def reset(self) -> None:
-        """Delete all blocks."""
         self._blocks.clear()
 
     def execute(self, command: int, number: int, rest: bytes, t: float) -> Status:

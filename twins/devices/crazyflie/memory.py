@@ -60,7 +60,6 @@ class Memories:
 
     @property
     def count(self) -> int:
-        """Number of memories."""
         return len(self.kinds) + len(self.decks)
 
     def read_number(self, number: int, address: int, count: int) -> bytes | None:

@@ -219,7 +219,6 @@ class Planner:
 
     @staticmethod
     def _shorter_turn(pose: Array, goal: Array) -> Array:
-        """Goal with the yaw of the shorter turn."""
         return np.array([*goal[:3], pose[3] + wrap(goal[3] - pose[3])])
 
 

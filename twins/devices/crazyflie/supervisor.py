@@ -85,7 +85,6 @@ class Supervisor:
         return bool(self.state[row] != State.CRASHED)
 
     def armed(self, row: int) -> bool:
-        """Whether a row is armed."""
         return bool(self.may_fly[row] or self.state[row] == State.ARMING)
 
     def stop(self, row: int) -> None:

@@ -132,7 +132,6 @@ def inventory(files: tuple[str, ...] = ()) -> Inventory:
 
 
 def _sections(text: str) -> Iterator[list[Variable]]:
-    """Variables of each section of the built-in text."""
     for section in re.split(r"^\[\w+\]$", text, flags=re.MULTILINE)[1:]:
         variables = []
         for line in filter(None, section.splitlines()):
