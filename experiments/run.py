@@ -56,7 +56,6 @@ def show(figure: Figure, file: str | Path | None = None) -> Picture:
     """A figure for the end of a cell.
 
     Args:
-        figure: Any of matplotlib's.
         file: Where to keep it, as SVG and PDF; without a suffix.
     """
     from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
@@ -160,7 +159,6 @@ def simulate(
     """Runs an experiment in virtual time.
 
     Args:
-        read: The experiment.
         cases: Which of its cases; all if none is named.
         seed: Of the noise; the file's if left out.
         folder: Where recordings go, made if it does not exist; None: none are made.

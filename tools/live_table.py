@@ -110,8 +110,6 @@ class Trends:
         """The row of a robot.
 
         Args:
-            name: Of the robot.
-            status: Its last one.
             now: [s, UTC], by the clock of the statuses' stamps.
             error: [m]
             rate: [1/s] of transmitted poses.
@@ -209,7 +207,6 @@ def lines(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, 
     """The table as lines, none longer than `width`, no more than `height` of them.
 
     Args:
-        title: Above the table.
         rows: One a robot, in the order of the experiment.
         events: Below the table, as many of the last as have room.
         width: Of the terminal [characters]; a name that is longer is shown all the same.

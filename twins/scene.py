@@ -156,8 +156,6 @@ def distance(scene: Scene, obstacle: int, pose: Array, point: Array) -> Array:
     """Distance (...) in the plane from points to an obstacle [m]; negative inside a box or a cylinder.
 
     Args:
-        scene: Scene of the obstacle.
-        obstacle: Number of the obstacle.
         pose: (..., 3) x, y [m] and yaw [rad] of the obstacle.
         point: (..., 2) [m].
     """

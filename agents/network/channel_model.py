@@ -41,12 +41,7 @@ def key(seed: int, *names: str) -> int:
 
 
 def uniform(keys: Words, counter: Counter) -> Array:
-    """Numbers in [0, 1), multiples of 2⁻⁵³: one for each key and counter, whose shapes are broadcast.
-
-    Args:
-        keys: (M, ...) see `key`.
-        counter: Which number of each.
-    """
+    """Numbers in [0, 1), multiples of 2⁻⁵³: one for each key and counter, whose shapes are broadcast."""
     first, second, last = _SHIFTS
     word = keys + _STEP * np.asarray(counter, dtype=np.int64).astype(np.uint64)  # wraps, as it must
     word = (word ^ (word >> first)) * _MIXERS[0]

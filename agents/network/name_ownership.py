@@ -187,10 +187,6 @@ class OwnershipCheck:
 
         For processes without a body, before they send anything: another process may send the same meanwhile.
 
-        Args:
-            session: That of the names.
-            ended: Whether the process was told to end, which ends the wait.
-
         Raises:
             NameTaken: If another process owns one of the names.
         """

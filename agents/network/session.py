@@ -239,9 +239,7 @@ class RouterWatch:
         """Begins with the first `silent_since`.
 
         Args:
-            session: Whose router is watched.
             key: Of the query; in a lab, a liveliness key that this session may watch.
-            endpoints: Of the session.
         """
         self._session, self._key, self._others = session, key, len(endpoints) > 1
         self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)

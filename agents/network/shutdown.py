@@ -27,9 +27,7 @@ def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -
     """Closes a session; returns whether that ended in time. If not it goes on in the background.
 
     Args:
-        session: To close.
         declared: Owners of entities of the session: kept until it is closed, because dropping an entity waits as well.
-        limit_s: Longest wait [s].
     """
     closing = threading.Thread(target=_close, args=(session, declared), name=LEAVING, daemon=True)
     closing.start()

@@ -47,8 +47,6 @@ def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
     """Refuses an impossible pose.
 
     Args:
-        pose: Received.
-        now: UTC time of arrival [s].
         reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
 
     Raises:
@@ -87,12 +85,6 @@ def check_position(measured: Position, *, now: float, reach: Vector) -> None:
 
 def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
     """Refuses a goal that is impossible or too old.
-
-    Args:
-        goal: Received.
-        now: UTC time of arrival [s].
-        reach: See `check_pose`.
-        oldest_s: Largest age [s].
 
     Raises:
         Malformed: If a number is not finite, the stamp is old or lies in the future, the pose is

@@ -100,7 +100,6 @@ def build(group: str, choice: str | Mapping[str, Any]) -> Any:  # noqa: ANN401 -
     """The plug-in that a choice names, with its parameters.
 
     Args:
-        group: Entry-point group.
         choice: `"periodic"`, or `{"kind": "send-on-delta", "threshold": 0.01}`.
 
     Raises:

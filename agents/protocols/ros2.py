@@ -190,8 +190,6 @@ def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None
     """Key expression of the tokens of the publishers or subscribers of a topic.
 
     Args:
-        style: Whose tokens.
-        role: Which end.
         topic: By its full name; "*" means any.
         domain: None means any.
     """

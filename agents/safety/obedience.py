@@ -108,7 +108,6 @@ class Obedience:
         """Compare at `t` [s]; before the next sample is due nothing happens.
 
         Args:
-            t: Now [s].
             setpoint: (N, 4) of the tick before; rows of NaN have none.
             position: (N, 3) measured [m].
             yaw: (N,) measured [rad].

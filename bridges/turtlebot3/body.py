@@ -36,7 +36,6 @@ class TurtleBot3:
     """TurtleBot3 robots; implements `agents.body.interface.Body`. All topics are polled: no threads.
 
     Args:
-        request: Robots to open.
         clock: Monotonic [s]; commands from before a suspension of the machine are old by it.
 
     Raises:

@@ -75,7 +75,6 @@ class PoseFilter:
         """Name, time of measurement [s], segment and yaw [rad] of each robot with a plausible pose.
 
         Args:
-            frame: Frame of motion capture.
             arrived: Time of arrival on any steady clock [s]; the times of measurement are on the same clock.
         """
         measured = arrived - frame.latency_s

@@ -55,8 +55,6 @@ def layout(what: str, size: str, wanted: LayoutOptions, jumps: Sequence[int] = (
     Args:
         what: polygon, grid, hemisphere, henneberg or circulant.
         size: How many robots; of a grid, ROWSxCOLUMNS.
-        wanted: For spacing, kind and seed.
-        jumps: Of a circulant.
 
     Raises:
         LayoutError: If there is none.

@@ -87,7 +87,6 @@ def hemisphere(count: int, spacing: float, apart: float) -> Layout:
     the rim are left out: their long sides would only make the formation slower.
 
     Args:
-        count: Of robots.
         spacing: Least distance of two of them [m].
         apart: Least distance seen from above [m], so that they can start and land below their places.
     """

@@ -121,8 +121,6 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
     """Pairs that come nearer than the sum of their radii while one is not above the other.
 
     Args:
-        prediction: The motion.
-        kinds: Of the rows.
         clearance: Free height from which on two robots pass above each other [m].
     """
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])

@@ -151,7 +151,6 @@ def find_shapes(links: Links, guesses: Iterable[Array], moves: Mask, anchors: An
         links: With what they ask for, see `residuals.targets_of_law`.
         guesses: (N, 3) each [m]; heights are held where they are.
         moves: (N,) rows that may be placed elsewhere in the plane.
-        anchors: Distances to what stands still.
 
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.

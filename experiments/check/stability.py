@@ -48,11 +48,8 @@ def modes(
 
     Args:
         law: Its offset is differentiated numerically.
-        links: Of the whole experiment.
         position: (N, 3) where the formation is met [m].
         closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
-        hz: Decisions per second.
-        anchors: Distances to what stands still.
         within_s: Modes with a longer time constant than this are free [s].
     """
     anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row

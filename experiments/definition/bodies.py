@@ -180,10 +180,6 @@ def body_request(
 def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
     """Replace the body of every robot by that of `--bodies`; without it, change nothing.
 
-    Args:
-        experiment: A case.
-        bodies: One of `BODIES`, or None.
-
     Raises:
         BodyError: See `behind_protocols`.
     """

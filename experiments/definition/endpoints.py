@@ -28,9 +28,6 @@ def router_endpoints(
 
     Args:
         experiment: Its `network.connect` holds if the command line names none.
-        file: The experiment's.
-        connect: Of the command line.
-        chosen: The lab of the command line.
 
     Raises:
         EndpointError: If a router of a lab asks for no certificates.

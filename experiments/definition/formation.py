@@ -97,7 +97,6 @@ def errors_over_time(law: Law, pattern: FormationArrays, time: Array, position: 
 
     Args:
         law: Its `error` is asked for all times at once.
-        pattern: The links.
         time: (T,) since the common start [s].
         position: (T, N, 3) true [m].
     """

@@ -89,14 +89,7 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
 
 
 def link_target(experiment: Experiment, text: str, given: Target | float, receiver: str) -> LinkTarget:
-    """Target of a link for one of its ends, as distance, offset and bearing.
-
-    Args:
-        experiment: For the heights that robots hold.
-        text: The link, with its first and its second robot.
-        given: Its target in the file.
-        receiver: The end that is asked.
-    """
+    """Target of a link for one of its ends, as distance, offset and bearing."""
     given = given if isinstance(given, Target) else Target(distance=given)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)

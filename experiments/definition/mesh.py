@@ -23,7 +23,6 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     All cases of a file have the same: a robot is at one place in all of them.
 
     Args:
-        cases: Of the experiment.
         secure: Whether ports that are chosen ask for certificates.
     """
     found: dict[str, str] = {}

@@ -79,10 +79,6 @@ def with_arena_file(document: Mapping[str, Any], file: ArenaFile | None) -> dict
 def load(name: str, folder: Path) -> ArenaFile:
     """Reads and checks an arena file.
 
-    Args:
-        name: As the experiment names it.
-        folder: That of the experiment file.
-
     Raises:
         Misnamed: If there is no such file.
         DocumentError: With everything that is wrong in it.

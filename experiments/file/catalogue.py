@@ -40,8 +40,6 @@ def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
     """Writes a new experiment file and, beside it, the schema that its first line shows to editors.
 
     Args:
-        text: Of the file.
-        target: The file, which is returned.
         furnished: The text is a catalogue entry's: the arena file that it names comes along.
 
     Raises:

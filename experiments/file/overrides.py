@@ -80,8 +80,6 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
     trigger.threshold=0.02` is for the cases that have a threshold.
 
     Args:
-        document: Changed in place.
-        override: The value and its path.
         part: `document` holds the changes of a case alone, so that any key may be missing.
 
     Returns:

@@ -144,9 +144,6 @@ def _table(
     """A table against a struct: unknown keys, missing keys, then each value, then the struct's own checks.
 
     Args:
-        value: The table, without the `kind` of a plug-in.
-        struct: Its type.
-        path: Where it stands.
         plugin: Group and kind, if these are a plug-in's parameters.
     """
     fields = _fields_of(struct)
@@ -310,8 +307,6 @@ def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = Non
     """JSON object of a command-line flag.
 
     Args:
-        flag: Such as "--faults".
-        text: Its value.
         struct: Its type; None: any object.
 
     Raises:

@@ -157,7 +157,6 @@ def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
 
     Args:
         alive: (T, N) whether a robot's position is known.
-        time: (T,) [s].
 
     Returns:
         Time without any known position [s], and the rows (T,) within `RETURN_S` of that at which some are not known.
@@ -212,7 +211,6 @@ def net_rotation(position: Array, time: Array) -> float | None:
 
     Args:
         position: (n, N, 3) [m]; robots with unknown positions are left out.
-        time: (n,) [s].
 
     The angle against the first pose is the planar Kabsch solution atan2(Σ r × s, Σ r · s), unwrapped in time; the rate
     is the slope of a straight line through it.

@@ -54,8 +54,6 @@ def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
     """Write the bundle of a run.
 
     Args:
-        folder: Of the run.
-        target: The archive.
         experiments: Its cases, whose plug-ins are added.
 
     Raises:

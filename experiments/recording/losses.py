@@ -37,7 +37,6 @@ def count_lost(
     """(N,) lost poses of each robot, as `playback.read` defines them.
 
     Args:
-        robots: Names.
         poses: Of each, in order of time.
         statuses: Of each, in order of time.
         run: Its beginning and end in UTC [s].

@@ -83,11 +83,8 @@ class Goals:
         """The goals of a run of `duration` [s], with times since the common start.
 
         Args:
-            sent: All goals.
             receipts: Goals that robots acted on: their row, when (`arrival`), and the stamp of the pose on which the
                 goal rests (`extra`).
-            duration: Length of the run [s].
-            received, lost, dropped, reports: See the fields.
         """
         assert receipts.extra is not None
         acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]

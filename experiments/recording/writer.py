@@ -107,11 +107,6 @@ class Recording:
 
         Args:
             path: A file that does not exist yet.
-            experiment: The experiment of this case, overrides applied.
-            document: The experiment file, as it was written.
-            case: Name of the case.
-            seed: Seed of this run.
-            clock: Which clock the stamps come from.
             started: UTC time of the common start [s], if it is known already; the event `start` says it as well.
             draw: Draws the scene for viewers.
             utc: Clock of the recorder [s]: nothing is logged later than it came. Without one, messages come in order.
@@ -166,7 +161,6 @@ class Recording:
         With a state, its place goes to the viewers' topics if it is known: the truth of a twin, else as measured.
 
         Args:
-            message: As it was sent.
             received: When the recorder got it, UTC [s]; of poses and goals.
             size: Of its payload on the network [bytes]; of poses and goals.
 

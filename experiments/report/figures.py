@@ -78,7 +78,6 @@ def every(
 
     Args:
         cases, traces: The run; several seeds of a case have one name.
-        width: Of each figure [in].
         bands: Of `errors`, where traces of most seeds are not known.
     """
     known = [trace for trace in traces if len(trace.time)]
@@ -193,9 +192,7 @@ def errors(
     dashed (paper, figure 16, there Σ over the links on a linear axis). Of several seeds the median and the range.
 
     Args:
-        traces: Of all seeds.
         cases: Where acquisitions are taken from; no markers if left out.
-        width: [in]
         bands: Medians and ranges; `error_bands` of the traces if left out.
     """
     figure = Drawing(figsize=(width, min(0.5 * width + 0.75, 3.2)), layout="constrained")

@@ -139,7 +139,6 @@ def render(
     Args:
         foot: Code and versions of this process if left out.
         replay: HTML of an embedded replay, trusted as it is, shown right after the findings; none if left out.
-        target, title, source, facts, command, verdict, sections: As the page shows them.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
 
@@ -197,7 +196,6 @@ def inline(svg: str, prefix: str, label: str) -> str:
     """An SVG file as an element of a page: ids of its own, black and white as the page's ink and paper.
 
     Args:
-        svg: As `figures.svg` gives it.
         prefix: For every id and every reference to one.
         label: Its content for screen readers; plain words without markup.
     """

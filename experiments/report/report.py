@@ -96,13 +96,11 @@ def write(
     is made again says the same.
 
     Args:
-        folder: Where to; made if it does not exist.
         traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
             and the figures of motions show the first seed.
         command: How to do the run again; not shown if left out.
         text: The experiment file; the experiment of the first trace as JSON if left out.
         date: When the run was, see `date_of`; now if left out.
-        name: Of the file.
         measured: `measure` of each trace, if that was done already; and of seeds whose traces are not known.
         notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
             interrupted is seen from the traces.
@@ -206,12 +204,8 @@ def compare(
     """Writes several runs side by side: a column for each case of each run, the first one as the reference.
 
     Args:
-        target: The file.
         runs: Name and metrics of each run; several seeds of a case within one run become means with 95 % intervals.
             Runs of the same name are numbered.
-        title, source: Of the page; the source is shown below the title.
-        command: How to do it again.
-        date: Now if left out.
         differences: Name and folder of each run, and how its file, seeds and versions differ from the first one's;
             shown before anything else.
 

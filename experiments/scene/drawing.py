@@ -81,9 +81,6 @@ class SceneDrawing:
         """Draws what does not move.
 
         Args:
-            server: Of the page.
-            stage: Of the case.
-            look: Colours.
             root: Name of the node that carries everything; `offset` moves it.
         """
         self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
@@ -211,7 +208,6 @@ class SceneDrawing:
         """Draws a moment.
 
         Args:
-            moment: Of the case.
             trails: Whether they have changed since the last one.
             still: Nothing follows soon: what is else drawn at some rounds only is drawn now.
             scans: Last range readings by robot.

@@ -145,15 +145,9 @@ def tune(
 ) -> TuningResult:
     """Seeks the parameters of each case that has any of the axes; what was tried before is not run again.
 
-    Args:
-        file: The experiment.
+    Args (others as of `sweep`):
         given: Ranges, `seeds=` to report on and `tuning=` to seek on, as on the command line.
         wished: As `wish_of` takes it.
-        settings: As behind `--set`.
-        cases: Which cases; all if none is named.
-        out: Where runs are kept and looked for.
-        scheduler: Address of a dask scheduler; None: on this machine.
-        processes: On this machine; None: one for each core.
         progress: Told of the case, of evaluations done, and of how many there are at most.
 
     Raises:

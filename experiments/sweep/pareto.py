@@ -35,7 +35,6 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         rows: The cells; those whose ratios are unknown are left out.
         index: Of the error: `iae`, `itae` or `rmse`.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
-        width: [in]
     """
     known = [row for row in rows if not row.reference and _at(row, index) is not None]
     best = {id(row) for row in front(known, index)}

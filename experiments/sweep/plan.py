@@ -138,9 +138,7 @@ def cells(read: Document, file: str, settings: Sequence[str], axes: Sequence[Axi
 
     Args:
         read: The file with `settings`.
-        file: As the user names it.
         settings: As behind `--set`.
-        axes: What changes.
         cases: Which cases; all if none is named.
 
     Raises:

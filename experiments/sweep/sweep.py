@@ -82,7 +82,6 @@ def sweep(
     """Runs a sweep, or what is missing of it; after Ctrl-C it gives what is done.
 
     Args:
-        file: The experiment.
         given: Axes and seeds, as on the command line.
         settings: As behind `--set`, for all cells.
         cases: Which cases; all if none is named. The first of the file is run in any case: it is the reference.

@@ -47,8 +47,6 @@ class Broadcast:
         """Reads the recording.
 
         Args:
-            session: Of this process.
-            path: The recording.
             realm: First chunk of the keys; None: that of the run.
 
         Raises:
@@ -88,7 +86,6 @@ class Broadcast:
         Args:
             ended: Ends it when set.
             clock: From 0 to the length of the recording [s]; its speed, loop and pauses are followed.
-            endpoints: Those of the session.
 
         Raises:
             Occupied: If a run or a robot is up in the realm, before or while it plays.

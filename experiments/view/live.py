@@ -46,8 +46,6 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
 
     Args:
         port: Preferred; the next free one is taken if it is not free.
-        title: Of the page.
-        dark: Dark colours.
     """
     import viser  # noqa: PLC0415 - an extra
 
@@ -172,10 +170,8 @@ class LiveView:
         """Draws an empty page.
 
         Args:
-            server: From `open_server`.
             session: On the network of the run.
             watched: The run.
-            dark: Dark colours.
             acting: Orders of the page; None for an observer, which sees no buttons.
         """
         self._server, self._session, self._watched, self._acting = server, session, watched, acting

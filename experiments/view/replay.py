@@ -204,10 +204,8 @@ class ReplayView:
         """Draws all cases beside one another.
 
         Args:
-            server: From `live.open_server`.
             films: The cases, at least one.
             where: Which run it is, for people.
-            dark: Dark colours.
         """
         self._server, self._films, self._where = server, list(films), where
         self.clock = Clock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))

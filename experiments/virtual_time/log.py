@@ -47,8 +47,6 @@ def goal_messages(centre: CentreLog, names: Sequence[str], first: int) -> Iterat
     """Goals of one repetition, and when they were sent since the common start [s].
 
     Args:
-        centre: Of all repetitions.
-        names: Of the robots.
         first: Row of the first of them.
     """
     own = centre.sent.between(first, first + len(names))
@@ -175,10 +173,6 @@ class Logbook:
 
     def record(self, path: Path, document: str) -> None:
         """Writes a recording of the whole run, take-off and landing included.
-
-        Args:
-            path: A file that does not exist yet.
-            document: The experiment file, as it was written.
 
         Raises:
             RecordingError: If it cannot be written.

@@ -92,7 +92,6 @@ def simulate(
     """Flies one case of an experiment once for each seed.
 
     Args:
-        experiment: The case.
         seeds: One for each repetition.
         lean: Keep `true_position`, and of the poses sent numbers and times: a seventh of the memory, for sweeps. The
             other columns are empty, and so is the table of received poses.

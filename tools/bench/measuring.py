@@ -60,9 +60,6 @@ def fly(
     """Fly the reference experiment over routers that run: real time, periodic poses (50 Hz), no plan of the leader.
 
     Args:
-        launcher: Of its processes.
-        folder: For its recording and logs.
-        endpoints: Of the routers.
         look: Is given the run's progress some ten times a second.
         duration_s: From the common start [s].
     """

@@ -59,8 +59,6 @@ def create(
         identities: Role by name.
         hosts: Names and addresses at which the routers can be reached, beside this machine.
         listening: The same for other members that listen, by name: those of a mesh.
-        days: For which certificates are valid.
-        authority_days: For which the authority is.
 
     Raises:
         LabError: If there is a lab already, the folder cannot be written, or a name or address is wrong.
@@ -110,10 +108,8 @@ def renew(
     """Make new keys and certificates on the same names; those before stay valid until they end.
 
     Args:
-        folder: Of the lab.
         names: Of identities; all if none is named.
         hosts: Names and addresses at which those named may listen from now on, beside those from before.
-        days: For which they are valid.
         authority: Whether the authority is a new one, whose certificates alone count from now on: all of them.
 
     Raises:

@@ -370,8 +370,6 @@ def packed(root: Path, names: Sequence[str], mode: int | None = None) -> bytes:
     """Files of a folder as a compressed tar without user names and without files made by running it.
 
     Args:
-        root: The place.
-        names: Of files and folders there.
         mode: Of all files; None: as they have it.
     """
     import tarfile
@@ -430,9 +428,6 @@ def send(name: str, host: Host, folder: Path, robots: Sequence[str]) -> str:
     """Put the certificates of some robots on a host, in place of what its folder held; return what was done.
 
     Args:
-        name: Of the host.
-        host: Has an address.
-        folder: Of the lab, here.
         robots: Their names; no other certificates stay there.
 
     Raises:

@@ -144,9 +144,6 @@ def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = 
 
     Args:
         robots: Possible victims.
-        count: How many faults.
-        seed: Of all choices.
-        kinds: Which there are.
     """
     random = np.random.default_rng(seed)
     deck = [kinds[place % len(kinds)] for place in range(count)]

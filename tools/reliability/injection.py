@@ -53,10 +53,7 @@ class Injector:
         """Inject a fault; return a note for the report.
 
         Args:
-            fault: What.
             victim: A robot; empty for the whole run.
-            session: For nonsense.
-            keys: Of the realm.
         """
         kind, size, how = fault.kind, fault.size, fault.properties
         if how.signal is not None:

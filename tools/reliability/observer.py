@@ -92,7 +92,6 @@ class Invariants:
         """The largest error [m] of links between robots that live, as their law measures it; 0 without any.
 
         Args:
-            live: Robots that are under way.
             t: Since the common start [s].
         """
         here = np.array([name in live for name in self.names])

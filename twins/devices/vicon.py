@@ -74,11 +74,7 @@ class ViconTwin:
 
         Args:
             subjects: Names of the bodies, as clients see them.
-            rate_hz: Frames per second.
             sigma: White noise of the positions, per axis [m].
-            rng: Generator of the noise.
-            faults: Silence, delay, occlusion.
-            host: Address to listen on.
             port: 0 for any free port.
 
         Raises:

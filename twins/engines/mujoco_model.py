@@ -58,10 +58,7 @@ def mjcf(frame: Airframe, scene: Scene, step: float, motor_lag: float) -> str:
     The state is position, quaternion, velocity in the world, angular velocity in the robot's frame, and motor thrusts.
 
     Args:
-        frame: Airframe of the quadrotor.
         scene: Only obstacles without a plan are used.
-        step: Of the simulation [s].
-        motor_lag: Time constant of a motor's thrust [s].
     """
     along = frame.arm / np.sqrt(2.0)
     rotors = [f'<site name="m{k}" pos="{x * along} {y * along} 0"/>' for k, (x, y, _) in enumerate(MOTORS)]

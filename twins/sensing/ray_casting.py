@@ -145,7 +145,6 @@ class Caster:
         nearest object above (below) in plan, else the ceiling of a walled arena (the floor).
 
         Args:
-            beams: Rays.
             position: (n, 3) of all rows [m]; a row at NaN neither sees nor is seen.
             yaw: (n,) [rad]
             obstacles: (copies, M, 3) poses: x, y [m], yaw [rad].

@@ -64,9 +64,7 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
     """The text of the experiment file, and what was not carried over.
 
     Args:
-        text: Of theirs.
         label: Its name; the files that an index names are looked for beside it.
-        duration_s: How long the experiment is to run [s].
         poses: A file with starts, see `starts_from`; they go before those of theirs.
 
     Raises:

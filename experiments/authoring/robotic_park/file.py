@@ -279,7 +279,6 @@ def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
 
     Args:
         file: Its name: `config_path` is meant from its folder.
-        text: Its content.
         poses: Of robots by name, from elsewhere; they go before those of the file.
 
     Raises:

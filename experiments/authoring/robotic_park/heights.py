@@ -36,8 +36,6 @@ def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mas
     beginning ends in a local minimum for about two of three of the shapes in space that the authors fly.
 
     Args:
-        wanted: Links, with what they ask for.
-        anchors: Distances to points.
         start: (N, 3) [m].
         climbs: (N,) robots whose height may be another; the others keep theirs.
     """

@@ -64,9 +64,6 @@ def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision
     """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
-        read: The experiment.
-        folder: For recordings and logs; it exists.
-        staging: Options that the file leaves open.
         user: After an interrupt or an emergency stop no further case begins.
 
     Returns:

@@ -66,9 +66,6 @@ def check_robots(
 
     Args:
         read: The experiment; of several cases, the first of the chosen ones.
-        folder: Where logs go; it exists.
-        options: What the file leaves open.
-        trials: What is tried.
         user: After an interrupt the robot that moves lands; emergency stops end the checks as well.
 
     Returns:

@@ -114,7 +114,6 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
     """Faults of the certificates of a machine, each with its remedy.
 
     Args:
-        found: What it says.
         folder: Of the lab, on this machine: its register and `ca.pem`.
         there: That machine's clock, UTC [s].
 

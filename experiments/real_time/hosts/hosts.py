@@ -48,11 +48,9 @@ def run_script(
     """Run a script in the plain shell of a host; return its output.
 
     Args:
-        name: Of the host.
         host: Has an address.
         script: Its text, and its words from $0 on.
         given: What it finds on its standard input.
-        limit_s: It must be over within this [s].
         late: Message if it is not.
         failed: Before the reason if it fails.
 
@@ -81,7 +79,6 @@ class Station:
         """Begin to connect; `greet` waits for the station.
 
         Args:
-            name: Of the host.
             host: Has an address.
             launcher: Starts the ssh, and keeps its lifeline.
             routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
@@ -264,7 +261,6 @@ class Hosts:
         """No host is connected yet.
 
         Args:
-            launcher: Starts the ssh of each process.
             routers: As this machine reaches them, those that listen everywhere as they listen.
         """
         self._launcher, self.routers = launcher, list(routers)

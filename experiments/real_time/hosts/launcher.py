@@ -127,8 +127,6 @@ class Launcher:
         """Start any command that holds its standard input as a lifeline.
 
         Args:
-            name: Of the process, and of its log.
-            command: And its arguments.
             first_input: Read there before the first heartbeat.
             answers: Its standard output is the caller's to read, and only its errors are logged.
             environment: Added to the launcher's own.

@@ -168,7 +168,6 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     """Answer until the lifeline is lost, then wait until the robots have landed; return the exit code of the process.
 
     Args:
-        fd: Descriptor of the questions.
         patience_s: Time for robots to land and to end [s].
     """
     here = Clock()

@@ -44,8 +44,6 @@ class Commander:
         """Set a low-level setpoint.
 
         Args:
-            row: Row of the setpoint.
-            t: Current time [s].
             target: Position [m]; NaN on axes without one.
             velocity: [m/s]; NaN on axes without one.
             heading: Yaw [rad], or NaN: use `turn`.

@@ -136,8 +136,6 @@ class Planner:
         ends, so it is a spiral for angles up to 90° only.
 
         Args:
-            row: Row of the plan.
-            t: Current time [s].
             pose: Start (4,).
             angle: Of the arc and of the turn, at most a full circle [rad].
             radii: First and last [m].

@@ -43,7 +43,6 @@ class Trajectories:
         """Pieces of a trajectory; none if it is not defined, which the firmware answers with OK as well.
 
         Args:
-            number: Of the trajectory.
             start: Pose (4,) to shift its start to; None: flown where it is defined.
             turned: Turned to the yaw of `start` too.
             reverse: Backwards.
