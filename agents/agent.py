@@ -385,11 +385,7 @@ class Agent:
         guidance.fresh[:] = False
 
     def _deviate(self, avoidance: Avoidance, wanted: Array, own: OwnState, near: Nearby) -> Array:
-        """Goals after avoidance.
-
-        Raises:
-            PluginError: If the avoidance fails; the error names it.
-        """
+        """Goals after avoidance."""
         name = type(avoidance).__name__
         try:
             goal = avoidance.deviate(wanted, own, near, 1.0 / self.assignment.body_hz)

@@ -313,9 +313,5 @@ class ExternalBody:
 
 
 def open_external(request: BodyRequest) -> ExternalBody:
-    """Entry point `external` of the group `zenpark.bodies`.
-
-    Raises:
-        BodyError: If a row has settings.
-    """
+    """Entry point `external` of the group `zenpark.bodies`."""
     return ExternalBody(request)

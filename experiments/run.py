@@ -265,11 +265,7 @@ def reopen_seeds(folder: str | Path) -> list[Run]:
 
 
 def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
-    """A run from its recordings, by case; those of killed recorders too, as far as they go.
-
-    Raises:
-        RecordingError: If one cannot be read.
-    """
+    """A run from its recordings, by case; those of killed recorders too, as far as they go."""
     traces: dict[str, Trace] = {}
     remarks, made = list(notes), []
     for case, file in recordings.items():

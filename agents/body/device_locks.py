@@ -66,12 +66,7 @@ class Claims:
 
 
 def _lock(path: Path, name: str, address: str) -> int:
-    """The open and locked file.
-
-    Raises:
-        BodyError: If another open file has the lock.
-        OSError: If there can be no such file.
-    """
+    """The open and locked file."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:

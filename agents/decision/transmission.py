@@ -88,11 +88,7 @@ class Transmitter:
 
 
 def due_rows(trigger: Trigger, view: View, state: Array) -> Index:
-    """`Trigger.due`, with an error that names the trigger.
-
-    Raises:
-        PluginError: If the trigger fails.
-    """
+    """`Trigger.due`, with an error that names the trigger."""
     try:
         return trigger.due(view, state)
     except FAILURES as error:

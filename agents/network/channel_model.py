@@ -264,11 +264,7 @@ class Channel:
         return passes, took
 
     def _queued(self, poses: PoseTable, begun: Mask) -> tuple[Array, Mask]:
-        """Times that poses wait for those before them and are being sent (M,) [s]; which of them are taken (M,).
-
-        Raises:
-            ValueError: If their sizes are not given.
-        """
+        """Times that poses wait for those before them and are being sent (M,) [s]; which of them are taken (M,)."""
         if poses.bytes is None:
             raise ValueError("links of limited bandwidth need the sizes of their samples")
         conditions, link = self._conditions, poses.link

@@ -60,11 +60,7 @@ def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
 
 
 def check_state(state: State, *, now: float, reach: Vector) -> None:
-    """Refuses telemetry with an impossible pose; a pose may be missing.
-
-    Raises:
-        Malformed: As `check_pose`.
-    """
+    """Refuses telemetry with an impossible pose; a pose may be missing."""
     _refuse_stamp(state.stamp, now)
     if state.position is not None:
         _refuse_place(state.position, reach)
@@ -72,11 +68,7 @@ def check_state(state: State, *, now: float, reach: Vector) -> None:
 
 
 def check_position(measured: Position, *, now: float, reach: Vector) -> None:
-    """Refuses an impossible measured position.
-
-    Raises:
-        Malformed: As `check_pose`.
-    """
+    """Refuses an impossible measured position."""
     _refuse_stamp(measured.stamp, now)
     _refuse_place(measured.position, reach)
     if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:

@@ -102,11 +102,7 @@ def settings(
 def _of_lab(
     endpoints: Sequence[str], identity: str, listens: bool, rights: access_control.Rights | None
 ) -> tuple[dict[str, object], Path | None]:
-    """Settings of the lab of some endpoints, and its folder; empty and None without one.
-
-    Raises:
-        LabError: If the lab has no such identity, or its register does not go with the rights.
-    """
+    """Settings of the lab of some endpoints, and its folder; empty and None without one."""
     folder = lab.lab_of(endpoints)
     if folder is None:
         return {}, None

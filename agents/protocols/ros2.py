@@ -110,11 +110,7 @@ class Types:
 
 @cache
 def types(distro: Distro) -> Types:
-    """The types of a distribution; cached, since that takes 0.1 s.
-
-    Raises:
-        BodyError: As `Types`.
-    """
+    """The types of a distribution; cached, since that takes 0.1 s."""
     return Types(distro)
 
 
@@ -223,11 +219,7 @@ def announced(style: Style, token: str) -> Endpoint:
 
 
 def gid(token: str) -> bytes:
-    """The 16 bytes by which rmw_zenoh knows an endpoint: XXH3-128 of its token, low half first, little endian.
-
-    Raises:
-        BodyError: If the extra `ros` is not installed.
-    """
+    """The 16 bytes by which rmw_zenoh knows an endpoint: XXH3-128 of its token, low half first, little endian."""
     try:
         import xxhash  # noqa: PLC0415 - an extra
     except ImportError:

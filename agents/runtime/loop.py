@@ -177,12 +177,7 @@ class Runtime:
     # ------------------------------------------------------------------ the network
 
     def _take_names(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Claims the names of the robots, before any body is touched.
-
-        Raises:
-            NameTaken: If another process owns one of them.
-            network.Unreachable: If no router answers.
-        """
+        """Claims the names of the robots, before any body is touched."""
         keys, setup = self._setup.keys, self._setup
         tokens = [keys.alive(name) for name in self._names]
         try:
@@ -198,11 +193,7 @@ class Runtime:
         return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
 
     def _mine(self) -> bool:
-        """Whether the names belong to this process; False while that is being checked.
-
-        Raises:
-            NameTaken: If another process has taken one of them.
-        """
+        """Whether the names belong to this process; False while that is being checked."""
         try:
             return self._ownership.over()
         except NameTaken as taken:
@@ -216,10 +207,6 @@ class Runtime:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
         Until then it must not command its bodies, since another process may drive them.
-
-        Raises:
-            NameTaken: If another process has taken one of them.
-            network.Unreachable: If the process was told to end, and no router has answered within `ANSWER_S`.
         """
         if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
             return False

@@ -173,11 +173,7 @@ class SetpointFilter:
 
 
 def _wished(setpoint: Array, avoidance: Avoidance, own: OwnState, nearby: Nearby) -> Array:
-    """Setpoints (N, 4) after avoidance.
-
-    Raises:
-        PluginError: If the avoidance fails; the error names it.
-    """
+    """Setpoints (N, 4) after avoidance."""
     name = type(avoidance).__name__
     try:
         wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)

@@ -201,9 +201,5 @@ class TurtleBot3:
 
 
 def open_turtlebot3(request: BodyRequest) -> Body:
-    """Entry points `ros2dds` and `rmw` of the group `zenpark.bodies`.
-
-    Raises:
-        BodyError: As `TurtleBot3`.
-    """
+    """Entry points `ros2dds` and `rmw` of the group `zenpark.bodies`."""
     return TurtleBot3(request)

@@ -55,9 +55,6 @@ def layout(what: str, size: str, wanted: LayoutOptions, jumps: Sequence[int] = (
     Args:
         what: polygon, grid, hemisphere, henneberg or circulant.
         size: How many robots; of a grid, ROWSxCOLUMNS.
-
-    Raises:
-        LayoutError: If there is none.
     """
     kind = _kind(wanted)
     if what == "grid":

@@ -178,11 +178,7 @@ def body_request(
 
 
 def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
-    """Replace the body of every robot by that of `--bodies`; without it, change nothing.
-
-    Raises:
-        BodyError: See `behind_protocols`.
-    """
+    """Replace the body of every robot by that of `--bodies`; without it, change nothing."""
     if bodies is None:
         return experiment
     if bodies == "protocol":

@@ -63,11 +63,7 @@ def write_new(text: str, target: Path, *, furnished: bool = False) -> Path:
 
 
 def _arena_beside(text: str, folder: Path) -> ArenaFile | None:
-    """The arena file that an entry needs in a folder.
-
-    Raises:
-        DocumentError: If another one of that name is there.
-    """
+    """The arena file that an entry needs in a folder."""
     name = arena_file.arena_file_name(tomllib.loads(text))
     if name is None:
         return None

@@ -180,11 +180,7 @@ def _need(law: object) -> str:
 
 
 def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:
-    """Distance [m], offset [m] or bearing of a link between places.
-
-    Raises:
-        _NoPlace: If one of the two is no robot or has no place, or both have the same.
-    """
+    """Distance [m], offset [m] or bearing of a link between places."""
     if not _ends(text):
         return 1.0 if word == "distance" else [1.0, 0.0]
     second, first = link_pairs(text)[0]
@@ -224,11 +220,7 @@ def _own(choice: Mapping[str, Any], group: str) -> list[str]:
 
 
 def _known(at: Any, step: str | int, path: Path, override: Override, *, part: bool) -> Any:  # noqa: ANN401
-    """The step as the document knows it.
-
-    Raises:
-        DocumentError: If it leads nowhere.
-    """
+    """The step as the document knows it."""
     if isinstance(at, list):
         if not re.fullmatch(r"[0-9]{1,6}", str(step)) or int(step) >= len(at):
             raise override.refused(f"there is no '{step}' in '{path[-2]}'", f"it is a list: 0 to {len(at) - 1}")

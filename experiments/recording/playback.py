@@ -60,11 +60,7 @@ class AboutRun:
 
     @classmethod
     def of(cls, records: Records) -> AboutRun:
-        """Content of `records`, whose messages were read.
-
-        Raises:
-            RecordingError: If there is nothing of the kind in it.
-        """
+        """Content of `records`, whose messages were read."""
         about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
         attached = next((record.data for record in records.attachments if record.name == JSON), b"")
         try:
@@ -76,11 +72,7 @@ class AboutRun:
             raise RecordingError(f"{records.path}: {text}") from None
 
     def start(self, events: Iterable[Event], statuses: Iterable[Status], path: Path) -> float:
-        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot.
-
-        Raises:
-            NotStarted: If no robot had started.
-        """
+        """UTC time of the common start [s]: as the conductor says, else as announced, else the earliest of a robot."""
         said = (each.stamp for each in events if each.kind == "start" and math.isfinite(each.stamp))
         start = next(said, self.announced)
         if start is None:

@@ -72,9 +72,6 @@ class Records:
 
         Four times as fast as `messages`, and for those that need only some fields of many messages: checksums are not
         compared, and of a damaged piece nothing is left.
-
-        Raises:
-            RecordingError: As `messages`.
         """
         with self._opened() as (file, size):
             yield from self._pieces(file, size)

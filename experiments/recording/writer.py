@@ -198,19 +198,11 @@ class Recording:
             self._record(self._scene, state, drawn, logged)
 
     def flush(self) -> None:
-        """Brings everything so far to the disk.
-
-        Raises:
-            RecordingError: If it cannot be written; what was written before stays.
-        """
+        """Brings everything so far to the disk."""
         self._guarded(self._writer.flush)
 
     def close(self) -> None:
-        """Finishes the file; a second call does nothing. After a write error it stays unfinished, and recoverable.
-
-        Raises:
-            RecordingError: If the end cannot be written; what was written before stays.
-        """
+        """Finishes the file; a second call does nothing. After a write error it stays unfinished, and recoverable."""
         try:
             if not self._over:
                 self._guarded(self._writer.finish)

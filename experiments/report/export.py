@@ -106,11 +106,7 @@ def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], f
 
 
 def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
-    """Writes a table with a line for each case, time and robot; empty where a value is unknown.
-
-    Raises:
-        ExportError: If the file cannot be written.
-    """
+    """Writes a table with a line for each case, time and robot; empty where a value is unknown."""
     try:
         with file.open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream)
@@ -242,11 +238,7 @@ def _bytes(value: Any) -> int:  # noqa: ANN401 - any field of a struct
 
 
 def require_savemat() -> Any:  # noqa: ANN401 - scipy has no types
-    """The function that writes MATLAB files.
-
-    Raises:
-        ExportError: If scipy is not installed.
-    """
+    """The function that writes MATLAB files."""
     try:
         return import_module("scipy.io").savemat  # an extra
     except ImportError:

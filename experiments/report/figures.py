@@ -59,7 +59,6 @@ BAND: Final = "#009E73"  # the tolerance
 LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
 WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
 MOST_SEEDS: Final = 50  # of a case, for the range of its errors
-ALIKE_S: Final = 2e-3  # [s] delays that differ by less are those of a fixed one and of ticks
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
 
 __all__ = ["formation", "plan_view", "save", "svg"]  # besides those of this module
@@ -74,7 +73,7 @@ def every(
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
     Figures without content are left out: all without a trace; ratios of a single case; pictures of space where no
-    position is known, or in perspective where all robots stay on the floor; delays where all are the same.
+    position is known, or in perspective where all robots stay on the floor.
 
     Args:
         cases, traces: The run; several seeds of a case have one name.
@@ -95,8 +94,6 @@ def every(
         figures["robot_bars"] = robot_bars(cases, width)
     if first:
         figures["events"], figures["intervals"] = events(first, width), intervals(first, width)
-    if any(len(_delays(trace)) for trace in first):
-        figures["delays"] = delays(first, width)
     return figures
 
 
@@ -334,37 +331,6 @@ def _solid(trace: Trace, marks: Sequence[tuple[Array, Array]]) -> str:
     low, high = f"{min(rates):.3g}", f"{max(rates):.3g}"
     rate = low if low == high else f"{low} to {high}"
     return f"{plain(trace.case)}: every robot throughout, {rate} Hz"
-
-
-@styled
-def delays(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
-    """Histogram of the delays of received poses, from stamp to arrival, all links of a case together."""
-    figure = Drawing(figsize=(width, 2.0), layout="constrained")
-    axes = figure.subplots()
-    of_case = {plain(trace.case): 1e3 * _delays(trace) for trace in traces}
-    every_delay = np.concatenate(list(of_case.values()))
-    low, high = max(float(every_delay.min()), 0.01), max(float(every_delay.max()), 0.1)
-    edges = 10.0 ** np.arange(math.floor(math.log10(low)), math.floor(math.log10(high)) + 1.01, 1.0 / 12.0)
-    for k, (name, taken) in enumerate(of_case.items()):
-        if len(taken):
-            weights = np.full(len(taken), 100.0 / len(taken))
-            line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", "--", "-.", ":")[k % 4]}
-            axes.hist(np.maximum(taken, edges[0]), edges.tolist(), weights=weights, histtype="step", label=name, **line)
-            axes.axvline(float(np.percentile(taken, 95)), linewidth=0.6, **line)
-    axes.set_xscale("log")
-    axes.set_xlim(edges[0], edges[-1])
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("delay of a pose, from stamp to arrival [ms]")
-    axes.set_ylabel("share of poses [%]")
-    axes.grid()
-    legend_above(figure, axes.get_legend_handles_labels(), columns=3)
-    return figure
-
-
-def _delays(trace: Trace) -> Array:
-    """Delays of received poses [s]; none where all are the same, as in virtual time without a modelled network."""
-    taken = np.maximum(trace.received.arrival - trace.received.stamp, 0.0)
-    return taken if trace.clock == "real" or (len(taken) and np.ptp(taken) > ALIKE_S) else taken[:0]
 
 
 @styled

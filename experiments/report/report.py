@@ -27,8 +27,6 @@ from experiments.report.tables import (
     clocks_table,
     collision_table,
     events_tables,
-    gaps_table,
-    links_table,
     network_tables,
     over_seeds,
     proof_tables,
@@ -73,8 +71,6 @@ SAME_STARTS: Final = (
 DIFFERENCES: Final = (
     "Experiment file, options, seeds, code and versions. What follows is to be read with these in mind."
 )
-GAPS: Final = "Between two transmissions within the run; silence before the first and after the last is not counted."
-BELIEF: Final = "Distance of the last pose received on each link, carried on by the prediction, from the true one."
 
 
 def write(
@@ -140,8 +136,6 @@ def write(
         Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
         Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
         *_tables("Network model", NETWORK, network_tables(cases)),
-        *_tables("Time between transmissions", GAPS, [gaps_table(cases)]),
-        *_tables("Belief error", BELIEF, [links_table(cases)]),
         *_of_worlds(cases, first, len(drawn)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
@@ -295,7 +289,6 @@ def _pictures(
         "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, with its links.{scenery.caption(shown)}{seed}",
-        "delays": f"Delays of poses from stamp to arrival, all links; vertical: 95 % are shorter.{seed}",
     }
     drawn = figures.every(cases, traces, bands=bands)
     return numbered((figure, captions[name]) for name, figure in drawn.items())

@@ -270,16 +270,6 @@ class _Rows(Generic[T]):
         rows += [self.row(name, items, summed=True) for name, items in (sums or {}).items()]
         return Table((self.head, *(head for head, _ in self.columns)), tuple(rows), title=case)
 
-    def side_by_side(self, cases: Sequence[CaseMetrics], unit: str) -> Table:
-        grouped = {case: self.groups(runs) for case, runs in by_case(cases).items()}
-        names = dict.fromkeys(name for groups in grouped.values() for name in groups)
-        rows = [
-            Row((name, *(cell(groups.get(name, [])) for groups in grouped.values() for _, cell in self.columns)))
-            for name in names
-        ]
-        head = [f"{case}: {what} [{unit}]" for case in grouped for what, _ in self.columns]
-        return Table((self.head, *head), tuple(rows))
-
 
 def _cell(what: Callable[[Iterable[Any]], float], field: str, scale: float = 1.0) -> Callable[[Sequence[Any]], str]:
     """A statistic of the known values of a field."""
@@ -349,23 +339,6 @@ def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         )
         for name, runs in by_case(cases).items()
     )
-
-
-def gaps_table(cases: Sequence[CaseMetrics]) -> Table:
-    """Shortest, median and longest time between transmissions, per robot and case."""
-    columns = [
-        ("shortest", _cell(min, "gap_min_s")),
-        ("median", _cell(statistics.median, "gap_median_s")),
-        ("longest", _cell(max, "gap_max_s")),
-    ]
-    return _Rows("Robot", _robots, attrgetter("robot"), columns).side_by_side(cases, "s")
-
-
-def links_table(cases: Sequence[CaseMetrics]) -> Table:
-    """Belief error of each link, per case; the mean and the largest over several seeds."""
-    columns = [("RMS", _cell(statistics.fmean, "rms", 100.0)), ("largest", _cell(max, "max", 100.0))]
-    name = "{0.receiver}, {0.sender}".format
-    return _Rows("Receiver, sender", attrgetter("belief"), name, columns).side_by_side(cases, "cm")
 
 
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:

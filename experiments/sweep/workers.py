@@ -118,11 +118,7 @@ def _local(processes: int | None) -> Iterator[Workers]:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Workers]:
-    """The workers of a dask scheduler, wherever they are; work of one that dies is given to another one.
-
-    Raises:
-        SweepError: If dask.distributed is not installed, the scheduler does not answer, or has no worker.
-    """
+    """The workers of a dask scheduler, wherever they are; work of one that dies is given to another one."""
     try:
         distributed: Any = import_module("distributed")  # an extra
     except ImportError:

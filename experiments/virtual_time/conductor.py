@@ -38,11 +38,7 @@ class VirtualConductor:
         self.over = False
 
     def give_orders(self, t: float, dt: float) -> None:
-        """Gives the orders that are due after the tick at `t`, of length `dt` [s].
-
-        Raises:
-            Stuck: If robots do not become ready, airborne or done.
-        """
+        """Gives the orders that are due after the tick at `t`, of length `dt` [s]."""
         if self._agent.lifecycle.all_running:
             return
         phase = self._agent.lifecycle.phase

@@ -172,11 +172,7 @@ class Logbook:
         )
 
     def record(self, path: Path, document: str) -> None:
-        """Writes a recording of the whole run, take-off and landing included.
-
-        Raises:
-            RecordingError: If it cannot be written.
-        """
+        """Writes a recording of the whole run, take-off and landing included."""
         with Recording(
             path,
             self._experiment,

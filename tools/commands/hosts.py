@@ -164,11 +164,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
 
 
 def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
-    """Hosts by name or tag, all if none is named.
-
-    Raises:
-        DocumentError: If there is none, or a name means none.
-    """
+    """Hosts by name or tag, all if none is named."""
     from experiments.file.problems import refusal
 
     known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}

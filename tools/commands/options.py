@@ -164,12 +164,7 @@ def session(
     identity: str,
     wait_s: float = 1.0,  # a router of this machine answers at once
 ) -> Iterator[zenoh.Session]:
-    """A session of a command, at the routers of the command line or at that of this machine.
-
-    Raises:
-        EndpointError, LabError: As `routers`.
-        Unreachable: If no router answers within `wait_s` [s].
-    """
+    """A session of a command, at the routers of the command line or at that of this machine."""
     from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.session import open_session
 

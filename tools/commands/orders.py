@@ -325,9 +325,6 @@ def _stop_all(stops: Sequence[EmergencyStop], reason: str, *, as_json: bool) -> 
 
     Returns:
         The exit code: 0, or 1 if a robot has not stopped in time, or if no robot was seen.
-
-    Raises:
-        EndpointError, Unreachable: If no router can be reached.
     """
     threads = [threading.Thread(target=stop.send, args=(reason,), daemon=True) for stop in stops]
     for thread in threads:

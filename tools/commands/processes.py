@@ -133,11 +133,7 @@ def _places(endpoints: Sequence[str]) -> list[str]:
 
 
 def of_zenohd(endpoints: Sequence[str], link: Sequence[str] = (), rights: Rights | None = None) -> dict[str, Any]:
-    """The configuration with which a zenohd is the router that `serve` would be, as its file has it.
-
-    Raises:
-        EndpointError: As `serve`.
-    """
+    """The configuration with which a zenohd is the router that `serve` would be, as its file has it."""
     from agents.network.zenoh_config import settings
 
     made: dict[str, Any] = {}

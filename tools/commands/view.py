@@ -235,11 +235,7 @@ def _pause_on_enter(clock: Clock) -> None:
 
 
 def _recordings(folder: Path, case: str | None = None) -> list[Path]:
-    """Recordings of a run, the oldest first.
-
-    Raises:
-        RecordingError: If there is none, or none of that case.
-    """
+    """Recordings of a run, the oldest first."""
     from experiments.recording.reader import RecordingError
 
     if folder.suffix == ".mcap":
@@ -254,11 +250,7 @@ def _recordings(folder: Path, case: str | None = None) -> list[Path]:
 
 
 def require_viser() -> None:
-    """Check that the library of the view is installed.
-
-    Raises:
-        ViewError: If it is not.
-    """
+    """Check that the library of the view is installed."""
     from importlib.util import find_spec
 
     if find_spec("viser") is None:
@@ -331,11 +323,7 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
 
 
 def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: str | None) -> Watched:
-    """The run on the command line, else the newest one of this machine.
-
-    Raises:
-        ViewError: If none is up.
-    """
+    """The run on the command line, else the newest one of this machine."""
     from agents.runtime import run_registry
     from experiments.view.acting import Watched
 

@@ -300,9 +300,5 @@ def _row(
 
 
 def open_device(request: DeviceRequest) -> Device:
-    """Entry point `turtlebot3-twin` of the group `zenpark.devices`.
-
-    Raises:
-        BodyError, Unreachable: As `TurtleBot3Twin`.
-    """
+    """Entry point `turtlebot3-twin` of the group `zenpark.devices`."""
     return TurtleBot3Twin(request)

@@ -123,11 +123,7 @@ class Conductor:
         return CaseResult(self._context.recording, self._context.ended(), start, ready, lost)
 
     def _adopt(self) -> None:
-        """Adopt robots that were started by hand or at boot.
-
-        Raises:
-            RunFailed: If one of them has flown already.
-        """
+        """Adopt robots that were started by hand or at boot."""
         away = self._processes.away
         if self._experiment.network.connect is not None or away:  # a router of our own has no other robots
             self._progress.phase = "looking for robots"
@@ -154,11 +150,7 @@ class Conductor:
     def _until(
         self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
     ) -> bool:
-        """Wait until every robot that is left has reached a phase; False if the user interrupted.
-
-        Raises:
-            RunFailed: If they have not in time, unless the file says to go on without them.
-        """
+        """Wait until every robot that is left has reached a phase; False if the user interrupted."""
         self._progress.phase = f"waiting until all are {phase}"
         deadline = time.monotonic() + limit_s
         while True:
@@ -181,11 +173,7 @@ class Conductor:
             time.sleep(POLL_S)
 
     def _take_off(self) -> bool:
-        """Order all robots to climb, those that were not ready again when they are; False if interrupted.
-
-        Raises:
-            RunFailed: As `_until`.
-        """
+        """Order all robots to climb, those that were not ready again when they are; False if interrupted."""
         refused = self._order(messages.Order("takeoff"))
 
         def again() -> None:

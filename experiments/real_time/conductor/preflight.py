@@ -70,9 +70,6 @@ def check_robots(
 
     Returns:
         The checks of each robot; none if the user ended them before they began.
-
-    Raises:
-        As `conduct`.
     """
     experiment = alone(next(iter(embody(read, options).values())))
     with staged(read, {PREFLIGHT: experiment}, folder, options, user) as stage, user.show as show:
@@ -130,12 +127,7 @@ class Inspector:
         self._states: dict[str, list[messages.State]] = {}  # of the robots that are observed
 
     def run(self) -> list[RobotChecks]:
-        """Check all robots; those that have moved are down in any case.
-
-        Raises:
-            HostError: If a host cannot be reached.
-            StandInError: If a protocol twin or a positioning system does not start.
-        """
+        """Check all robots; those that have moved are down in any case."""
         self._context.hosts.join(self._experiment)
         try:
             self._processes.prepare(recorder=False)

@@ -116,9 +116,6 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
     Args:
         folder: Of the lab, on this machine: its register and `ca.pem`.
         there: That machine's clock, UTC [s].
-
-    Raises:
-        LabError: If the register cannot be read.
     """
     from cryptography import x509  # noqa: PLC0415 - 4.5 MB that runs without a lab do without
 
@@ -161,11 +158,7 @@ def faults(found: Holding, folder: Path, there: float) -> Iterator[str]:
 
 
 def unnamed(endpoints: Sequence[str], folder: Path) -> Iterator[str]:
-    """Reasons why robots would refuse a router: its certificate must name the address by which they reach it.
-
-    Raises:
-        LabError: If the register cannot be read.
-    """
+    """Reasons why robots would refuse a router: its certificate must name the address by which they reach it."""
     routers = [each for each in register(folder).identities.values() if each.role == "router"]
     named = {host for router in routers for host in router.hosts}
     for reached in dict.fromkeys(Endpoint.parse(endpoint).host for endpoint in endpoints):

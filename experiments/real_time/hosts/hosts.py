@@ -53,9 +53,6 @@ def run_script(
         given: What it finds on its standard input.
         late: Message if it is not.
         failed: Before the reason if it fails.
-
-    Raises:
-        HostError: If it was not done.
     """
     assert host.address is not None
     text, *words = map(str, script)
@@ -185,11 +182,7 @@ class Station:
         return self.hello.zenpark == version.digest()
 
     def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
-        """Measure the host's clock, by some round trips; `robots` run there.
-
-        Raises:
-            HostError: If it does not answer.
-        """
+        """Measure the host's clock, by some round trips; `robots` run there."""
         trips = []
         for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
@@ -208,11 +201,7 @@ class Station:
         return self.clock
 
     def holds(self, names: Sequence[str]) -> certificates.Holding:
-        """Certificates of some robots in its folder.
-
-        Raises:
-            HostError: If it does not answer.
-        """
+        """Certificates of some robots in its folder."""
         return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
 
     def distrusted(self, names: Sequence[str]) -> list[str]:

@@ -83,11 +83,7 @@ def install(robot: str, *, namespace: str, domain: int, silence_s: float) -> lis
 
 
 def remove(robot: str) -> list[str]:
-    """Stop the watchdog and remove it; returns what there is to say.
-
-    Raises:
-        HostError: As `install`.
-    """
+    """Stop the watchdog and remove it; returns what there is to say."""
     return _run(robot, REMOVE, FOLDER)
 
 

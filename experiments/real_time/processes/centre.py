@@ -196,14 +196,7 @@ def _check_status(status: messages.Status) -> None:
 
 
 def serve(launch: Launch) -> int:
-    """Runs the centre of an experiment until it is told to end; returns the exit code.
-
-    Raises:
-        DocumentError: If the file is wrong, has no such case, or no robot that is guided.
-        PluginError: If a law, planner, trigger or predictor cannot be had.
-        NameTaken: If a centre is on the network already.
-        Unreachable: If no router answers.
-    """
+    """Runs the centre of an experiment until it is told to end; returns the exit code."""
     experiment, endpoints = launch.read()
     guided = Plan(experiment).guided
     if not guided:

@@ -109,12 +109,7 @@ class TwinLaunch(Launch, frozen=True, kw_only=True):
 
 
 def stand_in(launch: TwinLaunch) -> int:
-    """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code.
-
-    Raises:
-        DocumentError: If the file is wrong, or the robots do not ask for one and the same protocol twin.
-        Unreachable: If no router answers.
-    """
+    """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code."""
     experiment, endpoints = launch.read()
     names = launch.names
     words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
@@ -143,10 +138,6 @@ def by_hand(
     `faults` and the settings of the `device` are JSON. `connect` are routers for true poses, and for twins that are
     reached by Zenoh; may be none. `tables` are the setting of this name, `identity` is the name in the certificate, in
     a lab.
-
-    Raises:
-        DocumentError: If there is no such protocol twin, or the JSON is wrong.
-        Unreachable: If no router answers.
     """
     settings = structure.parse_object("--device", device)
     if tables:

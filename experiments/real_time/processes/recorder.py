@@ -64,11 +64,7 @@ class Recorder:
         return not self._alive
 
     def receive(self, *, last: bool = False) -> None:
-        """Writes received messages; states of protocol twins wait for the next true pose, except the `last` time.
-
-        Raises:
-            RecordingError: If it cannot be written.
-        """
+        """Writes received messages; states of protocol twins wait for the next true pose, except the `last` time."""
         for token, there in self._watch.changes():
             (self._alive.add if there else self._alive.discard)(token)
         for truth in self._truths.read(_require_finite):
@@ -88,11 +84,7 @@ class Recorder:
         return sum(count for count, _ in self._unread.values())
 
     def report_malformed(self, *, last: bool = False) -> None:
-        """Records unreadable messages as events: of each key the first, and their number the `last` time.
-
-        Raises:
-            RecordingError: If it cannot be written.
-        """
+        """Records unreadable messages as events: of each key the first, and their number the `last` time."""
         for key, (count, why) in list(self._unread.items())[:NAMED]:
             before = self._reported.get(key, 0)
             if not before or (last and count != before):
@@ -173,11 +165,7 @@ class RecorderLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def record(launch: RecorderLaunch) -> int:
-    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM; returns the exit code.
-
-    Raises:
-        RecordingError: If the recording cannot be written.
-    """
+    """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM; returns the exit code."""
     experiment, endpoints = launch.read()
     text = Path(launch.source).read_text("utf-8")
     lost, asked = threading.Event(), threading.Event()

@@ -67,13 +67,7 @@ class RobotLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def fly(launch: RobotLaunch) -> int:
-    """Runs robots of an experiment in this process; returns its exit code.
-
-    Raises:
-        DocumentError: If the file is wrong, or has no such robot or case.
-        BodyError, UnknownPlugin: If a body cannot be had.
-        Unreachable: If no router answers.
-    """
+    """Runs robots of an experiment in this process; returns its exit code."""
     file, names = launch.file, launch.names
     if launch.lifeline:
         command_line.detach()

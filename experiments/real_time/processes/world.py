@@ -191,14 +191,7 @@ class WorldLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def serve(launch: WorldLaunch) -> int:
-    """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code.
-
-    Raises:
-        DocumentError: If the file is wrong, has no such case, or no robot for a world.
-        BodyError, PluginError: If the engine cannot be had.
-        NameTaken: If a world is on the network already.
-        Unreachable: If no router answers.
-    """
+    """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code."""
     experiment, endpoints = launch.read()
     robots = experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):

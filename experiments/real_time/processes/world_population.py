@@ -47,11 +47,7 @@ class Population:
     state: BodyState  # last reading of the body
 
     def __init__(self, experiment: Experiment) -> None:
-        """All robots at their starts.
-
-        Raises:
-            BodyError, plugins.PluginError: If the engine cannot be had.
-        """
+        """All robots at their starts."""
         self._experiment = experiment
         self.names = tuple(experiment.robots)
         robots = list(experiment.robots.values())

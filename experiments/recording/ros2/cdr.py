@@ -111,11 +111,7 @@ class _Writer:
         self._offset: int | None = 0  # modulo 8, unknown behind a text or a sequence
 
     def struct(self, kind: type[msgspec.Struct], value: str) -> str:
-        """Puts the struct `value`; returns the expression that the decoder rebuilds it with.
-
-        Raises:
-            TypeError: See `codec`.
-        """
+        """Puts the struct `value`; returns the expression that the decoder rebuilds it with."""
         info = mi.type_info(kind)
         assert isinstance(info, mi.StructType)
         if not info.fields:

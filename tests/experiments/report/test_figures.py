@@ -149,14 +149,6 @@ def test_a_periodic_case_is_a_line_of_text():
     assert len(raster.patches) == 7
 
 
-def test_delays_are_shown_where_they_differ():
-    known = park(duration=3.0)
-    assert "delays" not in figures.every([], [known])
-    real = dataclasses.replace(known, clock="real")
-    (axes,) = figures.every([], [real])["delays"].axes
-    assert axes.get_xscale() == "log"
-
-
 def test_cases_and_robots_have_palettes_of_their_own():
     assert not set(style.CASES[:-1]) & set(style.ROBOTS)
     assert not set(style.CASES[:-1]) & set(style.KIND_COLOURS.values())

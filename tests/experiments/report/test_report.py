@@ -119,7 +119,7 @@ def test_contents_lead_to_every_section_and_details_are_folded(tmp_path, run):
     assert html.index('id="verdict"') < html.index('class="facts"') < html.index('id="results"')
     folded = {anchor for anchor in links if f'<div id="{anchor}">' in html}
     assert set(links) - folded == {"verdict", "replay", "results", "figures", "events"}
-    assert {"each-robot", "data-integrity", "belief-error", "experiment-file", "definitions"} <= folded
+    assert {"each-robot", "data-integrity", "experiment-file", "definitions"} <= folded
 
 
 def test_only_telling_events_stand_open():

@@ -416,12 +416,7 @@ class Drone:
 
 
 def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:
-    """Numbers packed at the beginning of `data`.
-
-    Raises:
-        struct.error: If `data` is too short.
-        ValueError: If a number is not finite, or too large.
-    """
+    """Numbers packed at the beginning of `data`."""
     values = packing.unpack_from(data)
     if not all(abs(value) <= LARGEST for value in values):  # NaN fails too
         raise ValueError(f"{values} are not valid numbers for a robot")
