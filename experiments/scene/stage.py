@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -21,7 +21,7 @@ from agents.body.kinds import KHEPERA4, Kind
 from agents.decision.lifecycle import Phase
 from agents.formation.changes import Reshaping
 from agents.formation.graph import Links, links
-from agents.network.messages import EMERGENCY, Ranges, Status
+from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
 from experiments.definition import bodies
 from experiments.definition.bodies import WORLD
@@ -203,6 +203,22 @@ class Stage:
         robots = () if self.experiment is None else self.experiment.robots.values()
         high = max([NAME_M, *(robot.hover or 0.0 for robot in robots), *self.tops.tolist()]) + NAME_M
         return np.array([*(self.scene.high - self.scene.low)[:2], high])
+
+    def broken_links(self, conditions: Index, statuses: Sequence[Status | None]) -> Mask:
+        """Links (E,) with an end that is gone, or whose receiver misses the sender in its last status."""
+        net = self.links
+        missing = {(row, name) for row, last in enumerate(statuses) if last is not None for name in last.missing}
+        gone = np.isin(conditions, PALED)
+        named = [(i, self.names[j]) in missing for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
+        return np.asarray(gone[net.sender] | gone[net.receiver] | np.array(named, dtype=bool))
+
+    def obstacles_at(self, t: float, world: WorldState | None) -> Array:
+        """Poses (M, 3) of the obstacles at `t` [s]: as the world says; without one, where their plans put them."""
+        pose = self.scene.at(t)
+        for each in () if world is None else world.obstacles:
+            if each.name in self.scene.names and self.scene.plans[k := self.scene.names.index(each.name)] is None:
+                pose[k] = each.pose
+        return pose
 
     @cached_property
     def flies(self) -> Mask:

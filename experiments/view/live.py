@@ -187,7 +187,7 @@ class LiveView:
             acting.build(server)
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Draws at 30 Hz while a page is open, until `ended`."""
+        """Draws while a page is open, until `ended`."""
         due = time.monotonic()
         while not ended():
             begun = time.monotonic()

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, nan
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import zenoh
@@ -22,6 +24,8 @@ from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
 
 UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
 RATE_S: Final = 1.0
+Handler = zenoh.handlers.Handler[zenoh.Sample]
+R = TypeVar("R", messages.State, messages.Ranges)
 DEPTH: Final = 8192  # samples between two rounds
 EVENTS: Final = 200  # kept
 
@@ -65,7 +69,7 @@ class Observer:
         self._worlds = pubsub.Inbox(pubsub.subscriber(session, keys.world, 8), messages.WorldState)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
-        self._ranges: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
+        self._ranges: zenoh.Subscriber[Handler] | None = None
         self._opened = self._rated = time.monotonic()
         self.robots, self.scans = {}, {}
         self.events = deque(maxlen=EVENTS)
@@ -94,11 +98,11 @@ class Observer:
             if name is not None:
                 report = self._report(name)
                 report.sent_at, report.sent = now, report.sent + 1
-        for event in self._told.read():
-            self.events.append(event)
+        self.events.extend(self._told.read())
         for world in self._worlds.read():
             self.world = world
-        self._read_ranges()
+        if self._ranges is not None:
+            self.scans |= {scan.robot: scan for scan in self._newest(self._ranges, messages.Ranges)}
         if now - self._rated >= RATE_S:
             for report in self.robots.values():
                 report.rate, report.sent = report.sent / (now - self._rated), 0
@@ -152,18 +156,19 @@ class Observer:
         report.status, report.heard_at, report.known = status, now, True
 
     def _read_states(self) -> None:
-        """The newest state of each robot; those before it are not decoded."""
-        newest = {str(sample.key_expr): sample for sample in received(self._states.handler)}
-        for key, sample in newest.items():
-            try:
-                state = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.State)
-            except messages.Malformed:
-                continue
-            if self._keys.whose(key) == state.robot:
-                report = self._report(state.robot)
-                report.state, report.known = state, True
-                for each in state.received:
-                    report.delay[each.sender] = each.arrived - each.stamp
+        for state in self._newest(self._states, messages.State):
+            report = self._report(state.robot)
+            report.state, report.known = state, True
+            for each in state.received:
+                report.delay[each.sender] = each.arrived - each.stamp
+
+    def _newest(self, subscriber: zenoh.Subscriber[Handler], kind: type[R]) -> Iterator[R]:
+        """The last message of each robot."""
+        for key, sample in {str(sample.key_expr): sample for sample in received(subscriber.handler)}.items():
+            with suppress(messages.Malformed):
+                message = messages.decode(sample.payload.to_bytes(), str(sample.encoding), kind)
+                if self._keys.whose(key) == message.robot:
+                    yield message
 
     def watch_ranges(self, *, wanted: bool) -> None:
         """Receives range readings, or receives them no more."""
@@ -173,17 +178,6 @@ class Observer:
             self._ranges.undeclare()  # type: ignore[no-untyped-call]
             self._ranges = None
             self.scans.clear()
-
-    def _read_ranges(self) -> None:
-        if self._ranges is None:
-            return
-        for key, sample in {str(sample.key_expr): sample for sample in received(self._ranges.handler)}.items():
-            try:
-                scan = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Ranges)
-            except messages.Malformed:
-                continue
-            if self._keys.whose(key) == scan.robot:
-                self.scans[scan.robot] = scan
 
     # ------------------------------------------------------------------ what is drawn
 
@@ -227,34 +221,14 @@ class Observer:
             condition=np.array(conditions, dtype=np.intp),
             silent_for=np.array([now - report.sent_at for report in reports]),
             error=error,
-            broken=self._broken(reports, np.array(conditions)),
-            obstacles=self._obstacles(elapsed),
+            broken=stage.broken_links(np.array(conditions), [report.status for report in reports]),
+            obstacles=stage.obstacles_at(elapsed or 0.0, self.world),
             trail=self._trail.points,
             attitude=_rows([None if s is None else s.attitude for s in states], 4),
             shadow=_rows([None if s is None else s.shadow_position for s in states], 3),
             shadow_yaw=np.array([_number(None if s is None else s.shadow_yaw) for s in states]),
             time=elapsed,
         )
-
-    def _broken(self, reports: list[RobotReport], conditions: Array) -> np.ndarray:
-        """Links (E,) whose sender is gone, or misses in the last status of the receiver."""
-        net, names = self.stage.links, self.stage.names
-        missing = {
-            (row, name) for row, report in enumerate(reports) if report.status is not None
-            for name in report.status.missing
-        }  # fmt: skip
-        gone = np.isin(conditions, (Condition.SILENT, Condition.STOPPED, Condition.DEAD))
-        named = [(i, names[j]) in missing for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
-        return np.asarray(gone[net.sender] | gone[net.receiver] | np.array(named, dtype=bool))
-
-    def _obstacles(self, elapsed: float | None) -> Array:
-        """As the world says; without one, where their plans put them."""
-        scene = self.stage.scene
-        pose = scene.at(elapsed or 0.0)
-        for each in [] if self.world is None else self.world.obstacles:
-            if each.name in scene.names and (scene.plans[k := scene.names.index(each.name)] is None):
-                pose[k] = each.pose
-        return pose
 
 
 def _number(value: float | None) -> float:

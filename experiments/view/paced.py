@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from agents.decision.lifecycle import DONE, IDLE, LANDING, READY, RUNNING
+from agents.decision.lifecycle import RUNNING
 from agents.network.messages import Event
 from experiments.definition.experiment import Experiment
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
 from experiments.view.live import FRAME_S, TABLE_S, ShowFolder
 from experiments.view.panel import PLOT_S, Panel, Row, known
-from experiments.view.replay import Clock, add_transport
+from experiments.view.replay import CONDITION_OF, Clock, add_transport
 from experiments.virtual_time.simulation import Instant
 
 if TYPE_CHECKING:
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 POLL_S: Final = 0.005
 PAGE_S: Final = 30.0  # the first case waits so long for a page
-CONDITIONS: Final = {
-    IDLE: Condition.WAITING, READY: Condition.WAITING, LANDING: Condition.LANDING, DONE: Condition.DONE,
-}  # fmt: skip
 
 
 class PacedView:
@@ -99,7 +96,7 @@ class PacedView:
         phase, elapsed = agent.lifecycle.phase, None if isnan(instant.time) else instant.time
         held = agent.hazards.held
         conditions = [
-            CONDITIONS.get(int(each), Condition.HELD if held[row] else Condition.ACTIVE)
+            CONDITION_OF.get(int(each), Condition.HELD if held[row] else Condition.ACTIVE)
             for row, each in enumerate(phase)
         ]
         self._trail.add(instant.now, position)

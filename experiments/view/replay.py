@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from math import inf, nan
-from typing import TYPE_CHECKING, Any, Final
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array
 from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
-from agents.network.messages import EMERGENCY, Status
+from agents.network.messages import EMERGENCY, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
@@ -23,10 +25,14 @@ from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row, known
 if TYPE_CHECKING:
     import viser
 
+M = TypeVar("M", Status, WorldState)
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
 APART: Final = 0.15  # between words on the slider, in its lengths
 GAP: Final = 1.15  # from arena to arena, in its lengths
+CONDITION_OF: Final = {  # by phase; in the others a robot is active, or held
+    IDLE: Condition.WAITING, READY: Condition.WAITING, LANDING: Condition.LANDING, DONE: Condition.DONE,
+}  # fmt: skip
 
 
 class Film:
@@ -54,8 +60,8 @@ class Film:
             condition=conditions,
             silent_for=np.array([_since(track.sent, t) for track in tracks]),
             error=self._links.errors(t, position),
-            broken=self._broken(conditions, t),
-            obstacles=self._obstacles(t),
+            broken=self.stage.broken_links(conditions, [_last(track.statuses, t) for track in tracks]),
+            obstacles=self.stage.obstacles_at(t, _last(self.tracks.world, t)),
             trail=trail,
             attitude=attitude if np.isfinite(attitude).any() else None,
             shadow=shadow if np.isfinite(shadow).any() else None,
@@ -88,24 +94,6 @@ class Film:
         history.rate = list(np.stack(sent, axis=1).astype(float))
         return history
 
-    def _broken(self, conditions: Index, t: float) -> Mask:
-        """Links (E,) whose ends are gone, or whose sender the receiver misses."""
-        net, names = self.stage.links, self.stage.names
-        gone = np.isin(conditions, (Condition.SILENT, Condition.STOPPED, Condition.DEAD))
-        last = [_last(track.statuses, t) for track in self.tracks.tracks]
-        missing = {(row, name) for row, status in enumerate(last) if status is not None for name in status.missing}
-        named = [(i, names[j]) in missing for i, j in zip(net.receiver.tolist(), net.sender.tolist(), strict=True)]
-        return np.asarray(gone[net.sender] | gone[net.receiver] | np.array(named, dtype=bool))
-
-    def _obstacles(self, t: float) -> Array:
-        scene = self.stage.scene
-        pose = scene.at(t)
-        said = [each for each in self.tracks.world if each.stamp <= t]
-        for each in said[-1].obstacles if said else []:
-            if each.name in scene.names and scene.plans[k := scene.names.index(each.name)] is None:
-                pose[k] = each.pose
-        return pose
-
 
 def _condition(track: Track, sample: int, t: float) -> Condition:
     """Condition of a robot by its sample and its last status."""
@@ -116,18 +104,14 @@ def _condition(track: Track, sample: int, t: float) -> Condition:
         return Condition.STOPPED
     if t - track.time[sample] > LOST_S and phase != DONE:
         return Condition.DEAD if sample == len(track.time) - 1 else Condition.SILENT
-    known = {IDLE: Condition.WAITING, READY: Condition.WAITING, LANDING: Condition.LANDING, DONE: Condition.DONE}
     held = status is not None and status.hazard.startswith("hold")
-    return known.get(phase, Condition.HELD if held else Condition.ACTIVE)
+    return CONDITION_OF.get(phase, Condition.HELD if held else Condition.ACTIVE)
 
 
-def _last(statuses: Sequence[Status], t: float) -> Status | None:
-    """The last status at or before `t` [s]."""
-    low, high = 0, len(statuses)
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (middle + 1, high) if statuses[middle].stamp <= t else (low, middle)
-    return statuses[low - 1] if low else None
+def _last(messages: Sequence[M], t: float) -> M | None:
+    """The last message at or before `t` [s]."""
+    count = bisect_right(messages, t, key=attrgetter("stamp"))
+    return messages[count - 1] if count else None
 
 
 def _since(sent: Array, t: float) -> float:
@@ -234,7 +218,7 @@ class ReplayView:
         self._choose(0)
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Draws at 30 Hz while a page is open and something moves, until `ended`."""
+        """Draws while a page is open and something moves, until `ended`."""
         before = time.monotonic()
         while not ended():
             now = time.monotonic()
