@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -31,10 +32,12 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.conductor.run_view import Shown
-from experiments.real_time.conductor.support import await_routers, make_routers
+from experiments.real_time.conductor.support import RouterEnded, await_routers, make_routers
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE
+
+PORT_CHOICES: Final = 3  # of a run with no `network.listen`: a free port may be taken before its router listens there
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,26 @@ def staged(
     Args, Raises: As `conduct`; `embodied` are the cases, see `embody`.
     """
     read.keep(folder / SOURCE)
+    with ExitStack() as up:
+        for left in reversed(range(1 if read.experiment.network.listen else PORT_CHOICES)):
+            try:
+                stage = up.enter_context(_staged(read, embodied, folder, staging, user))
+                break
+            except RouterEnded:
+                if not left:
+                    raise
+        yield stage
+
+
+@contextmanager
+def _staged(
+    read: Document,
+    embodied: Mapping[str, Experiment],
+    folder: Path,
+    staging: RunOptions,
+    user: Supervision,
+) -> Iterator[Stage]:
+    """`staged`, at ports that are free now."""
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed

@@ -29,6 +29,10 @@ class StandInError(RuntimeError):
     """A protocol twin or a positioning system that did not start, with its output."""
 
 
+class RouterEnded(StandInError):
+    """A router that ended instead of listening: its port was taken, or its lab cannot be used."""
+
+
 @dataclass(frozen=True)
 class StandIns:
     """Stand-ins that were started."""
@@ -104,7 +108,7 @@ def _announced(process: Process, pattern: str, count: int, interrupted: Callable
     """Wait until a process has printed `count` lines of a form; returns the two groups of each."""
     deadline = time.monotonic() + READY_S
     while True:
-        found = dict(re.findall(pattern, process.log.read_text(errors="replace"), re.MULTILINE))
+        found = dict(re.findall(pattern, process.output, re.MULTILINE))
         if len(found) >= count:
             return found
         if interrupted() or not process.alive or time.monotonic() > deadline:
@@ -119,13 +123,15 @@ def await_routers(launcher: Launcher, routers: Sequence[Router]) -> None:
     Without that, robots would join a stranger's router where another run took the port at the same moment.
 
     Raises:
-        StandInError: If one does not.
+        RouterEnded: If one ends instead.
+        StandInError: If one does not listen in time.
     """
     for router in routers:
+        process = launcher.get(router.name)
         try:
-            _announced(launcher.get(router.name), r"^(router) (ready)\b", 1, lambda: False)
+            _announced(process, r"^(router) (ready)\b", 1, lambda: False)
         except StandInError as error:
-            raise StandInError(f"{error}; if another run has just begun, start this one again") from None
+            raise (error if process.alive else RouterEnded(str(error))) from None
 
 
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded

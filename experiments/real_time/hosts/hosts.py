@@ -131,7 +131,7 @@ class Station:
             HostError: If the host cannot be reached, or zenpark does not run there.
         """
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
-        ports = iter(ssh.allocated(self.process.log.read_text(errors="replace")))
+        ports = iter(ssh.allocated(self.process.output))
         here = address or self.hello.seen_from or "127.0.0.1"
         try:
             # routers as the host reaches them
@@ -174,7 +174,7 @@ class Station:
     def _broken(self) -> str:
         with suppress(TimeoutError):
             self.process.handle.wait(ANSWER_S)
-        output = self.process.log.read_text(errors="replace")
+        output = self.process.output
         return f"{self.name}: {ssh.explained(self.address, self.host.zenpark, output)}"
 
     @property
@@ -239,7 +239,7 @@ class Station:
 
     def _under_way(self) -> list[Process]:
         """Processes whose ssh is not through yet: the other end prints a line at once."""
-        self._starting = [each for each in self._starting if each.alive and not each.log.stat().st_size]
+        self._starting = [each for each in self._starting if each.alive and not each.output]
         return self._starting
 
 

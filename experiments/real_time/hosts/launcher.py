@@ -37,9 +37,13 @@ class Process:
 
     name: str
     handle: subprocess.Popen[bytes]
-    log: Path
+    log: Path  # begins with the output of processes of this name before it
+    begins: int = 0  # [bytes] where its own output begins there
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
-    shown: int = 0  # bytes of its output that `news` has returned
+    shown: int = 0  # [bytes] end of what `news` has returned
+
+    def __post_init__(self) -> None:
+        self.shown = self.begins
 
     @property
     def alive(self) -> bool:
@@ -52,6 +56,11 @@ class Process:
         if code is None:
             return "still running"
         return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+
+    @property
+    def output(self) -> str:
+        """Its output until now."""
+        return self.log.read_bytes()[self.begins :].decode(errors="replace")
 
     def news(self) -> list[str]:
         """New whole lines of its output."""
@@ -67,7 +76,7 @@ class Process:
     def tail(self) -> str:
         """The end of its output."""
         try:
-            lines = self.log.read_text(errors="replace").splitlines()
+            lines = self.output.splitlines()
         except OSError:
             return ""
         return "\n".join(lines[-TAIL:])
@@ -134,6 +143,7 @@ class Launcher:
         own = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
         log = self._logs / f"{name}.log"
         with log.open("ab") as output:
+            begins = os.fstat(output.fileno()).st_size
             handle = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
@@ -144,7 +154,7 @@ class Launcher:
             )
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
-        process = Process(name, handle, log, bytearray(first_input))
+        process = Process(name, handle, log, begins, bytearray(first_input))
         with self._lock:
             self._processes[name] = process
             self._write(process)

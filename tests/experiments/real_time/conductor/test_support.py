@@ -1,17 +1,20 @@
 """Who serves a whole run is started again, where others look for it, and not for ever."""
 
 import math
-import re
 import socket
 import time
+from contextlib import ExitStack, nullcontext
 from types import SimpleNamespace
 
 import pytest
 
-from agents.network.endpoints import free_endpoint
+from agents.network.endpoints import Endpoint, free_endpoint
+from agents.runtime import run_registry
 from experiments.file import document
+from experiments.real_time.conductor import conduct
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.support import STARTS, Router, Servants, StandInError, await_routers
+from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, embody, staged
+from experiments.real_time.conductor.support import STARTS, RouterEnded, Servants
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import ROUTER, Launcher
 
@@ -46,15 +49,20 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
 
 
 @pytest.mark.system
-def test_a_port_that_another_run_took_at_the_same_moment_ends_the_run(tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken, Launcher(tmp_path / "logs") as launcher:
-        router = Router("router", [f"tcp/127.0.0.1:{taken.getsockname()[1]}"])
-        router.start(launcher)
-        with pytest.raises(StandInError, match=re.compile("already in use.*start this one again", re.DOTALL)):
-            await_routers(launcher, [router])
-        free = Router("router2", [free_endpoint(preferred_port=0)])
-        free.start(launcher)
-        await_routers(launcher, [free])
+def test_a_router_whose_port_was_taken_meanwhile_listens_at_another(tmp_path, monkeypatch):
+    taken = free_endpoint(preferred_port=0)
+    with socket.create_server(("127.0.0.1", Endpoint.parse(taken).port)):
+        free = [[taken], [taken], [free_endpoint(preferred_port=0)]]
+        chosen = iter(free)
+        monkeypatch.setattr(conduct, "free_endpoints", lambda *_, **__: next(chosen))
+        read, user = document.read("triangle"), Supervision(nullcontext(), lambda: False)
+        with staged(read, embody(read, RunOptions()), tmp_path, RunOptions(), user) as stage:
+            assert stage.context("event").endpoints == free[-1]
+            (run,) = [run for run in run_registry.runs() if run.folder == str(tmp_path)]
+            assert run.endpoints == free[-1]
+        chosen = iter([[taken]] * PORT_CHOICES)
+        with pytest.raises(RouterEnded, match="already in use"), ExitStack() as up:
+            up.enter_context(staged(read, embody(read, RunOptions()), tmp_path, RunOptions(), user))
 
 
 def test_a_launcher_that_stood_still_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
