@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 
 from experiments.metrics.results import CaseMetrics, Collision
@@ -20,7 +21,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *failures(cases),
         *interruptions(cases),
         *_troubles(cases),
-        *_nothing_lost(cases),
+        *_lost_poses(cases),
         *_modelled(cases),
         *_deadlines(cases),
         *_gaps(cases),
@@ -78,11 +79,12 @@ def left_out(cases: Sequence[CaseMetrics]) -> str:
     return " ".join(words) or "The means are over all robots."
 
 
-def _nothing_lost(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _lost_poses(cases: Sequence[CaseMetrics]) -> list[Finding]:
     sent = sum(robot.messages for case in cases for robot in case.robots)
     lost = {name: sum(run.lost for run in runs) for name, runs in by_case(cases).items()}
     if not any(lost.values()):
-        return [Finding("good", f"Nothing was lost: {number(sent)} poses were sent, and no running number is missing.")]
+        mark: Mark = "plain" if any(case.failures for case in cases) else "good"
+        return [Finding(mark, f"No pose was lost: {number(sent)} were sent, and no running number is missing.")]
     where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
     return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
 
@@ -222,7 +224,8 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             how = f"{share} % {'fewer' if fewer > 0.0 else 'more'}" if float(share) else "as many"
             how += f" transmissions {'than' if float(share) else 'as'} {reference}"
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
-            text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot."
+            text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot"
+            text += f"{_with_leaders(runs, first)}."
             found.append(Finding("good" if fewer > 0.0 and float(share) else "plain", text))
         errors = [(index.upper(), spread(ratios(runs, first, index))) for index in ("iae", "itae", "rmse")]
         known = [(label, each) for label, each in errors if each.mean is not None]
@@ -235,6 +238,17 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = f"Its errors relative to {reference}: {_list(parts)}."
             found.append(Finding("good" if worse <= 1.0 else "plain" if worse < 1.25 else "fair", text))
     return found
+
+
+def _with_leaders(runs: Sequence[CaseMetrics], first: Sequence[CaseMetrics]) -> str:
+    """The share of transmissions of all robots, where leaders are left out of the means."""
+    leading = any(case.leaders for case in (*runs, *first))
+    sent, before = ([sum(robot.f_hz for robot in run.robots) for run in each] for each in (runs, first))
+    if not leading or not sum(before):
+        return ""
+    fewer = 100.0 * (1.0 - statistics.fmean(sent) / statistics.fmean(before))
+    how = f"{abs(fewer):.1f} % {'fewer' if fewer >= 0.0 else 'more'}"
+    return f"; leaders included, {how}"
 
 
 def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:

@@ -22,7 +22,7 @@ def run():
 def test_a_run_shows_its_verdict_and_table(run):
     html = run._repr_html_()
     assert "<b>Three &lt;robots&gt;</b>" in html
-    assert "✓ Nothing was lost" in html
+    assert "✓ No pose was lost" in html
     assert html.count("<table>") == 1
     assert len(repr(run)) < 200
 

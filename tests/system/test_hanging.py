@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.runtime.watchdog import HUNG
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, PATIENCE_S, ROOT, RobotProcess, Watcher, WorldProcess
+from tests.system.lab import ENVIRONMENT, PATIENCE_S, ROOT, Flight, RobotProcess, Watcher, WorldProcess
 
 pytestmark = pytest.mark.system
 
@@ -196,3 +197,26 @@ def test_a_stop_behind_a_flood_of_what_is_none_is_obeyed(router: RouterProcess, 
     finally:
         robot.end()
         world.end()
+
+
+def test_a_process_that_hangs_in_the_final_landing_fails_the_run(tmp_path: Path) -> None:
+    file = tmp_path / "short.toml"
+    file.write_text(
+        'title = "short"\nduration_s = 1.5\ntrigger = { kind = "periodic" }\n'
+        '[robots.TE01]\nkind = "tello"\nstart = [0.0, 0.0]\nhover = 0.6\n'
+        '[robots.KH01]\nkind = "khepera4"\nstart = [0.5, 0.5]\n'
+    )
+    flight = Flight(tmp_path / "out", str(file))
+    try:
+        flight.until_said("phase conductor: landing")
+        robot = flight.children()["TE01"]
+        robot.suspend()
+        code, _ = flight.finish(90.0)
+    finally:
+        flight.signal(signal.SIGKILL)
+    assert code == 1
+    assert re.search(r"lost TE01: did not end its landing within 15 s: \w+", flight.said())
+    assert "zenpark: Failed in default: TE01 at " in flight.said()
+    report = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    verdict = report[report.index("In short") :]
+    assert verdict.index("TE01 at") < verdict.index("No pose was lost")

@@ -158,9 +158,10 @@ class CaseProcesses:
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
         self._launcher.end(self._standins, grace_s=2.0)
 
-    def end_robots(self) -> None:
-        """End the processes of all robots: these land first."""
-        self._launcher.end([self._process(group) for group in self._groups], grace_s=LAND_S)
+    def end_robots(self) -> list[str]:
+        """End the processes of all robots, which land first; return the robots whose process had to be killed."""
+        groups = {self._process(group): members for group, members in self._groups.items()}
+        return [name for process in self._launcher.end(groups, grace_s=LAND_S) for name in groups[process.name]]
 
     def deaths(self) -> Iterator[Death]:
         """Processes that ended since the last call; router, world, centre and positioning restart, a few times."""

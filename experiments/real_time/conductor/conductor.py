@@ -112,6 +112,8 @@ class Conductor:
                     self._view.report_clocks(clocks)
                     for each in trouble:
                         self._view.report("clock", "conductor", each)
+                for name in self._processes.end_robots():
+                    self._leave_behind(name, "its process hung after the landing, and was killed")
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: show it now
             self._progress.events.append(messages.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
@@ -261,16 +263,27 @@ class Conductor:
         if any(not (view.gone or view.reached("landing")) for view in self._robots.values()):
             self._order(messages.Order("land"))
         deadline = time.monotonic() + LAND_S
-        while time.monotonic() < deadline:
+        while (late := self._not_down()) and time.monotonic() < deadline:
             self._update()
-            if all(
-                view.gone or view.reached("done") or view.phase in ("starting", "idle")
-                for view in self._robots.values()
-            ):
-                break
             time.sleep(POLL_S)
+        for name in late:
+            self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._why(name)}")
         self._progress.phase = "done"
         self._show(self._progress)
+
+    def _not_down(self) -> list[str]:
+        """Robots that are left and have neither landed nor never risen."""
+        return [
+            name
+            for name, view in self._robots.items()
+            if not (view.gone or view.reached("done") or view.phase in {"starting", "idle"})
+        ]
+
+    def _leave_behind(self, name: str, why: str) -> None:
+        """Report a robot that did not end as ordered: it counts as lost, once, and fails the run."""
+        if not self._robots[name].gone:
+            self._robots[name].left_because = "lost"
+            self._view.report("lost", name, why)
 
     # ------------------------------------------------------------------ what happens meanwhile
 

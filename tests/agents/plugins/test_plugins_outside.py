@@ -218,7 +218,7 @@ def test_a_robot_of_the_guide_that_dies_or_freezes_or_tells_nonsense_fails_the_r
     said = flight.said()
     (failed,) = re.findall(r"^zenpark: (Failed in .*)$", said, re.MULTILINE)
     page = re.sub("<.*?>", "", (tmp_path / "run" / "report.html").read_text("utf-8"))
-    top, *_ = re.split("Nothing was lost|Samples were lost", page)
+    top, *_ = re.split("No pose was lost|Samples were lost", page)
     for text in (failed, top):
         assert all(f"{name} at " in text for name in FAULTS)
     assert "RV04 at " not in failed

@@ -102,7 +102,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
         "It rained.",
         "zenpark run <this> --seed 1",
         "TB01 leads and is left out of the means.",
-        "Nothing was lost: 17\u202f",
+        "No pose was lost: 17\u202f",
         "Figure 7.",
         "all robots are ready",
         "ITAE",
@@ -312,6 +312,11 @@ def test_verdict_says_what_was_measured(run):
     said = {finding.text: finding.mark for finding in findings(cases)}
     fewer = 100.0 * (1.0 - cases[1].mean["f_hz"] / cases[0].mean["f_hz"])
     assert any(text.startswith(f"event needs {fewer:.1f} % fewer transmissions than periodic: 4.") for text in said)
+    sent = [sum(robot.f_hz for robot in case.robots) for case in cases]  # the means leave the leader out
+    every = 100.0 * (1.0 - sent[1] / sent[0])
+    assert any(text.endswith(f" per second and robot; leaders included, {every:.1f} % fewer.") for text in said)
+    failed = findings([msgspec.structs.replace(cases[0], failures=("CF01 was lost",))])
+    assert [each.mark for each in failed if each.text.startswith("No pose was lost")] == ["plain"]
     same = {
         finding.text: finding.mark for finding in findings([cases[0], msgspec.structs.replace(cases[0], case="again")])
     }

@@ -51,7 +51,7 @@ def test_what_was_dropped_is_told_apart_from_what_was_lost(run):
 def test_the_verdict_and_the_tables_say_so(run):
     measured = measure(run.trace())
     said = [each.text for each in findings([measured])]
-    assert any(text.startswith("Nothing was lost") for text in said)
+    assert any(text.startswith("No pose was lost") for text in said)
     (text,) = [text for text in said if text.startswith("The modelled network dropped")]
     assert f"dropped {measured.dropped} of 4" in text
     assert text.endswith("at most 50.0 ms.")
