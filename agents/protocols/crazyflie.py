@@ -16,12 +16,15 @@ from agents.protocols.crazyradio import software
 
 Positive = Annotated[float, Meta(gt=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
-StatusRate = Annotated[float, Meta(ge=2, le=100)]  # an older status than 1 s is not believed
+LogRate = Annotated[float, Meta(ge=5, le=100)]
 Wait = Annotated[float, Meta(gt=0, le=60)]
 # [1/s] up and down, that one Crazyradio carries without queues, unless more is measured: half of the 500 exchanges per
 # second of cflib's maintainers (issue 258), with which a queue on board grows to seconds
 PACKETS_PER_RADIO: Final = 250.0
 MEASURED_SHARE: Final = 0.7  # of the measured exchanges per second: full packets are slower than those without content
+YOUNG_S: Final = 0.1  # 99 % of poses are younger, or the rates are refused
+TURNS: Final = 2  # of a radio through its robots, for which a pose waits at most, behind answers
+PERIOD_S: Final = 0.01  # periods of logs are multiples of this
 SETPOINT_PACKETS: Final = 2  # of one setpoint, each of which is answered: its trajectory, and the start of that
 DEFAULT_ADDRESS: Final = "E7E7E7E7E7"  # of a Crazyflie as it is sold, and of cflib
 ADDRESSES: Final = (
@@ -64,8 +67,7 @@ class CrazyflieSettings(Part, frozen=True):
     """CrazyflieSettings of one Crazyflie."""
 
     stream_hz: Rate = 10.0  # largest rate of setpoints
-    log_hz: Rate = 20.0  # rate of the pose; a log period is a multiple of 10 ms
-    status_hz: StatusRate = 5.0  # rate of battery and supervisor
+    log_hz: LogRate = 20.0  # rate of pose, battery and supervisor; a log period is a multiple of 10 ms
     multiranger: bool = False  # has a Multi-ranger deck
     ranges_hz: Rate = 10.0  # rate of its ranges
     # its positioning system; None: set up on board already
@@ -83,6 +85,11 @@ class CrazyflieSettings(Part, frozen=True):
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 
     @property
+    def log_period(self) -> int:
+        """Period of the pose, in units of 10 ms."""
+        return max(1, round(1.0 / PERIOD_S / self.log_hz))
+
+    @property
     def up_hz(self) -> float:
         """Packets per second to the drone."""
         return SETPOINT_PACKETS * self.stream_hz + (
@@ -96,7 +103,7 @@ class CrazyflieSettings(Part, frozen=True):
 
     @property
     def _logs_hz(self) -> float:
-        return self.log_hz + self.status_hz + (self.ranges_hz if self.multiranger else 0.0)
+        return self.log_hz + (self.ranges_hz if self.multiranger else 0.0)
 
     @property
     def packets_hz(self) -> float:
@@ -171,27 +178,52 @@ def capacity(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> float:
     return min(max(PACKETS_PER_RADIO, usable), usable * asked / max(up, down))
 
 
-def fitting_rates(each: CrazyflieSettings, share: float) -> str:
-    """The rates of a robot, lowered to this share of the packets, as its `device` table has them."""
-    period = ceil(100.0 / (share * each.log_hz))
-    lowered = {
-        "log_hz": floor(100.0 / period),
-        "status_hz": max(2, floor(share * each.status_hz)),
-        "stream_hz": max(1, floor(share * each.stream_hz)),
-    }
-    text = ", ".join(f"{name} = {hz:g}" for name, hz in lowered.items())
-    if isinstance(each.positioning, Outside):
-        text += f", positioning.rate_hz = {max(1, floor(share * each.positioning.rate_hz))}"
-    return text
+def oldest_pose(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> float:
+    """Age [s] below which 99 % of the poses of robots with these settings stay, on one radio."""
+    return max(PERIOD_S * one.log_period for one in each) + TURNS * len(each) / exchanges_hz
 
 
-def overload(radio: str, each: Sequence[CrazyflieSettings], carried_hz: float) -> str:
+def overload(radio: str, each: Sequence[CrazyflieSettings], exchanges_hz: float) -> str:
     """Reason why robots with these settings ask too much of a radio, and the rates that fit; empty if they do not."""
-    asked = sum(settings_.packets_hz for settings_ in each)
-    if asked <= carried_hz:
+    asked, carried = sum(one.packets_hz for one in each), capacity(each, exchanges_hz)
+    age = oldest_pose(each, exchanges_hz)
+    if asked <= carried and age <= YOUNG_S:
         return ""
-    slow = " (little: is this computer busy, the channel disturbed?)" if carried_hz < PACKETS_PER_RADIO else ""
-    return (
-        f"radio {radio}: {len(each)} robots ask for {asked:.0f} packets/s, up and down; it carries {carried_hz:.0f}"
-        f"{slow}: in each device table write {fitting_rates(each[0], carried_hz / asked)}, or plug in another radio"
+    slow = " (little: is this computer busy, the channel disturbed?)" if carried < PACKETS_PER_RADIO else ""
+    if asked > carried:
+        fault = f"ask for {asked:.0f} packets/s, up and down; it carries {carried:.0f}{slow}"
+    else:
+        fault = f"would have poses that are {age:.2f} s old, at {exchanges_hz:.0f} exchanges/s{slow}"
+    return f"radio {radio}: {len(each)} robots {fault}: {_remedy(each, exchanges_hz)}"
+
+
+def _remedy(each: Sequence[CrazyflieSettings], exchanges_hz: float) -> str:
+    """The rates that fit a radio, or the number of robots that do."""
+    for robots in range(len(each), 0, -1):
+        for percent in range(100, 0, -1):
+            lowered = _lowered(each[0], 0.01 * percent, robots, exchanges_hz)
+            some = [lowered] * robots
+            if sum(one.packets_hz for one in some) <= capacity(some, exchanges_hz) and (
+                oldest_pose(some, exchanges_hz) <= YOUNG_S
+            ):
+                rates = f"log_hz = {lowered.log_hz:g}, stream_hz = {lowered.stream_hz:g}"
+                if isinstance(lowered.positioning, Outside):
+                    rates += f", positioning.rate_hz = {lowered.positioning.rate_hz:g}"
+                if robots == len(each):
+                    return f"in each device table write {rates}, or plug in another radio"
+                return f"plug in another radio; this one carries {robots}, with {rates}"
+    return "is another program using it?"
+
+
+def _lowered(each: CrazyflieSettings, share: float, robots: int, exchanges_hz: float) -> CrazyflieSettings:
+    """Settings with a share of the rates, in which poses are as young as they must be."""
+    longest = max(floor((YOUNG_S - TURNS * robots / exchanges_hz) / PERIOD_S), 1)
+    system = each.positioning
+    if isinstance(system, Outside):
+        system = msgspec.structs.replace(system, rate_hz=max(1.0, floor(share * system.rate_hz)))
+    return msgspec.structs.replace(
+        each,
+        log_hz=floor(1.0 / PERIOD_S / min(ceil(each.log_period / share), longest)),
+        stream_hz=max(1.0, floor(share * each.stream_hz)),
+        positioning=system,
     )

@@ -114,7 +114,7 @@ class CrazyflieBody:
             time.sleep(WINDOW_S)
             best = max(best, (self._exchanges(rows) - before) / (time.monotonic() - begin))
             self._capacity[radio] = capacity(settings, best)
-            refusal = overload(radio, settings, self._capacity[radio])
+            refusal = overload(radio, settings, best)
             if not refusal:
                 break
         return refusal

@@ -25,6 +25,7 @@ CLIMB: Final = 0.4  # [m/s] mean speed of take-offs
 DESCENT: Final = 0.2  # [m/s] mean speed of landings: never 0.5 m/s
 FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone lags behind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
+UPLOAD_S: Final = 8.0  # limit for writing a climb, part by part
 LONGEST_S: Final = 8.0  # duration of a landing, which others wait 15 s for
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
@@ -38,6 +39,8 @@ FLYING_FLAG_S: Final = 3.0  # from a take-off to the flag "flying" in the status
 LANDING_GAP_S: Final = 0.8  # after a longer gap the drone is landed: it has flown without control
 SLOWEST_HZ: Final = 2.5  # setpoints over a radio that has become slow
 REFRESH_S: Final = 0.25  # a setpoint that does not change is sent again after this
+STRAIGHT: Final = 0.1  # [rad] a smaller yaw is turned to 0 on the way up: two packets instead of seventeen
+SAME: Final = 0.5e-3  # [m], [rad] a smaller change of a setpoint is none: positions are sent in millimetres
 PERIODS: Final = 2.5  # for so many periods of setpoints, and for `HOLD_S`, the last one is held
 MARGIN_S: Final = 2.0  # a drone that nothing reaches is down so long after its trajectory has reached the floor
 HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignored
@@ -75,6 +78,7 @@ class Flight:
         self._commanded_at = math.inf
         self._since = -math.inf
         self._due = -math.inf  # next setpoint [s]
+        self._begun = math.inf  # begin of the setpoint that is being sent [s]
         self._sent: Target | None = None  # last setpoint,
         self._sent_at = -math.inf  # [s]
         self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
@@ -112,21 +116,23 @@ class Flight:
         """Climb to `height` [m] above the ground here; on refusal, `trouble` gives the reason."""
         if self.airborne:
             return
-        self.trouble = self.takeoff_refusal() or self._arm()
-        if self.trouble:
+        x, y, z = self._telemetry.position.tolist()
+        yaw = self._telemetry.yaw
+        place = x, y, z, yaw if abs(yaw) > STRAIGHT else 0.0
+        self._span = max(height / CLIMB, SHORTEST_S)
+        self.trouble = self.takeoff_refusal()
+        trajectory = None if self.trouble else self._write_climb(place, (height, self._span))
+        self.trouble = self.trouble or self._arm()
+        if self.trouble or trajectory is None:
             return
         for _ in range(3):  # without answer: low-level setpoints of another program would mute the planner
             self.link.cf.commander.send_notify_setpoint_stop()
             self._pause(POLL_S)
-        x, y, z = self._telemetry.position.tolist()
-        place = x, y, z, self._telemetry.yaw
-        self._span = max(height / CLIMB, SHORTEST_S)
-        climb = height, self._span
         self._target, self._top = None, (x, y, height, place[3])
         self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
         trajectories = self.link.trajectories
         answer = self._command_planner(
-            trajectories.start_command, lambda: trajectories.climb(place, climb, self._hold), Info.PLANNER_ACTIVE
+            trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE
         )
         self._plan_end(time.monotonic() + self._span, height)
         if answer is None or answer == Status.OK:
@@ -190,11 +196,15 @@ class Flight:
             return
         if self._target is not None and self.phase is Phase.CLIMBING:
             self._enter(Phase.FLYING)
-        if target == self._sent and now - self._sent_at < REFRESH_S:
+        if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
+        self._begun = min(self._begun, now)
         packets = self.link.trajectories.hold(target, self._hold)
+        if packets == 0:
+            return
         self._sent, self._sent_at = target, now
-        self._due = now + packets / (SETPOINT_PACKETS * self._stream_hz) - 0.5 * POLL_S
+        self._due = self._begun + packets / (SETPOINT_PACKETS * self._stream_hz) - 0.5 * POLL_S
+        self._begun = math.inf
         self._plan_end(now, target[2])
 
     def _plan_end(self, since: float, height: float) -> None:
@@ -285,6 +295,16 @@ class Flight:
             return "no take-off: its position estimate has not settled"
         return ""
 
+    def _write_climb(self, place: Target, climb: tuple[float, float]) -> int | None:
+        """Write the climb; returns its number, or None, with `trouble`."""
+        begin = time.monotonic()
+        while (number := self.link.trajectories.write_climb(place, climb, self._hold)) is None:
+            if time.monotonic() > begin + UPLOAD_S:
+                self.trouble = "no take-off: its trajectory is not confirmed; is its radio too full, or gone?"
+                break
+            self._pause(0.25 * POLL_S)
+        return number
+
     def _arm(self) -> str:
         """Arm the motors if necessary, until they may turn; returns the reason of a failure, or an empty text."""
         begin, asked = time.monotonic(), -math.inf
@@ -300,7 +320,7 @@ class Flight:
             self._pause(POLL_S)
         return ""
 
-    def _command_planner(self, command: HighLevel, send: Callable[[], None], flag: int = 0) -> int | None:
+    def _command_planner(self, command: HighLevel, send: Callable[[], object], flag: int = 0) -> int | None:
         """Send a high-level command until the drone replies; returns the code of the reply, or None.
 
         `flag`: of the status, which stands for a reply.
@@ -318,3 +338,7 @@ class Flight:
                 if self._telemetry.info & flag and self._telemetry.status_time > begin:
                     return None
         return None
+
+
+def _same(target: Target, sent: Target | None) -> bool:
+    return sent is not None and all(abs(new - old) <= SAME for new, old in zip(target, sent, strict=True))

@@ -135,6 +135,7 @@ class CrazyflieLink:
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
         self.trajectories = Trajectories(self._send)
+        self.confirmed: Callable[[], None] = lambda: None  # called when the drone has confirmed a part of them
         cf = self.cf = Crazyflie()
         cf._toc_cache = _tables()
         cf.link_statistics.start = lambda: None  # its pings cost ten packets a second, and its thread can join itself
@@ -408,6 +409,7 @@ class CrazyflieLink:
             number, address = crtp.MEMORY.unpack_from(packet.data)
             if number == self.trajectories.memory:
                 self.trajectories.note_answer(address, packet.data[crtp.MEMORY.size])
+                self.confirmed()
 
     def _note_firmware(self, packet: Packet) -> None:
         if packet.data and packet.data[0] == crtp.FIRMWARE:

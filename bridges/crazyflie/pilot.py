@@ -154,6 +154,7 @@ class CrazyfliePilot:
                 continue
             try:
                 self._link = self._flight.link = link
+                link.confirmed = self._wake.set
                 self._prepare(link)
                 self._serve(link)
                 break
@@ -247,7 +248,7 @@ class CrazyfliePilot:
         self._slowed = False
         link.define_trajectories()  # before answers wait behind logs
         ranges_hz = settings.ranges_hz if settings.multiranger else None
-        telemetry.start_logging(link, log_hz=settings.log_hz, status_hz=settings.status_hz, ranges_hz=ranges_hz)
+        telemetry.start_logging(link, log_hz=settings.log_hz, ranges_hz=ranges_hz)
         link.ask_firmware()
         deadline = time.monotonic() + STATUS_S
         while telemetry.status_time == -inf:
@@ -353,7 +354,7 @@ class CrazyfliePilot:
         gap = max(link.take_gap() if link.is_radio else 0.0, self._stood_still)
         self._stood_still = 0.0
         silent = now - max(self._telemetry.arrival, self._logs_at)
-        if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.status_hz and link.gap < LOGLESS_S):
+        if gap > LOGS_S or (silent > LOGLESS_S + 3.0 / self._settings.log_hz and link.gap < LOGLESS_S):
             self._logs_at = now
             link.restart_logs()
         late = self._telemetry.pose_age - (now - self._telemetry.arrival)  # [s] time in queues

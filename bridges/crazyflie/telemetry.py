@@ -17,10 +17,10 @@ from agents.arrays import Array
 from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
 
-POSE: Final = {f"stateEstimate.{name}": "float" for name in ("x", "y", "z", "vx", "vy", "vz")} | {
-    "stateEstimate.yaw": "FP16"  # two bytes are left of 26: a pose is one packet
-}
-STATUS: Final = {
+PLACE: Final = tuple(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz"))  # [mm], [mm/s]
+YAW: Final = "stateEstimate.yaw"  # [degrees]
+STATE: Final = dict.fromkeys(PLACE, "int16_t") | {  # 23 bytes of 26: pose and status are one packet
+    YAW: "FP16",
     "supervisor.info": "uint16_t",
     "pm.vbat": "FP16",
     "pm.state": "int8_t",
@@ -52,7 +52,7 @@ class Board:
 
     def __init__(self, rows: int) -> None:
         never = np.full(rows, -np.inf)
-        self.pose_time, self.status_time, self.ranges_time = never.copy(), never.copy(), never.copy()  # (N,) [s]
+        self.pose_time, self.ranges_time = never.copy(), never.copy()  # (N,) [s]
         self.pose = np.full((rows, 7), np.nan)  # x, y, z [m], their rates [m/s], yaw [rad]
         self.settled = np.zeros(rows, dtype=bool)  # position estimate has settled and may be used
         self.info = np.zeros(rows, dtype=np.intp)  # flags of the supervisor
@@ -97,17 +97,13 @@ class Telemetry:
         self.board, self.row = board, row
         self.stamps = StampAge()
         self.arrival = -inf  # of the last packet of a log [s, monotonic]
+        self.status_time = -inf  # of the last status over this connection [s, monotonic]
         self._lighthouse = lighthouse
 
     @property
     def info(self) -> Info:
         """Last flags of the supervisor."""
         return Info(int(self.board.info[self.row]))
-
-    @property
-    def status_time(self) -> float:
-        """Time of the last status on the monotonic clock [s]."""
-        return float(self.board.status_time[self.row])
 
     @property
     def position(self) -> Array:
@@ -133,13 +129,12 @@ class Telemetry:
         """Clear the status at a new connection."""
         self.stamps = StampAge()
         self.arrival = -inf
-        self.board.status_time[self.row] = -np.inf
+        self.status_time = -inf
         self.board.info[self.row] = 0
 
-    def start_logging(self, link: CrazyflieLink, *, log_hz: float, status_hz: float, ranges_hz: float | None) -> None:
+    def start_logging(self, link: CrazyflieLink, *, log_hz: float, ranges_hz: float | None) -> None:
         """Start the log blocks that fill the board."""
-        link.start_log("pose", log_hz, POSE, self._pose)
-        link.start_log("status", status_hz, STATUS, self._status)
+        link.start_log("state", log_hz, STATE, self._state)
         if ranges_hz is not None:
             link.start_log("ranges", ranges_hz, RANGES, self._ranges)
 
@@ -158,19 +153,17 @@ class Telemetry:
         self.arrival = t
         return t - self.stamps.age(t, stamp)
 
-    def _pose(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
-        x, y, z, vx, vy, vz, yaw = (values.get(name, nan) for name in POSE)
-        self.board.pose[self.row] = x, y, z, vx, vy, vz, radians(yaw)
-        self.board.pose_time[self.row] = self._stamped(t, stamp)
-
-    def _status(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
+    def _state(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         board, row = self.board, self.row
+        measured = self._stamped(t, stamp)
+        place = (MM * values.get(name, nan) for name in PLACE)
+        board.pose[row] = *place, radians(values.get(YAW, nan))
+        board.pose_time[row] = measured
         board.info[row] = int(values["supervisor.info"]) if "supervisor.info" in values else _info(values)
         board.power[row] = int(values.get("pm.state", Power.BATTERY))
-        measured = self._stamped(t, stamp)
-        self._add_volts(values.get("pm.vbat", nan), measured - board.status_time[row])
+        self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
         board.stations[row] = int(values.get("lighthouse.status", -1))
-        board.status_time[row] = measured
+        self.status_time = measured
 
     def _add_volts(self, volts: float, since: float) -> None:
         """Filter the voltage `since` [s] after the last one, and estimate the charge, with the motors on or off."""

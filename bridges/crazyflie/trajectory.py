@@ -11,6 +11,7 @@ used for yaw 0, and polynomials in several packets for others. Formats: Bitcraze
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -27,10 +28,13 @@ FARTHEST: Final = 32.0  # [m] from the origin in a compressed trajectory
 CHUNK: Final = 24  # [bytes] written by one packet
 LONGEST_MS: Final = 0xFFFF
 SHORTEST_S: Final = 0.01
-# trajectories by number: a compressed one, of which only the end, nearly always the same, is read after its start; two
-# lists of polynomials, one of which is written while the other is flown, and those of a take-off; address, pieces
-COMPRESSED, FIRST, SECOND, TAKEOFF = range(4)
-PLACES: Final = ((0x000, 0), (0x100, 2), (0x300, 2), (0x500, 3))
+# trajectories by number: two of each format, one of which is written while the other is flown, and those of a take-off
+COMPRESSED: Final = (0, 1)
+POLYNOMIALS: Final = (2, 3)
+TAKEOFFS: Final = (4, 5)
+# address, and the number of pieces of polynomials, which compressed ones do not need
+PLACES: Final = ((0x000, 0), (0x040, 0), (0x100, 2), (0x300, 2), (0x080, 0), (0x500, 3))
+REPEAT_S: Final = 0.3  # a part that is not confirmed is written again after this
 START_EXPIRY_S: Final = 0.5  # a radio does not deliver a start that has waited for longer
 STAMP: Final = struct.Struct("<d")  # time of a start [s, monotonic], behind what the firmware reads of it
 
@@ -47,21 +51,20 @@ def rest_to_rest(begin: float, end: float, span: float) -> list[float]:
     return [begin, 0.0, 0.0, 0.0, *powers]
 
 
-def compressed(place: Sequence[float], hold: float) -> bytes:
-    """Hold x, y, z [m] with yaw 0 for `hold` [s], then sink to `BELOW`."""
-    sinking = min(max(round(crtp.SECONDS_MS * (place[2] - BELOW) / SINK), 1), LONGEST_MS)
-    return b"".join(
-        (
-            struct.pack("<4h", *(round(each / crtp.MM) for each in place[:3]), 0),
-            struct.pack("<BH", 0, round(crtp.SECONDS_MS * hold)),
-            struct.pack("<BHh", 1 << 4, sinking, round(BELOW / crtp.MM)),  # z: one control point, a straight line
-            struct.pack("<BH", 0, 0),
-        )
-    )
+def compressed(place: Sequence[float], hold: float, climb: tuple[float, float] | None = None) -> bytes:
+    """Hold x, y, z [m] with yaw 0 for `hold` [s], then sink; see `polynomials`."""
+    x, y, z, top = (round(each / crtp.MM) for each in (*place[:3], place[2] if climb is None else climb[0]))
+    pieces = [struct.pack("<4h", x, y, z, 0)]
+    if climb is not None:  # z: seven control points, of which those at each end are equal: at rest there
+        pieces.append(struct.pack("<BH7h", 3 << 4, round(crtp.SECONDS_MS * climb[1]), *[z] * 3, *[top] * 4))
+    pieces.append(struct.pack("<BH", 0, round(crtp.SECONDS_MS * hold)))
+    sinking = min(max(round((top - BELOW / crtp.MM) / SINK), 1), LONGEST_MS)
+    pieces.append(struct.pack("<BHh", 1 << 4, sinking, round(BELOW / crtp.MM)))  # one control point, a straight line
+    return b"".join((*pieces, struct.pack("<BH", 0, 0)))
 
 
 def polynomials(place: Target, hold: float, climb: tuple[float, float] | None = None) -> bytes:
-    """Hold a place for `hold` [s], then sink to `BELOW`; before that `climb` from it to a height [m] in a time [s]."""
+    """Hold a place for `hold` [s], then sink to `BELOW`; before that `climb` from there to a height [m] in some [s]."""
     x, y, z, yaw = place
     pieces = [] if climb is None else [(rest_to_rest(z, *climb), climb[1])]
     top = z if climb is None else climb[0]
@@ -73,10 +76,17 @@ def polynomials(place: Target, hold: float, climb: tuple[float, float] | None = 
     )
 
 
+def _fits(target: Target) -> bool:
+    """Whether a compressed trajectory can hold a setpoint."""
+    return target[3] == 0.0 and max(map(abs, target[:3])) < FARTHEST
+
+
 class Trajectories:
     """Trajectory memory of one Crazyflie, over one link.
 
-    Of polynomials only what differs is written, and they are started when the drone has confirmed all of it.
+    Only what differs is written, one part at a time: a burst of parts would be answered by a burst, behind which poses
+    wait. A trajectory is started when the drone has confirmed all of it, because the firmware may start what its memory
+    holds before a write that came first (two tasks).
     """
 
     def __init__(self, send: Send) -> None:
@@ -84,67 +94,78 @@ class Trajectories:
         self.start_command = HighLevel.START_2
         self._send = send
         self._written: dict[int, bytes] = {}  # confirmed parts, by address
-        self._sent: dict[int, bytes] = {}  # parts that are not confirmed yet
-        self._upcoming: bytes | None = None  # polynomials that are not started yet,
-        self._number = FIRST  # and their number
-        # the compressed one is of this flight: the firmware may start it before it has written the last one (two tasks)
-        self._current = False
+        self._sent: tuple[int, bytes] | None = None  # address and content of the part that is not confirmed yet,
+        self._sent_at = -math.inf  # [s, monotonic]
+        self._upcoming: tuple[int, bytes] | None = None  # number and content of the setpoint that is being written
+        self._started = -1  # number of the last trajectory that was started
+        self._packets = 0  # sent since then
 
     def define(self) -> None:
         """Tell the drone where its trajectories are; each is answered."""
         for number, (address, pieces) in enumerate(PLACES):
-            kind = crtp.COMPRESSED if number == COMPRESSED else crtp.UNCOMPRESSED
+            kind = crtp.UNCOMPRESSED if pieces else crtp.COMPRESSED
             place = crtp.DEFINE.pack(crtp.IN_MEMORY, kind, address, pieces)
             self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, number)) + place)
 
     def note_answer(self, address: int, status: int) -> None:
         """Answer of the drone about a part that was written."""
-        self._current |= address == PLACES[COMPRESSED][0] and status == 0
-        part = self._sent.pop(address, None)
-        if part is not None and status == 0:
-            self._written[address] = part
+        if self._sent is not None and self._sent[0] == address:
+            if status == 0:
+                self._written[address] = self._sent[1]
+            self._sent = None
 
     def hold(self, target: Target, seconds: float) -> int:
-        """Send a setpoint that is held for some seconds, or a part of it; returns the number of packets."""
-        if target[3] == 0.0 and max(map(abs, target[:3])) < FARTHEST:
-            self._upcoming = None
-            self._write_part(PLACES[COMPRESSED][0], compressed(target, seconds))
-            return 1 + (self._start(COMPRESSED) if self._current else 0)
-        self._current = False
-        self._upcoming = self._upcoming or polynomials(target, seconds)
-        packets = self._write(self._number, self._upcoming)
-        if packets == 0:
-            packets, self._upcoming = self._start(self._number), None
-            self._number = SECOND if self._number == FIRST else FIRST
-        return packets
+        """Write the next part of a setpoint that is held for some seconds, or start it when all of it is confirmed.
 
-    def climb(self, place: Target, climb: tuple[float, float], seconds: float) -> None:
-        """Write a climb from a place to a height [m] in a time [s], or start it once the drone has confirmed it."""
-        self._current, self._upcoming = False, None  # of an earlier flight
-        if self._write(TAKEOFF, polynomials(place, seconds, climb)) == 0:
-            self._start(TAKEOFF)
+        A setpoint that has been begun is started before another one is written. Returns the number of packets that it
+        has taken if it was started, else 0.
+        """
+        if self._upcoming is None:
+            short = _fits(target)
+            data = compressed(target, seconds) if short else polynomials(target, seconds)
+            one, other = COMPRESSED if short else POLYNOMIALS
+            again = self._started in (one, other) and not self._missing(self._started, data)
+            self._upcoming = self._started if again else other if self._started == one else one, data
+        number, data = self._upcoming
+        return self.start(number) if self._write(number, data) else 0
 
-    def _write(self, number: int, data: bytes) -> int:
-        address, _ = PLACES[number]
-        parts = {address + k: data[k : k + CHUNK] for k in range(0, len(data), CHUNK)}
-        missing = {at: part for at, part in parts.items() if self._written.get(at) != part}
-        for at, part in missing.items():
-            self._written.pop(at, None)
-            self._sent[at] = part
-        return sum(self._write_part(at, part) for at, part in missing.items())
+    def write_climb(self, place: Target, climb: tuple[float, float], seconds: float) -> int | None:
+        """Write the next part of a climb, see `polynomials`; returns its number when all of it is confirmed."""
+        self._upcoming = None  # of an earlier flight
+        short = _fits((*place[:2], climb[0], place[3]))
+        number = TAKEOFFS[0 if short else 1]
+        write = compressed if short else polynomials
+        return number if self._write(number, write(place, seconds, climb)) else None
 
-    def _write_part(self, address: int, part: bytes) -> int:
-        self._send(Port.MEMORY, crtp.MEMORY_WRITE, crtp.MEMORY.pack(self.memory, address) + part)
-        return 1
-
-    def _start(self, number: int) -> int:
+    def start(self, number: int) -> int:
+        """Start a trajectory; returns the number of packets since the last start."""
         packed = (
             crtp.START_2.pack(False, False, False, number, 1.0)
             if self.start_command == HighLevel.START_2
             else crtp.START.pack(False, False, number, 1.0)
         )
         self._send(Port.HIGH_LEVEL, 0, bytes((self.start_command, 0)) + packed + STAMP.pack(time.monotonic()))
-        return 1
+        packets, self._packets = self._packets + 1, 0
+        self._started, self._upcoming = number, None
+        return packets
+
+    def _write(self, number: int, data: bytes) -> bool:
+        """Write the next part of a trajectory, unless one is not confirmed yet; True when all of it is."""
+        missing = self._missing(number, data)
+        now = time.monotonic()
+        if missing and (self._sent is None or now - self._sent_at > REPEAT_S):
+            address, part = self._sent = missing[0]
+            self._written.pop(address, None)
+            self._sent_at = now
+            self._packets += 1
+            self._send(Port.MEMORY, crtp.MEMORY_WRITE, crtp.MEMORY.pack(self.memory, address) + part)
+        return not missing
+
+    def _missing(self, number: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Addresses and contents of the parts of a trajectory that the drone has not confirmed."""
+        begin, _ = PLACES[number]
+        parts = ((begin + k, data[k : k + CHUNK]) for k in range(0, len(data), CHUNK))
+        return [(address, part) for address, part in parts if self._written.get(address) != part]
 
 
 class PromptRadio:

@@ -234,7 +234,7 @@ def _radio(each: Observed) -> Check:
         return Check(check="radio", verdict="unknown", found="no shared radio")
     found = f"{asked:.0f} of {carried:.0f} packets/s"
     if asked > carried:
-        return _bad("radio", found, "lower stream_hz, log_hz and status_hz, or plug in another radio for some robots")
+        return _bad("radio", found, "lower stream_hz and log_hz, or plug in another radio for some robots")
     return Check(check="radio", verdict="ok", found=found)
 
 

@@ -250,20 +250,6 @@ def test_a_session_that_begins_while_safelink_is_on():
             again.close()
 
 
-def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
-    """More logs than polls: the drone says so by its stamps, long before a packet is lost; then the radio recovers."""
-    monkeypatch.setattr(body, "overload", lambda *_: "")
-    with flown(device=RADIO | {"log_hz": 100.0}, exchanges_hz=90.0) as (twin, process):
-        process.until(lambda: len(twin.device.lines[0].queue) > 150, "queue")
-        waits = len(twin.device.lines[0].queue) / 105.0  # [s] of logs
-        assert process.t - process.state.time[0] == pytest.approx(waits, rel=0.3)
-        process.body.takeoff(np.array([0]), np.array([HEIGHT]))
-        process.until(lambda: "s old; is its radio too full" in process.state.notes[0], "refusal")
-        process.until(lambda: not process.state.flying[0], "on the ground")
-        assert truth(twin)[2] == 0.0
-        assert twin.device.lines[0].dropped == 0
-
-
 def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
     """Twenty times as many logs as asked for, more than there are polls: answers and the status wait behind them."""
     with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
@@ -315,8 +301,8 @@ def test_recovery_from_a_crash_is_asked_for():
 # rates that a radio of 500 exchanges/s carries; for 15 drones one of 1,000
 FLEETS = {
     4: (500.0, {}),
-    8: (500.0, {"log_hz": 14.0, "status_hz": 3.0, "stream_hz": 4.0}),
-    15: (1000.0, {"log_hz": 12.0, "status_hz": 2.0, "stream_hz": 3.0}),
+    8: (500.0, {"stream_hz": 5.0}),
+    15: (1000.0, {"stream_hz": 4.0}),
 }
 
 

@@ -233,10 +233,8 @@ def test_firmware_without_supervisor():
         def start_log(self, name, _rate, variables, logged):
             blocks[name] = variables, logged
 
-    telemetry.start_logging(Old(), log_hz=50.0, status_hz=10.0, ranges_hz=None)
-    blocks["status"][1](
-        1.0, 0, {"pm.vbat": 3.55, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0}
-    )
+    telemetry.start_logging(Old(), log_hz=50.0, ranges_hz=None)
+    blocks["state"][1](1.0, 0, {"pm.vbat": 3.55, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
     assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
     assert board.battery[0] == pytest.approx(0.5)
     assert telemetry.battery_low
@@ -255,17 +253,42 @@ def test_other_robots():
 
 @pytest.mark.parametrize(("exchanges", "carried"), [(100.0, 70.0), (300.0, 210.0), (600.0, 420.0)])
 def test_what_a_radio_carries(exchanges, carried):
-    """Of 65 packets per second and robot, 45 come down, 20 of them nearly empty: at most 70 % of the exchanges."""
+    """Of 60 packets per second and robot, 40 come down, 20 of them nearly empty: at most 70 % of the exchanges."""
     assert capacity([CrazyflieSettings()] * 5, exchanges) == pytest.approx(carried)
 
 
-def test_crowded_radio():
-    """Six robots at the defaults, 45 packets per second each, are more than 250; the rates that are named fit."""
-    assert overload("0", [CrazyflieSettings()] * 5, 250.0) == ""
-    text = overload("0", [CrazyflieSettings()] * 6, 250.0)
-    assert text.startswith("radio 0: 6 robots ask for 270 packets/s, up and down; it carries 250: ")
-    assert "log_hz = 16, status_hz = 4, stream_hz = 9, or plug in another radio" in text
-    assert overload("0", [CrazyflieSettings(log_hz=16, status_hz=4, stream_hz=9)] * 6, 250.0) == ""
-    with_positions = overload("0", [CrazyflieSettings(positioning=Outside())] * 8, 250.0)
-    assert "520 packets/s" in with_positions
-    assert "positioning.rate_hz = 9" in with_positions
+@pytest.mark.parametrize(
+    ("robots", "exchanges", "device", "said", "rates"),
+    [
+        (6, 357.0, {}, "", {}),
+        (8, 396.0, {}, "ask for 320 packets/s, up and down; it carries 277: ", {"stream_hz": 7.0}),
+        (15, 664.0, {}, "ask for 600 packets/s, up and down; it carries 465: ", {"stream_hz": 5.0}),
+        (6, 500.0, {"log_hz": 50.0}, "ask for 420 packets/s", {"log_hz": 33.0, "stream_hz": 9.0}),
+        (5, 500.0, {"log_hz": 8.0}, "would have poses that are 0.14 s old, at 500 exchanges/s: ", {"log_hz": 12.0}),
+        (
+            8,
+            500.0,
+            {"positioning": Outside()},
+            "ask for 480 packets/s",
+            {"log_hz": 16.0, "stream_hz": 6.0, "positioning": Outside(rate_hz=13.0)},
+        ),
+    ],
+)
+def test_crowded_radio(robots, exchanges, device, said, rates):
+    """The rates that are named fit, and leave poses young."""
+    text = overload("0", [CrazyflieSettings(**device)] * robots, exchanges)
+    if not said:
+        assert text == ""
+        return
+    assert text.startswith(f"radio 0: {robots} robots {said}")
+    fitting = [CrazyflieSettings(**device | rates)] * robots
+    assert overload("0", fitting, exchanges) == ""
+    named = f"log_hz = {fitting[0].log_hz:g}, stream_hz = {fitting[0].stream_hz:g}"
+    if "positioning" in rates:
+        named += f", positioning.rate_hz = {rates['positioning'].rate_hz:g}"
+    assert text.endswith(f": in each device table write {named}, or plug in another radio")
+
+
+def test_a_radio_with_too_many_robots():
+    text = overload("0", [CrazyflieSettings()] * 15, 400.0)
+    assert text.endswith(": plug in another radio; this one carries 10, with log_hz = 20, stream_hz = 4")

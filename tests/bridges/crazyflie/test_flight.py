@@ -11,9 +11,10 @@ from agents.protocols.crazyflie import CrazyflieSettings
 from agents.protocols.crtp import HighLevel, Info, Port
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
+from bridges.crazyflie import trajectory as trajectory_module
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.telemetry import Board, Telemetry
-from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFF, Trajectories
+from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, Trajectories
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
 
@@ -23,7 +24,7 @@ class Air:
 
     def __init__(self, monkeypatch, **chosen):
         self.now, self.sent = 100.0, []
-        for each in (module, telemetry_module):
+        for each in (module, telemetry_module, trajectory_module):
             monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.board = Board(1)
         self.telemetry = Telemetry(self.board, 0, lighthouse=False)
@@ -50,7 +51,7 @@ class Air:
         if port == Port.MEMORY:
             trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], 0)
         elif data[0] == HighLevel.START_2:
-            self.sent.append((self.now, "climb" if data[5] == TAKEOFF else "setpoint"))
+            self.sent.append((self.now, "climb" if data[5] in TAKEOFFS else "setpoint"))
 
     def pause(self, seconds):
         self.now += seconds
@@ -65,7 +66,7 @@ class Air:
         end = self.now + seconds
         while self.now < end:
             self.now += 0.02
-            self.board.status_time[0] = self.board.pose_time[0] = self.telemetry.arrival = self.now
+            self.telemetry.status_time = self.board.pose_time[0] = self.telemetry.arrival = self.now
             self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
             self.flight.set_target(self.now, PLACE)
             self.flight.update_phase(self.now)
@@ -100,6 +101,15 @@ def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
     air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
     air.pass_(2.0)
     assert 15 < len([at for at in air.times("setpoint") if at > begin]) < 25
+
+
+def test_a_setpoint_that_changes_by_less_than_is_sent_does_not_change(air):
+    places = iter(np.tile([0.1, 0.1004], 1000))
+    setpoint = air.flight.set_target
+    air.flight.set_target = lambda now, _: setpoint(now, (next(places), 0.2, 0.5, 0.0))
+    begin = air.now
+    air.pass_(2.0)
+    assert len([at for at in air.times("setpoint") if at > begin]) < 10
 
 
 def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
@@ -233,7 +243,7 @@ def test_an_old_status_tells_of_an_earlier_phase(air):
     air.flying = False
     for _ in range(200):
         air.now += 0.02
-        air.telemetry.arrival, air.board.status_time[0] = air.now, 100.0
+        air.telemetry.arrival, air.telemetry.status_time = air.now, 100.0
         air.flight.set_target(air.now, PLACE)
         air.flight.update_phase(air.now)
     assert air.flight.phase is Phase.FLYING

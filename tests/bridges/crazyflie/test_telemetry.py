@@ -1,5 +1,6 @@
 """Telemetry of a Crazyflie: age of poses by the drone's own stamps, and charge by the voltage under load."""
 
+import numpy as np
 import pytest
 
 from agents.protocols.crtp import Info
@@ -48,7 +49,7 @@ class Blocks:
 
     def __init__(self, telemetry):
         self.logged = {}
-        telemetry.start_logging(self, log_hz=50.0, status_hz=10.0, ranges_hz=None)
+        telemetry.start_logging(self, log_hz=50.0, ranges_hz=None)
 
     def start_log(self, name, _rate, _variables, logged):
         self.logged[name] = logged
@@ -57,9 +58,10 @@ class Blocks:
 def test_poses_carry_the_time_of_their_measurement():
     board = Board(1)
     blocks = Blocks(Telemetry(board, 0, lighthouse=False))
-    pose = {"stateEstimate.x": 1.0}
-    blocks.logged["pose"](10.0, 5000, pose)
-    blocks.logged["pose"](13.0, 5020, pose)
+    state = {"stateEstimateZ.x": 1500, "stateEstimateZ.vy": -20, "stateEstimate.yaw": 90.0}
+    blocks.logged["state"](10.0, 5000, state)
+    blocks.logged["state"](13.0, 5020, state)
+    assert board.pose[0, [0, 4, 6]] == pytest.approx([1.5, -0.02, np.pi / 2])
     assert board.pose_time[0] == pytest.approx(10.02, abs=1e-3)
 
 
@@ -69,10 +71,10 @@ def test_charge_by_the_voltage_under_load():
     blocks = Blocks(telemetry)
 
     def after(seconds, volts, info):
-        begin = telemetry.status_time if board.status_time[0] > 0 else 0.0
+        begin = max(telemetry.status_time, 0.0)
         for tick in range(1, int(10 * seconds) + 1):
             t = begin + 0.1 * tick
-            blocks.logged["status"](t, int(1000 * t), {"supervisor.info": int(info), "pm.vbat": volts})
+            blocks.logged["state"](t, int(1000 * t), {"supervisor.info": int(info), "pm.vbat": volts})
         return float(board.battery[0])
 
     assert after(1.0, 4.2, Info.CAN_FLY) == pytest.approx(1.0)

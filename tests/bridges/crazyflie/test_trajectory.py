@@ -1,6 +1,7 @@
 """Trajectories that end on the floor, as the twin's memory and planner read them."""
 
 import array
+import types
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from agents.protocols import crtp
 from agents.protocols.crazyradio import COUNTERS, NULL
 from agents.protocols.crtp import HighLevel, Memory, Port
 from bridges.crazyflie import trajectory as module
-from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, SECOND, SINK, START_EXPIRY_S, TAKEOFF
+from bridges.crazyflie.trajectory import COMPRESSED, HOLD_S, POLYNOMIALS, REPEAT_S, SINK, START_EXPIRY_S, TAKEOFFS
 from twins.devices.crazyflie.memory import Memories
-from twins.devices.crazyflie.planner import Planner
+from twins.devices.crazyflie.planner import Planner, evaluate, polynomial
 from twins.devices.crazyflie.trajectories import Trajectories
 
 DT = 0.01
@@ -21,8 +22,10 @@ TOUCHES = 0.5  # [m/s] faster at the floor is no landing
 class Board:
     """Memory, planner and answers of a Crazyflie; `lost`: so many answers about the memory do not come."""
 
-    def __init__(self):
+    def __init__(self, monkeypatch):
         self.memories, self.planner, self.lost = Memories(), Planner(1), 0
+        self.now = 100.0
+        monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
         self.trajectories = Trajectories(self.memories)
         self.sent, self.started = [], []
         self.client = module.Trajectories(self.receive)
@@ -50,10 +53,23 @@ class Board:
         """Poses (k, 4) of the plan, `DT` apart."""
         return np.array([self.planner.goal(k * DT)[0] for k in range(round(seconds / DT))])
 
+    def hold(self, x, yaw=0.0):
+        """Called again and again until the setpoint is started; returns the packets that were sent."""
+        self.sent.clear()
+        while not self.client.hold((x, 2.0, 0.5, yaw), HOLD_S):
+            self.now += 0.05
+        return len(self.sent)
+
+    def climb(self, place, climb):
+        while (number := self.client.write_climb(place, climb, HOLD_S)) is None:
+            assert self.started == []
+            self.now += 0.05
+        self.client.start(number)
+
 
 @pytest.fixture
-def board():
-    return Board()
+def board(monkeypatch):
+    return Board(monkeypatch)
 
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 3.0])
@@ -71,15 +87,20 @@ def test_a_setpoint_is_held_and_then_left_for_the_floor(board, height, yaw):
     assert poses[-1, 2] == pytest.approx(module.BELOW, abs=0.01)
     assert sinks[round(1.1 / DT)] == pytest.approx(SINK, rel=0.01)
     if yaw == 0.0:
-        assert board.started == [COMPRESSED]
+        assert board.started == [COMPRESSED[0]]
         assert len(board.sent) == 2
 
 
-def test_a_climb_ends_on_the_floor_too(board):
-    while not board.started:
-        board.client.climb((0.1, 0.2, 0.02, 0.7), (0.8, 2.0), HOLD_S)
-    assert board.started == [TAKEOFF]
-    z = board.flown(12.0)[:, 2]
+@pytest.mark.parametrize(("yaw", "packets"), [(0.0, 2), (0.7, 17)])
+def test_a_climb_ends_on_the_floor_too(board, yaw, packets):
+    board.climb((0.1, 0.2, 0.02, yaw), (0.8, 2.0))
+    assert board.started == [TAKEOFFS[packets > 2]]
+    assert len(board.sent) == packets + 1
+    poses = board.flown(12.0)
+    assert poses[:, [0, 1, 3]] == pytest.approx(np.tile([0.1, 0.2, yaw], (len(poses), 1)))
+    ways = polynomial(2.0, (np.array([0.02]), *[np.zeros(1)] * 2), (np.array([0.8]), *[np.zeros(1)] * 2))
+    assert poses[:200, 2] == pytest.approx(evaluate(ways, np.arange(200) * DT)[0], abs=1e-3)
+    z = poses[:, 2]
     assert z[0] == pytest.approx(0.02)
     assert z.max() == pytest.approx(z[round(2.0 / DT)]) == pytest.approx(0.8)
     assert z[round(3.0 / DT)] == pytest.approx(0.8)
@@ -87,57 +108,45 @@ def test_a_climb_ends_on_the_floor_too(board):
     assert z[-1] < 0.0
 
 
-def test_polynomials_are_started_when_all_of_them_is_confirmed(board):
-    """Also with a setpoint that changes meanwhile; then only what differs is written, beside the one that is flown."""
-    board.lost = 3
-    board.client.hold((1.0, 2.0, 0.5, 0.3), HOLD_S)
-    assert board.started == []
-    written = len(board.sent)
-    board.client.hold((1.1, 2.0, 0.5, 0.3), HOLD_S)
-    assert len(board.sent) == written + 3
-    board.client.hold((1.2, 2.0, 0.5, 0.3), HOLD_S)
-    assert len(board.started) == 1
-    assert board.flown(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.3])
-    for x in (1.2, 1.3, 1.4, 1.5, 1.6, 1.7):
-        board.client.hold((x, 2.0, 0.5, 0.3), HOLD_S)
-    assert board.started[:3] == [1, SECOND, 1]
-    board.sent.clear()
-    board.client.hold((1.8, 2.0, 0.5, 0.3), HOLD_S)
-    assert len(board.sent) == 2, "x of two pieces"
-
-
-def test_the_first_setpoint_is_started_when_it_is_confirmed(board):
-    """The firmware may start what its memory holds before the write that came first: a place of an earlier flight."""
-    board.client.hold((3.0, 3.0, 1.0, 0.0), HOLD_S)
-    while board.started[-1] != TAKEOFF:
-        board.client.climb((0.0, 0.0, 0.0, 0.0), (0.5, 1.5), HOLD_S)
-    board.lost = 2
-    for _ in range(2):
-        board.client.hold((0.0, 0.0, 0.5, 0.0), HOLD_S)
-    assert board.started[-1] == TAKEOFF
-    for x in (0.0, 0.1):
-        board.client.hold((x, 0.0, 0.5, 0.0), HOLD_S)
-        assert board.flown(DT)[0] == pytest.approx([x, 0.0, 0.5, 0.0])
-    assert board.started[-2:] == [COMPRESSED] * 2
-
-
-def test_polynomials_of_an_earlier_flight_are_not_started(board):
+def test_one_part_is_written_at_a_time_and_started_when_all_are_confirmed(board):
+    """Also of a setpoint that changes meanwhile; an answer that does not come is waited for, then asked for again."""
     board.lost = 1
-    board.client.hold((3.0, 3.0, 1.0, 0.3), HOLD_S)
-    assert board.started == []
-    while not board.started:
-        board.client.climb((0.0, 0.0, 0.0, 0.3), (0.5, 1.5), HOLD_S)
-    while len(board.started) < 2:
-        board.client.hold((0.0, 0.0, 0.5, 0.3), HOLD_S)
-    assert board.flown(DT)[0] == pytest.approx([0.0, 0.0, 0.5, 0.3])
+    for x in (1.0, 1.1, 1.2):
+        assert board.client.hold((x, 2.0, 0.5, 0.3), HOLD_S) == 0
+    assert len(board.sent) == 1
+    board.now += REPEAT_S + 0.1
+    assert board.hold(1.3, yaw=0.3) > 5
+    assert board.started == [POLYNOMIALS[0]]
+    assert board.flown(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.3])
 
 
-def test_an_old_start_is_not_transmitted(board, monkeypatch):
+@pytest.mark.parametrize(("yaw", "numbers", "least"), [(0.0, COMPRESSED, 2), (0.3, POLYNOMIALS, 3)])
+def test_the_trajectory_that_is_flown_is_never_written(board, yaw, numbers, least):
+    """Only what differs is written; a setpoint that does not change is one packet, its start."""
+    for k in range(6):
+        packets = board.hold(0.1 * k, yaw)
+        assert board.started[-1] == numbers[k % 2]
+        assert board.flown(DT)[0] == pytest.approx([0.1 * k, 2.0, 0.5, yaw])
+    assert packets == least, "x of each piece"
+    assert board.hold(0.5, yaw) == 1
+    assert board.hold(0.4, yaw) == 1, "the one before is still there"
+
+
+def test_setpoints_of_an_earlier_flight_are_not_started(board):
+    board.lost = 1
+    assert board.client.hold((3.0, 3.0, 1.0, 0.0), HOLD_S) == 0
+    board.climb((0.0, 0.0, 0.0, 0.3), (0.5, 1.5))
+    board.hold(0.2)
+    assert board.started == [TAKEOFFS[1], COMPRESSED[0]]
+    assert board.flown(DT)[0] == pytest.approx([0.2, 2.0, 0.5, 0.0])
+
+
+def test_an_old_start_is_not_transmitted(board):
     """cflib repeats a packet until it is answered, for as long as a gap takes; the counters of safelink stay."""
     transmitted = []
     radio = type("Radio", (), {"send_packet": lambda _, data: transmitted.append(bytes(data))})()
-    prompt, now = module.PromptRadio(radio), module.time.monotonic()
-    board.client.hold((0.0, 0.0, 0.5, 0.0), HOLD_S)
+    prompt = module.PromptRadio(radio)
+    board.hold(0.0)
     write, start = (
         array.array("B", bytes((crtp.header(port, channel) & ~0x08,)) + data)
         for (port, channel), data in zip(((Port.MEMORY, 2), (Port.HIGH_LEVEL, 0)), board.sent, strict=True)
@@ -146,7 +155,7 @@ def test_an_old_start_is_not_transmitted(board, monkeypatch):
     prompt.send_packet(write)
     prompt.send_packet(start)
     assert transmitted[1:] == [bytes(write), bytes(start)]
-    monkeypatch.setattr(module.time, "monotonic", lambda: now + START_EXPIRY_S + 0.1)
+    board.now += START_EXPIRY_S + 0.1
     prompt.send_packet(write)
     prompt.send_packet(start)
     assert transmitted[3:] == [bytes(write), bytes((NULL & ~COUNTERS | 0x04,))]

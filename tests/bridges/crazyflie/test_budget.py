@@ -1,0 +1,53 @@
+"""Poses are as young as the budget of a radio promises, on a simulated clock."""
+
+import numpy as np
+import pytest
+
+from agents.protocols.crazyflie import YOUNG_S, CrazyflieSettings, oldest_pose, overload
+from bridges.crazyflie.flight import Phase
+from tests.bridges.crazyflie_clock import HEIGHT, Fleet, flight_of
+
+SINKS = 0.5  # [m/s] a landing is slower
+
+
+@pytest.mark.parametrize(
+    ("rows", "exchanges", "rates"),
+    [
+        (1, 400.0, {}),
+        (4, 400.0, {}),
+        (8, 400.0, {"stream_hz": 7.0}),
+        (15, 664.0, {"stream_hz": 5.0}),
+        (5, 250.0, {"stream_hz": 7.0}),
+    ],
+)
+def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchanges, rates):
+    settings = [CrazyflieSettings(**rates)] * rows
+    assert overload("0", settings, exchanges) == ""
+    with Fleet(monkeypatch, rows, exchanges, **rates) as fleet:
+        age = np.percentile(flight_of(fleet), 99)
+        assert fleet.fastest < SINKS
+    print(f"{rows} robots, {exchanges:g} exchanges/s: 99 % of poses are younger than {1e3 * age:.0f} ms")
+    assert age < oldest_pose(settings, exchanges) <= YOUNG_S
+
+
+def test_a_take_off_with_a_yaw_leaves_poses_young(monkeypatch):
+    """Seventeen parts of polynomials, one at a time: in a burst their answers made poses 0.2 s old."""
+    with Fleet(monkeypatch, 8, 400.0, stream_hz=4.0) as fleet:
+        fleet.twin.flock.quadrotor.yaw[:] = 0.5
+        assert np.percentile(flight_of(fleet), 99) < YOUNG_S
+
+
+def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
+    """More logs than polls: the drone says so by its stamps, long before a packet is lost."""
+    with Fleet(monkeypatch, 1, 90.0, log_hz=100.0) as fleet:
+        (line,) = fleet.twin.lines
+        while len(line.queue) < 150:
+            fleet.run(0.1)
+        assert fleet.ages[-1][0] == pytest.approx(len(line.queue) / 100.0, rel=0.05)
+        fleet.order(lambda flight: flight.takeoff(HEIGHT))
+        fleet.run(0.5)
+        (trouble,) = fleet.troubles
+        assert "s old; is its radio too full" in trouble
+        assert fleet.phases == {Phase.GROUND}
+        assert line.dropped == 0
+        assert not fleet.twin.flock.quadrotor.flying.any()

@@ -1,0 +1,236 @@
+"""Crazyflies on one radio, on a simulated clock: no result depends on the computer.
+
+Real are the flight control and telemetry of the bridge, and the twins with their queues; the driver of cflib is
+replaced by what it does: it polls its drones in turn, and has room for one packet of each.
+"""
+
+import math
+import random
+import threading
+import types
+from collections import deque
+
+import numpy as np
+
+from agents.protocols import crtp
+from agents.protocols.crazyflie import chosen
+from agents.protocols.crtp import HighLevel, Log, Port
+from bridges.crazyflie import flight, telemetry, trajectory
+from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.pilot import LOOP_HZ
+from bridges.crazyflie.telemetry import Board, Telemetry
+from tests.twins.loopback import request
+from twins.devices.crazyflie.device import CrazyflieTwin
+from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
+from twins.devices.device import DeviceRequest, Faults
+
+CODES = {"int16_t": "i16", "uint16_t": "u16", "uint8_t": "u8", "int8_t": "i8", "FP16": "half"}
+TICK = 0.01  # [s] of the twins, and of the robots' loop
+ROOM_S = 0.0005  # between two looks whether the driver has room
+HEIGHT = 0.35
+NULL = bytes((0xFF,))
+
+
+class Thread:
+    """Thread that runs only while `step` waits for it; `due`: when it is to be called next [s]."""
+
+    def __init__(self, due, body):
+        self.due, self._ending = due, False
+        self._go, self._back = threading.Semaphore(0), threading.Semaphore(0)
+        self._thread = threading.Thread(target=self._run, args=(body,))
+        self._thread.start()
+
+    def _run(self, body):
+        self._go.acquire()
+        try:
+            if not self._ending:
+                body()
+        except SystemExit:
+            pass
+        finally:
+            self._back.release()
+
+    def pause(self, until):
+        """From within: wait until a time [s]."""
+        self.due = until
+        self._back.release()
+        self._go.acquire()
+        if self._ending:
+            raise SystemExit
+
+    def step(self):
+        self._go.release()
+        self._back.acquire()
+
+    def close(self):
+        self._ending = True
+        self._go.release()
+        self._thread.join()
+
+
+class Drone:
+    """One Crazyflie, its telemetry and flight control, and the packets that wait for the radio."""
+
+    def __init__(self, fleet, row):
+        self._fleet, self.row = fleet, row
+        self.out, self.order, self._blocks, self._replies = deque(), None, {}, {}
+        self.telemetry = Telemetry(fleet.board, row, lighthouse=False)
+        self.flight = Flight(fleet.settings, self.telemetry, lambda seconds: self.thread.pause(fleet.now + seconds))
+        self.trajectories = trajectory.Trajectories(self._send_at_once)
+        self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.Memory.TRAJECTORY)
+        self.trajectories.define()
+        self.telemetry.start_logging(self, log_hz=fleet.settings.log_hz, ranges_hz=None)
+        fleet.twin.lines[row].queue.clear()  # answers
+        self.trajectories._send = self._send
+        self.flight.link = self
+        self.error, self.busy = None, False
+        self.cf = self.commander = self.high_level_commander = self
+        self.thread = Thread(fleet.now + fleet.random.random() / LOOP_HZ, self._control)
+
+    def start_log(self, _name, rate_hz, variables, logged):
+        table, number = self._fleet.twin.drones[self.row]._log_table, len(self._blocks)
+        kinds = [CODES[kind] for kind in variables.values()]
+        codes = [LOG_CODES[kind] for kind in kinds]
+        items = [crtp.ITEM.pack(code, table.number[name]) for code, name in zip(codes, variables, strict=True)]
+        self._send_at_once(Port.LOG, 1, bytes((Log.CREATE, number)) + b"".join(items))
+        self._send_at_once(Port.LOG, 1, bytes((Log.START, number, round(100.0 / rate_hz))))
+        self._blocks[number] = list(variables), [PACKINGS[kind] for kind in kinds], logged
+
+    def planner_reply(self, command):
+        return self._replies.get(command, (0, 0))
+
+    def send_notify_setpoint_stop(self):
+        self._send(Port.SETPOINT, 1, bytes(5))
+
+    def land(self, height, span, **_yaw):
+        self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.LAND, 0)) + crtp.CLIMB.pack(height, 0.0, True, span))
+
+    def receive(self, packet):
+        port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
+        if (port, channel) == (Port.LOG, 2):
+            names, packings, logged = self._blocks[data[0]]
+            values, at = {}, 4
+            for name, packing in zip(names, packings, strict=True):
+                (values[name],) = packing.unpack_from(data, at)
+                at += packing.size
+            logged(self._fleet.now, int.from_bytes(data[1:4], "little"), values)
+        elif port == Port.HIGH_LEVEL:
+            self._replies[data[0]] = self.planner_reply(data[0])[0] + 1, data[3]
+        elif port == Port.MEMORY:
+            self.trajectories.note_answer(crtp.MEMORY.unpack_from(data)[1], data[crtp.MEMORY.size])
+            self.thread.due = self._fleet.now
+
+    def _send_at_once(self, port, channel, data):
+        self._fleet.twin._deliver(self.row, bytes((crtp.header(port, channel),)) + data)
+
+    def _send(self, port, channel, data):
+        while self.out:
+            self.thread.pause(self._fleet.now + ROOM_S)
+        self.out.append(bytes((crtp.header(port, channel),)) + data)
+
+    def _control(self):
+        """Loop of the pilot's thread."""
+        fleet, due = self._fleet, self._fleet.now
+        while True:
+            if fleet.now >= due:
+                due = max(due + 1.0 / max(fleet.settings.stream_hz, LOOP_HZ), fleet.now)
+            order, self.order = self.order, None
+            if order is not None:
+                order(self.flight)
+            self.flight.update_phase(fleet.now)
+            self.flight.send_due(fleet.now)
+            self.thread.pause(due)
+
+
+class Fleet:
+    """Crazyflies on a radio with `hz` exchanges per second; closed at the end of a `with` statement."""
+
+    def __init__(self, monkeypatch, rows, hz, **device):
+        self.hz, self.now, self.random = hz, 100.0, random.Random(rows)
+        for module in (flight, telemetry, trajectory):
+            monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: self.now))
+        asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
+        self.settings = chosen("", device, external=False)
+        self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
+        self.board = Board(rows)
+        self.board.settled[:] = True
+        self.drones = [Drone(self, row) for row in range(rows)]
+        self.ages, self.fastest = [], 0.0  # (k, rows) ages of poses [s]; fastest descent [m/s]
+        self._begin = self._next_tick = self._next_exchange = self.now
+        for line in self.twin.lines:
+            line.heard = 0.0
+        self._exchanges = 0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error):
+        for drone in self.drones:
+            drone.thread.close()
+        self.twin.close()
+
+    def run(self, seconds, *, speed=0.0):
+        """Fly for some seconds; with a `speed` [m/s] each drone is led around a circle of 0.3 m."""
+        end = self.now + seconds
+        while self.now < end:
+            thread = min((drone.thread for drone in self.drones), key=lambda each: each.due)
+            self.now = max(self.now, min(self._next_tick, self._next_exchange, thread.due))
+            if self.now >= self._next_tick:
+                self._next_tick += TICK
+                self._advance(speed)
+            elif self.now >= self._next_exchange:
+                self._next_exchange += 1.0 / self.hz
+                self._exchange(self._exchanges % len(self.drones))
+                self._exchanges += 1
+            else:
+                thread.due = math.inf
+                thread.step()
+        return self
+
+    def order(self, what):
+        """Give an order, a function of a `Flight`, to all."""
+        for drone in self.drones:
+            drone.order = what
+
+    @property
+    def phases(self):
+        return {drone.flight.phase for drone in self.drones}
+
+    @property
+    def troubles(self):
+        return {drone.flight.trouble for drone in self.drones} - {""}
+
+    def _advance(self, speed):
+        """Step of the twins; then the robots' loop reads and commands."""
+        self.twin.advance(self.now - self._begin)
+        self.ages.append(self.now - self.board.pose_time)
+        self.fastest = max(self.fastest, -self.twin.flock.quadrotor.velocity[:, 2].min())
+        for row, drone in enumerate(self.drones):
+            angle = speed / 0.3 * self.now + row
+            target = (0.3 * math.cos(angle), row + 0.3 * math.sin(angle), HEIGHT, 0.0)
+            drone.flight.set_target(self.now, target if speed > 0.0 else None)
+
+    def _exchange(self, row):
+        line, drone = self.twin.lines[row], self.drones[row]
+        line.t = self.now - self._begin
+        _, answer, packet = line.exchange(drone.out.popleft() if drone.out else NULL, 3)
+        if packet is not None:
+            self.twin._deliver(row, packet)
+        if answer[0] & 0xF3 != 0xF3:
+            drone.receive(answer)
+
+
+def flight_of(fleet):
+    """Take off, follow a circle at 0.3 m/s, land; returns the ages of poses (k, rows) from before the take-off on."""
+    fleet.run(1.0)
+    fleet.ages.clear()
+    fleet.order(lambda flight: flight.takeoff(HEIGHT))
+    fleet.run(3.0)
+    assert fleet.phases == {Phase.CLIMBING}, fleet.troubles
+    fleet.run(4.0, speed=0.3)
+    assert fleet.phases == {Phase.FLYING}, fleet.troubles
+    fleet.order(Flight.land)
+    fleet.run(6.0)
+    assert fleet.phases == {Phase.GROUND}
+    assert not fleet.troubles
+    return np.array(fleet.ages)
