@@ -58,7 +58,7 @@ def end(code: int) -> NoReturn:
     sys.exit(code)
 
 
-FAREWELL_S: Final = 15.0  # limit for robots without a launcher to land; the same again to land by force
+FAREWELL_S: Final = 15.0  # least limit for robots without a launcher to land; the same again to land by force
 STOPPED_S: Final = 5.0  # limit for a body to confirm that its motors are off
 AFTER_S: Final = 2.0 * FAREWELL_S + STOPPED_S + 5.0  # limit for all of that and the end of the process
 SETTLE_S: Final = 0.5  # the token of a robot that has just started may still be on its way

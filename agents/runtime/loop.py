@@ -42,7 +42,8 @@ from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox, replace_rows
 from agents.runtime.setup import Setup
 from agents.runtime.telemetry import Counts, Telemetry
-from agents.runtime.watchdog import AGAIN_S, Watchdog
+from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
+from agents.safety.detection import SLOWEST
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
@@ -79,7 +80,12 @@ class Runtime:
         self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows that are alive for their neighbours
         self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
         self._coming_down = False  # the loop is over
-        self._watchdog = Watchdog(body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s)
+        ceiling = float(assignment.limits.high[2]) if any(kind.flies for kind in assignment.kinds) else 0.0
+        self._descent_s = ceiling / SLOWEST  # [s] longest landing: what still descends after a limit would fall
+        self._watchdog = Watchdog(
+            body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s,
+            down_s=max(DOWN_S, self._descent_s),
+        )  # fmt: skip
 
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
@@ -138,7 +144,7 @@ class Runtime:
             error = sys.exception()
             why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
             self._watchdog.call_for_help(why)
-            self._order_down(self._body.land, FAREWELL_S)
+            self._order_down(self._body.land, max(FAREWELL_S, self._descent_s))
         if failures:
             raise failures[0]
 
@@ -425,7 +431,7 @@ class Runtime:
             zero -= self._setup.clock.slew(self._dt)
             self._tick(t)
             if farewell == np.inf and (reason := stopping()) is not None:
-                farewell = t + FAREWELL_S
+                farewell = t + max(FAREWELL_S, self._descent_s)
                 self._stopping = reason
                 for row in range(len(self._names)):
                     self.agent.lifecycle.land(row, reason)

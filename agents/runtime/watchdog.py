@@ -18,7 +18,7 @@ from agents.arrays import Index
 from agents.body.interface import Body
 
 SILENCE_S: Final = 0.5
-DOWN_S: Final = 10.0  # limit for the robots of a loop that hangs to land,
+DOWN_S: Final = 10.0  # least limit for the robots of a loop that hangs to land,
 CUT_S: Final = 0.5  # and for the body to cut the motors; then the process ends
 AGAIN_S: Final = 0.5  # between two orders to land: the first may be lost
 LOOKS: Final = 5  # checks in each silence

@@ -84,7 +84,7 @@ def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
         ]
     assert max(heights) == pytest.approx(0.6, abs=0.05)
     poses = typed(file, "/KH01/true_pose")
-    assert poses[0].header.frame_id == "park"
+    assert poses[0].header.frame_id == "map"
     assert abs(poses[-1].pose.position.x) < 2.0
     with file.open("rb") as stream:
         reader = make_reader(stream)

@@ -13,7 +13,7 @@ from agents.network.keys import Keys
 from agents.runtime import loop
 from agents.runtime.loop import Runtime
 from agents.runtime.setup import Setup
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition.experiment import Arena, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net
@@ -92,6 +92,7 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
 def short_waits(monkeypatch):
     monkeypatch.setattr(loop, "FAREWELL_S", 0.3)
     monkeypatch.setattr(loop, "STOPPED_S", 0.1)
+    monkeypatch.setattr(loop, "SLOWEST", np.inf)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
@@ -106,12 +107,33 @@ def test_everything_is_tried_on_the_way_out_and_the_error_is_said(broken):
     assert "the loop breaks" in chain
 
 
-def test_a_robot_is_stopped_when_it_is_down_and_not_before():
+def test_a_robot_is_stopped_when_it_is_down_and_not_before(monkeypatch):
+    monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
     body = Airborne(steps=10)
     with pytest.raises(OSError, match="the loop breaks"):
         run(body)
     assert body.steps <= 0
     assert body.calls == ["open", "land", "stop", "close"]
+
+
+def test_a_drone_at_the_ceiling_that_descends_slowly_is_not_stopped_in_the_air(monkeypatch):
+    monkeypatch.setattr(loop, "FAREWELL_S", 0.05)
+    monkeypatch.setattr(loop, "SLOWEST", 2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
+    body = Airborne(steps=100)  # a second
+    with pytest.raises(OSError, match="the loop breaks"):
+        run(body)
+    assert body.steps <= 0
+
+
+@pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
+def test_the_watchdog_gives_a_drone_the_time_of_a_descent_from_the_ceiling(monkeypatch, height, down_s):
+    monkeypatch.undo()
+    robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "B": Robot(kind="khepera4", start=[0.5, 0.2])}
+    plan = Plan(pair(robots=robots, formation=Formation(), arena=Arena(size=(4.0, 4.0, height))))
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
+    flying, driving = (Runtime(plan.assignment((name,)), Airborne(), setup)._watchdog for name in "FB")
+    assert flying._down_s == pytest.approx(down_s)
+    assert driving._down_s == 10.0
 
 
 def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypatch):
