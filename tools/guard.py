@@ -43,7 +43,7 @@ def explanation(found: dict[str, Path | None], root: Path) -> str:
     return "\n".join(lines)
 
 
-def _lean(words: list[str]) -> None:
+def _become_station(words: list[str]) -> None:
     """Become what a run starts on its hosts, small computers often: typer is for people, and takes as long to import.
 
     Returns if it is not that.
@@ -67,7 +67,7 @@ def main() -> None:
         print(explanation(found, root), file=sys.stderr)
         sys.exit(2)
     try:
-        _lean(sys.argv[1:])
+        _become_station(sys.argv[1:])
         from tools.main import main as command_line  # noqa: PLC0415 (not before the check)
 
         command_line()

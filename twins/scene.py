@@ -191,11 +191,11 @@ def outside(scene: Scene, obstacle: int) -> bool:
         return bool(norm(beyond) > scene.radius[obstacle])
     points = corners(outline, pose)
     if scene.closed[obstacle]:
-        return _apart(points, low, high)
-    return all(_apart(np.stack(edge), low, high) for edge in pairwise(points))
+        return _disjoint(points, low, high)
+    return all(_disjoint(np.stack(edge), low, high) for edge in pairwise(points))
 
 
-def _apart(polygon: Array, low: Array, high: Array) -> bool:
+def _disjoint(polygon: Array, low: Array, high: Array) -> bool:
     """Whether a convex polygon (k, 2) or segment and a rectangle are disjoint, by the separating axis theorem."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     axes = np.concatenate([np.eye(2), np.stack([-edge[:, 1], edge[:, 0]], axis=1)])

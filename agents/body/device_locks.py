@@ -71,7 +71,7 @@ def _lock(path: Path, name: str, address: str) -> int:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is(path, file):
+            if _still_at(path, file):
                 os.ftruncate(file, 0)
                 os.write(file, f"{os.getpid()} {name}".encode())
                 return file
@@ -87,7 +87,7 @@ def _lock(path: Path, name: str, address: str) -> int:
         os.close(file)
 
 
-def _is(path: Path, file: int) -> bool:
+def _still_at(path: Path, file: int) -> bool:
     """Whether an open file still has this path; its last holder may have removed it meanwhile."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(file))

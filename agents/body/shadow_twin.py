@@ -71,17 +71,17 @@ class Shadowed:
 
     def takeoff(self, rows: Index, height: Array) -> None:
         self._body.takeoff(rows, height)
-        mine, which = self._among(rows)
+        mine, which = self._twin_rows(rows)
         self._try(lambda twin: twin.takeoff(mine, height[which]))
 
     def land(self, rows: Index) -> None:
         self._body.land(rows)
-        mine, _ = self._among(rows)
+        mine, _ = self._twin_rows(rows)
         self._try(lambda twin: twin.land(mine))
 
     def stop(self, rows: Index) -> None:
         self._body.stop(rows)
-        mine, _ = self._among(rows)
+        mine, _ = self._twin_rows(rows)
         self._try(lambda twin: twin.stop(mine))
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -116,7 +116,7 @@ class Shadowed:
         shown = np.flatnonzero(self._placed)
         position[rows[shown]], yaw[rows[shown]] = shadow.position[shown], shadow.yaw[shown]
 
-    def _among(self, rows: Index) -> tuple[Index, Index]:
+    def _twin_rows(self, rows: Index) -> tuple[Index, Index]:
         """The twin's rows among those of the body, whose motors come on or go off; and where they stand in `rows`."""
         which = np.flatnonzero(np.isin(rows, self._rows))
         mine = np.searchsorted(self._rows, rows[which])

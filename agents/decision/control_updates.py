@@ -45,16 +45,16 @@ class ControlView(View):
         return self._law()
 
     @cached_property
-    def _both(self) -> tuple[Array, Array]:
+    def _both_errors(self) -> tuple[Array, Array]:
         return self._errors()
 
     @property
     def error(self) -> Array:  # type: ignore[override]
-        return self._both[0]
+        return self._both_errors[0]
 
     @property
     def energy(self) -> Array:  # type: ignore[override]
-        return self._both[1]
+        return self._both_errors[1]
 
     @cached_property
     def deviation(self) -> Array:

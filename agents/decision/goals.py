@@ -171,7 +171,7 @@ class GoalComputer:
         except FAILURES as error:
             raise PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}") from error
         if np.shape(offset) != position.shape:
-            raise PluginError(_misshapen(law, "offset", "a vector for each robot", position.shape, offset))
+            raise PluginError(_wrong_shape(law, "offset", "a vector for each robot", position.shape, offset))
         return offset if anchors is None else offset + anchors.offset(position)
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
@@ -185,7 +185,7 @@ class GoalComputer:
         error = law.error(position, believed, neighbours.links)
         if np.shape(error) != neighbours.links.receiver.shape:
             raise PluginError(
-                _misshapen(law, "error", "one value for each link", neighbours.links.receiver.shape, error)
+                _wrong_shape(law, "error", "one value for each link", neighbours.links.receiver.shape, error)
             )
         both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
@@ -244,5 +244,5 @@ def _error_and_energy(error: Array) -> Array:
     return both
 
 
-def _misshapen(law: laws.Law, method: str, wanted: str, shape: tuple[int, ...], given: Array) -> str:
+def _wrong_shape(law: laws.Law, method: str, wanted: str, shape: tuple[int, ...], given: Array) -> str:
     return f"`{method}` of the law {type(law).__name__} must give {wanted}, {shape}, not {np.shape(given)}"

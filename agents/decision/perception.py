@@ -68,14 +68,14 @@ class Perception:
         aware = np.isfinite(state.yaw) & (t - state.time <= self._limits.own_silence_s)
         if self._avoids is not None:
             aware &= self._avoids
-        near = self._others(t, state, poses, aware)
+        near = self._nearby_robots(t, state, poses, aware)
         if state.rays is not self._rays:
             self._update_points(state, poses)
         if state.rays is not None:
             near = near.append(self._near_points(t, state, aware))
         return own, near
 
-    def _others(self, t: float, state: BodyState, poses: NeighbourPoses, aware: Mask) -> Nearby:
+    def _nearby_robots(self, t: float, state: BodyState, poses: NeighbourPoses, aware: Mask) -> Nearby:
         """Received robots that are near; lost ones stay at their last received place."""
         row = self._receiver
         age = np.maximum(t - poses.stamp, 0.0)

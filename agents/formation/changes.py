@@ -67,9 +67,9 @@ def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> 
         if not share.any():
             continue
         grown = 1.0 + share * (change.scale - 1.0)
-        distance = _scaled(_toward(distance, change.distance, share), grown, change.rise)
+        distance = _scaled(_interpolated(distance, change.distance, share), grown, change.rise)
         if relative is not None:
-            relative = _turned(_toward(relative, change.relative, share[:, None]), share * change.turn)
+            relative = _turned(_interpolated(relative, change.relative, share[:, None]), share * change.turn)
             relative = relative * np.stack([grown, grown, np.ones_like(grown)], axis=1)
         if bearing is not None:
             bearing = _turned(_toward_unit(bearing, change.bearing, share), share * change.turn)
@@ -80,7 +80,7 @@ def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> 
     return replace(links, distance=distance, relative=relative, bearing=bearing)
 
 
-def _toward(old: Array, new: Array, share: Array) -> Array:
+def _interpolated(old: Array, new: Array, share: Array) -> Array:
     return np.where(np.isnan(new), old, np.where(share >= 1.0, new, old + share * (new - old)))
 
 

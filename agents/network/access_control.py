@@ -73,7 +73,7 @@ def _joined(one: Mapping[str, Grant], other: Mapping[str, Grant]) -> dict[str, G
 
 def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...], list[str]]]:
     """Flow, kinds of messages and keys of each allowance."""
-    kept, wanted = _kept(grant.publish), _kept(grant.subscribe)
+    kept, wanted = _cache_keys(grant.publish), _cache_keys(grant.subscribe)
     yield "ingress", ("put", "reply"), [*grant.publish, *kept]
     yield "ingress", ("declare_queryable", "liveliness_token"), kept
     yield "egress", ("query",), kept
@@ -89,13 +89,13 @@ def _messages(grant: Grant, realm: str) -> Iterator[tuple[Flow, tuple[str, ...],
     yield "ingress", ("liveliness_query", "declare_liveliness_subscriber"), grant.watch
     yield "egress", ("liveliness_token",), grant.watch
     # a publisher that knows of no subscriber sends nothing: all learn the subscriptions, not the values
-    everything = [f"{realm}/**", *_kept([f"{realm}/**"]), *grant.publish, *kept, *grant.query]
+    everything = [f"{realm}/**", *_cache_keys([f"{realm}/**"]), *grant.publish, *kept, *grant.query]
     yield "egress", ("declare_subscriber", "declare_queryable"), everything
     yield "ingress", ("declare_queryable", "reply"), [OWN_ADMIN]
     yield "egress", ("query",), [ADMIN]
 
 
-def _kept(keys: Iterable[str]) -> list[str]:
+def _cache_keys(keys: Iterable[str]) -> list[str]:
     """Keys of the caches and of the detection of advanced publishers."""
     return [f"{key}/@adv/**" for key in keys if not key.startswith("@")]
 
@@ -169,7 +169,7 @@ def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
         "permission": "allow",
         "flows": ["ingress", "egress"],
         "messages": list(PASSED),
-        "key_exprs": [*keys, *_kept(keys), ADMIN],
+        "key_exprs": [*keys, *_cache_keys(keys), ADMIN],
     }
 
 

@@ -451,9 +451,9 @@ def read_stop(payload: bytes, mime: str) -> Stop:
         sender, reason = (
             text if isinstance(text := decoded.get(field), str) else "" for field in Stop.__struct_fields__
         )
-    return Stop(_shown(sender) or UNKNOWN, _shown(reason))
+    return Stop(_printable(sender) or UNKNOWN, _printable(reason))
 
 
-def _shown(text: str) -> str:
+def _printable(text: str) -> str:
     """Text of others on one line, without what could steer a terminal."""
     return "".join(letter if letter.isprintable() else " " for letter in text[:MAX_WORDS]).strip()

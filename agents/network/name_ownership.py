@@ -61,7 +61,7 @@ def claim(
         _first_round(session, alive, mine, rank, pause)
         tokens += [pubsub.alive_token(session, Keys.life(key, mine)) for key in alive]
         pause.wait(settle_s)
-        others = _others(session, alive, mine, rank, pause, owners=False)
+        others = _earlier_claims(session, alive, mine, rank, pause, owners=False)
         if others:
             raise NameTaken(", ".join(others))
     except BaseException:
@@ -74,13 +74,13 @@ def claim(
 def _first_round(session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event) -> None:
     """Waits until no other process owns a name or has an earlier claim."""
     deadline = time.monotonic() + OWNER_VANISH_S
-    while others := _others(session, alive, mine, rank, pause, owners=True):
+    while others := _earlier_claims(session, alive, mine, rank, pause, owners=True):
         if time.monotonic() > deadline:
             raise NameTaken(", ".join(others))
         pause.wait(network.RETRY_S)
 
 
-def _others(
+def _earlier_claims(
     session: zenoh.Session, alive: Sequence[str], mine: str, rank: str, pause: threading.Event, *, owners: bool
 ) -> list[str]:
     """Names (their liveliness keys) with an earlier claim than `rank`, or with another owner if `owners` count."""
@@ -95,11 +95,11 @@ def _others(
             raise network.Unreachable(f"no router answers who owns the name, for {ANSWER_S:g} s: is it overloaded?")
         pause.wait(network.RETRY_S)
     return [
-        key for key, tokens in found.items() if any(_rival(key, token, mine, rank, owners) for token in tokens or ())
+        key for key, tokens in found.items() if any(_is_rival(key, token, mine, rank, owners) for token in tokens or ())
     ]
 
 
-def _rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> bool:
+def _is_rival(alive: str, token: str, mine: str, rank: str, owners: bool) -> bool:
     """Whether a token stands in the way of the claim `rank` of the session `mine`."""
     if (other := Keys.rank_of(alive, token)) is not None:
         return other < rank

@@ -53,7 +53,7 @@ def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
         Malformed: If a number is not finite, the stamp lies in the future, the position is out
             of reach, or the velocity is no robot's.
     """
-    if not (_counted(pose.seq) and _past(pose.stamp, now)):
+    if not (_counted(pose.seq) and _too_old(pose.stamp, now)):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, reach)
     _refuse_motion(pose.velocity, pose.yaw)
@@ -82,7 +82,7 @@ def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> Non
         Malformed: If a number is not finite, the stamp is old or lies in the future, the pose is
             younger than the goal that rests on it, or the position is out of reach.
     """
-    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _past(goal.stamp, now)):
+    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _too_old(goal.stamp, now)):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
@@ -103,7 +103,7 @@ def check_ranges(ranges: Ranges, *, now: float) -> None:
         raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
     if not len(ranges.bearing) == len(ranges.elevation) == len(ranges.distance):
         raise Malformed("bearings, elevations and distances differ in number")
-    if not _within((*ranges.bearing, *ranges.elevation), 2.0 * math.pi):
+    if not _all_within((*ranges.bearing, *ranges.elevation), 2.0 * math.pi):
         raise Malformed("a bearing or an elevation is no angle in radians")
     if not all(value is None or 0.0 <= value <= MAX_RANGE for value in ranges.distance):
         raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
@@ -148,16 +148,16 @@ def _counted(seq: int) -> bool:
     return 0 < seq < 2**53  # what JSON carries exactly
 
 
-def _past(stamp: float, now: float) -> bool:
+def _too_old(stamp: float, now: float) -> bool:
     return 0.0 < stamp < now + FUTURE_S
 
 
-def _within(values: Sequence[float], limit: float) -> bool:
+def _all_within(values: Sequence[float], limit: float) -> bool:
     return all(abs(value) <= limit for value in values)
 
 
 def _refuse_stamp(stamp: float, now: float) -> None:
-    if not _past(stamp, now):
+    if not _too_old(stamp, now):
         raise Malformed(f"stamp {stamp} is impossible")
 
 

@@ -133,7 +133,7 @@ class Barrier(Avoidance, frozen=True):
         matters[rows] = True
         limit = own.speed[near.row]
         taking = matters[near.row] & ((bound < limit) | barred)
-        aside = self._aside(own, near, normal)[taking]
+        aside = self._evasion(own, near, normal)[taking]
         normal, bound, excess, of = normal[taking], bound[taking], excess[taking], near.row[taking]
         place = np.searchsorted(rows, of)
         order = np.lexsort((-excess, place))
@@ -143,7 +143,7 @@ class Barrier(Avoidance, frozen=True):
         velocity = _closest(velocity, chosen, tightest)
         return rows, _scaled(velocity, own.speed[rows], normal, bound, place)
 
-    def _aside(self, own: OwnState, near: Nearby, normal: Array) -> Array:
+    def _evasion(self, own: OwnState, near: Nearby, normal: Array) -> Array:
         """Evasion of each row, per m/s that a thing bars (K, 2): to its right, seen toward the thing.
 
         One that comes faster than the row can flee will not mind it: there it is the side of its way where the row is.

@@ -74,7 +74,7 @@ class Displacement(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def error(self, position: Array, sender_position: Array, links: Links) -> Array:
         """‖p_i − p_j − d_ij‖."""
-        return norm(np.asarray(position[links.receiver] - sender_position - _given(links.relative, links)))
+        return norm(np.asarray(position[links.receiver] - sender_position - _or_nan(links.relative, links)))
 
 
 class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,7 +95,7 @@ class Bearing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def error(self, position: Array, sender_position: Array, links: Links) -> Array:
         """‖x − max(gᵀx, 0) g‖."""
-        return norm(_beside(position[links.receiver] - sender_position, links))
+        return norm(_from_ray(position[links.receiver] - sender_position, links))
 
 
 class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,7 +127,7 @@ class Mixed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if links.wants is None:
             return error
         other = np.where(
-            links.wants == BY_BEARING, norm(_beside(offset, links)), norm(offset - _given(links.relative, links))
+            links.wants == BY_BEARING, norm(_from_ray(offset, links)), norm(offset - _or_nan(links.relative, links))
         )
         return np.where(links.wants == BY_DISTANCE, error, other)
 
@@ -137,25 +137,25 @@ def _by_distance(offset: Array, links: Links, dead_zone: float) -> Array:
     square = np.asarray(np.vecdot(offset, offset))
     if dead_zone > 0.0:
         length = np.sqrt(square)
-        square = (links.distance - _beyond(links.distance - length, dead_zone)) ** 2
+        square = (links.distance - _beyond_dead_zone(links.distance - length, dead_zone)) ** 2
     return np.asarray((0.5 * links.gain * (links.distance**2 - square))[:, None] * offset)
 
 
-def _beyond(error: Array, dead_zone: float) -> Array:
+def _beyond_dead_zone(error: Array, dead_zone: float) -> Array:
     return np.asarray(error - clamp(error, -dead_zone, dead_zone))
 
 
 def _by_relative(offset: Array, links: Links) -> Array:
-    return np.asarray(links.gain[:, None] * (_given(links.relative, links) - offset))
+    return np.asarray(links.gain[:, None] * (_or_nan(links.relative, links) - offset))
 
 
 def _by_bearing(offset: Array, links: Links) -> Array:
-    return np.asarray(-links.gain[:, None] * _beside(offset, links))
+    return np.asarray(-links.gain[:, None] * _from_ray(offset, links))
 
 
-def _beside(offset: Array, links: Links) -> Array:
+def _from_ray(offset: Array, links: Links) -> Array:
     """Vectors (E, 3) from the nearest point of the ray along the bearing to x; seen from above where the bearing is."""
-    bearing = _given(links.bearing, links)
+    bearing = _or_nan(links.bearing, links)
     flat = np.isnan(bearing[:, 2]) & np.isfinite(bearing[:, 0])
     if flat.any():
         bearing, offset = bearing.copy(), offset.copy()
@@ -164,7 +164,7 @@ def _beside(offset: Array, links: Links) -> Array:
     return np.asarray(offset - along[:, None] * bearing)
 
 
-def _given(vectors: Array | None, links: Links) -> Array:
+def _or_nan(vectors: Array | None, links: Links) -> Array:
     return np.full((len(links), 3), np.nan) if vectors is None else vectors
 
 

@@ -105,12 +105,12 @@ class Waypoints(Parameters, frozen=True):
         route = np.concatenate([anchor[:, None], points], axis=1)
         way = elapsed * self.speed_
         if not self.loop:
-            return _along(route, way), _any_yaw(len(elapsed))
+            return _points_along(route, way), _any_yaw(len(elapsed))
         ring = np.concatenate([points, points[:, :1]], axis=1)
         approach, lap = _length(route[:, :2]), _length(ring)
         on_ring = way > approach
         rest = np.mod(way - approach, np.where(lap > 0, lap, 1.0))
-        return np.where(on_ring[:, None], _along(ring, rest), _along(route, way)), _any_yaw(len(elapsed))
+        return np.where(on_ring[:, None], _points_along(ring, rest), _points_along(route, way)), _any_yaw(len(elapsed))
 
     def speed(self) -> float:
         return self.speed_
@@ -121,7 +121,7 @@ def _length(route: Array) -> Array:
     return np.asarray(np.sqrt(np.sum(np.diff(route, axis=1) ** 2, axis=2)).sum(axis=1))
 
 
-def _along(route: Array, way: Array) -> Array:
+def _points_along(route: Array, way: Array) -> Array:
     """The points (R, 3) reached after `way` (R,) metres along the polylines `route` (R, P, 3)."""
     step = np.diff(route, axis=1)
     length = np.sqrt(np.sum(step**2, axis=2))  # (R, P-1)

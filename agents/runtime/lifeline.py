@@ -57,12 +57,12 @@ class Lifeline:
                 if not data:
                     return GONE
                 if self._on_line is not None:
-                    self._pass_on(data, self._on_line)
+                    self._deliver_lines(data, self._on_line)
         except OSError as error:
             return f"the lifeline broke: {error.strerror}"
         return f"nothing from the starter for {self._timeout_s:g} s"
 
-    def _pass_on(self, data: bytes, on_line: Callable[[bytes], None]) -> None:
+    def _deliver_lines(self, data: bytes, on_line: Callable[[bytes], None]) -> None:
         *lines, rest = (self._rest + data).split(b"\n")
         self._rest = rest[-LONGEST:]
         for line in lines:

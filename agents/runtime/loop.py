@@ -97,9 +97,9 @@ class Runtime:
             network.Unreachable: If no router answers.
         """
         lost = threading.Event()
-        rope = Lifeline(lost, on_line=self._setup.clock.follow)
+        lifeline = Lifeline(lost, on_line=self._setup.clock.follow)
         if self._setup.lifeline:
-            rope.start()
+            lifeline.start()
         asked = threading.Event()
 
         # at the end all steps are tried, the last entry first, even if others raise
@@ -116,15 +116,15 @@ class Runtime:
             self._take_names(session, asked)
             out.callback(self._ownership.end)
             self._body.open()
-            out.callback(self._let_go)
+            out.callback(self._close_body)
             out.callback(self._watchdog.end)
             out.callback(self._order_down, self._body.stop, STOPPED_S)
             out.callback(self._come_down)
             self._join(session)
-            self._loop(lambda: rope.reason if lost.is_set() else self._reason(asked.is_set()))
+            self._loop(lambda: lifeline.reason if lost.is_set() else self._reason(asked.is_set()))
         return 0
 
-    def _let_go(self) -> None:
+    def _close_body(self) -> None:
         if not self._hands_off:
             self._body.close()
 
@@ -142,7 +142,7 @@ class Runtime:
         failures: list[Exception] = []
         if self._in_the_air(failures) and (self.agent.lifecycle.phase < Phase.DONE).any():  # else it was stopped
             error = sys.exception()
-            why = "it did not land in time" if error is None else f"its control loop broke: {_what(error)}"
+            why = "it did not land in time" if error is None else f"its control loop broke: {_error_text(error)}"
             self._watchdog.call_for_help(why)
             self._order_down(self._body.land, max(FAREWELL_S, self._descent_s))
         if failures:
@@ -160,7 +160,7 @@ class Runtime:
         obeyed = False
         while True:
             self._watchdog.beat()
-            self._make_sure()
+            self._await_ownership()
             if self._now >= again:
                 again = self._now + AGAIN_S
                 obeyed = False
@@ -191,25 +191,25 @@ class Runtime:
             self._ownership.stood_still()
         except NameTaken as taken:
             raise NameTaken(
-                f"{self._whose(taken)}: a robot of this name is on the network already; end it first "
+                f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
                 "(`./zenpark keys` shows who is there), or choose another router with --connect"
             ) from None
 
-    def _whose(self, taken: NameTaken) -> str:
+    def _owners_text(self, taken: NameTaken) -> str:
         return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
 
-    def _mine(self) -> bool:
+    def _owns_names(self) -> bool:
         """Whether the names belong to this process; False while that is being checked."""
         try:
             return self._ownership.over()
         except NameTaken as taken:
             self._hands_off = True
             raise NameTaken(
-                f"{self._whose(taken)}: another process has taken this name while this one stood still or was cut off; "
-                "it leaves, and its body to the other one"
+                f"{self._owners_text(taken)}: another process has taken this name while this one stood still or was "
+                "cut off; it leaves, and its body to the other one"
             ) from None
 
-    def _make_sure(self) -> bool:
+    def _await_ownership(self) -> bool:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
         Until then it must not command its bodies, since another process may drive them.
@@ -218,7 +218,7 @@ class Runtime:
             return False
         woke, self._hands_off = uptime(), True
         self._ownership.begin(self._session)
-        while not self._mine():
+        while not self._owns_names():
             if uptime() - woke > ANSWER_S and self._reason_to_end() is not None:
                 names = ", ".join(self._names)
                 raise network.Unreachable(
@@ -266,9 +266,9 @@ class Runtime:
             ranged=[source == "body" for source in ranging],
             receipts=None if self._goals is None else self._goals.news,
         )
-        self._be_there()
+        self._declare_tokens()
 
-    def _be_there(self) -> None:
+    def _declare_tokens(self) -> None:
         """Declares the tokens by which neighbours know that these robots are alive."""
         with self._tokens_lock:
             for row, name in enumerate(self._names):
@@ -292,7 +292,7 @@ class Runtime:
         for row in np.flatnonzero(self.agent.lifecycle.active).tolist():
             self.agent.lifecycle.land(row, why)
         self.agent.land_here()
-        self._be_there()
+        self._declare_tokens()
 
     def _hold_after_suspend(self, slept: float) -> None:
         """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
@@ -328,7 +328,7 @@ class Runtime:
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < np.inf and self._silent_since == np.inf:
                 self._ownership.begin(self._session)  # it was cut off
-            self._mine()
+            self._owns_names()
         return self._silent_since
 
     def _cut(self, _stop: messages.Stop) -> None:
@@ -398,15 +398,15 @@ class Runtime:
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         self._reason_to_end = stopping
-        self._make_sure()  # opening the body may have taken long
+        self._await_ownership()  # opening the body may have taken long
         zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.utc()
         self._joined = True
         self._watchdog.start()
-        self._go_round(zero, stopping)
+        self._run_ticks(zero, stopping)
 
-    def _go_round(self, zero: float, stopping: Callable[[], str | None]) -> None:
+    def _run_ticks(self, zero: float, stopping: Callable[[], str | None]) -> None:
         farewell = np.inf
         while True:
             self._watchdog.beat()
@@ -418,7 +418,7 @@ class Runtime:
                 time.sleep(wait)
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
-            if self._make_sure():
+            if self._await_ownership():
                 continue
             self._counts.missed += behind
             self._next += behind * self._dt
@@ -504,12 +504,12 @@ class Runtime:
                     token.undeclare()  # type: ignore[no-untyped-call]
         if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
             self._retired.difference_update(back)
-            self._be_there()
+            self._declare_tokens()
 
     def _act(self, actions: Actions) -> None:
         """Commands the body, motors-off first."""
         commands = actions.commands
-        stale = self._make_sure()
+        stale = self._await_ownership()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
         if commands is not None:
             orders = ((self._body.stop, commands.stop), (self._body.land, commands.land))
@@ -545,5 +545,5 @@ def _noted(failures: list[Exception]) -> Iterator[None]:
         failures[:] = failures or [error]
 
 
-def _what(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"

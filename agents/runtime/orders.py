@@ -26,7 +26,9 @@ def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Ans
             return agent.lifecycle.takeoff(row), None
         case "start" | "go":
             return (
-                _start(agent, row, order, t, utc) if order.order == "start" else _go(agent, row, order.goal, t)
+                _start(agent, row, order, t, utc)
+                if order.order == "start"
+                else _send_to_goal(agent, row, order.goal, t)
             ), None
         case "hold":
             return _hold(agent, row), None
@@ -59,7 +61,7 @@ def _resume(agent: Agent, row: int) -> str:
     return ""
 
 
-def _go(agent: Agent, row: int, goal: tuple[float, float] | None, t: float) -> str:
+def _send_to_goal(agent: Agent, row: int, goal: tuple[float, float] | None, t: float) -> str:
     if goal is None or not all(map(isfinite, goal)):
         return "an order to go needs a `goal`, x and y in metres"
     return agent.go(row, goal, t)

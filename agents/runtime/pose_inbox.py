@@ -99,12 +99,14 @@ class NeighbourSubscription:
         """
         self._now = now
         received = self._poses.read_samples(self._check)
-        return self._newer(received, now) if received else ()
+        return self._newer_poses(received, now) if received else ()
 
     def _check(self, pose: messages.Pose) -> None:
         validation.check_pose(pose, now=self._now, reach=self._reach)
 
-    def _newer(self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float) -> Iterator[ReceivedPose]:
+    def _newer_poses(
+        self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float
+    ) -> Iterator[ReceivedPose]:
         before = self._received_at  # poses that waited while this process stood still count as one reception
         for pose, sample in received:
             life, anew = _session_of(sample), False

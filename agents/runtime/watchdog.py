@@ -77,7 +77,7 @@ class Watchdog:
 
     def call_for_help(self, why: str) -> None:
         """Raises the alarm without waiting for it to be sent."""
-        self._do("alarm", partial(self._alarm, why))
+        self._call_in_thread("alarm", partial(self._alarm, why))
 
     def __enter__(self) -> Self:
         self.start()
@@ -108,19 +108,19 @@ class Watchdog:
                 self.call_for_help(self.tripped)
             if looked >= again:
                 again = looked + AGAIN_S
-                self._do("land", lambda: self._body.land(self._rows))
+                self._call_in_thread("land", lambda: self._body.land(self._rows))
             if looked - hung > self._down_s:
-                self._give_up()
+                self._abort()
                 return
 
-    def _give_up(self) -> None:
+    def _abort(self) -> None:
         """Cuts the motors and ends the process; the watchdog of the device and the launcher do the rest."""
-        self._do("stop", lambda: self._body.stop(self._rows))
+        self._call_in_thread("stop", lambda: self._body.stop(self._rows))
         self._at_work["stop"].join(CUT_S)
         if not self._over.wait(CUT_S):  # time for messages to leave the process
             self._end(HUNG)
 
-    def _do(self, what: str, call: Callable[[], object]) -> None:
+    def _call_in_thread(self, what: str, call: Callable[[], object]) -> None:
         """Makes a call in a thread of its own, unless the last call of that name still runs."""
         last = self._at_work.get(what)
         if last is None or not last.is_alive():

@@ -122,7 +122,7 @@ class Detector:
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""
         state = now.state
-        found = self._around(now, rows)
+        found = self._in_surroundings(now, rows)
         squared = np.vecdot(state.velocity, state.velocity)
         if not every(squared < self._slow_squared):
             found.append(self._moving(state, squared, rows))
@@ -133,24 +133,24 @@ class Detector:
         if some(rows.ordered) or some(rows.not_finite) or rows.unguided is not None:
             found.append(self._orders(rows))
         if state.heard is not None:
-            found.append(self._unheard(now.t, state.heard))
+            found.append(self._silent_devices(now.t, state.heard))
         if self._obedience.due(now.t):
             watched = rows.cruising & ~now.where.invalid
             self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
         if some(self._obedience.still) or some(self._obedience.strays):
             found.append(self._disobedient(self._obedience))
         if not now.where.all_valid:
-            found.append(self._outside(now))
+            found.append(self._position_and_arena(now))
         if not found:  # as on most ticks
             return []
         return [each for each in chain.from_iterable(found) if some(each.rows)]
 
-    def _around(self, now: Situation, rows: RowStatus) -> list[Iterator[Observation]]:
+    def _in_surroundings(self, now: Situation, rows: RowStatus) -> list[Iterator[Observation]]:
         """Causes in other robots, the network and the process."""
         neighbours, health = now.neighbours, now.health
         found = []
         if self._limits.separation is not None:
-            found.append(self._near(now, self._limits.separation))
+            found.append(self._separation_of_robots(now, self._limits.separation))
         if neighbours.incomplete:
             found.append(self._lost_neighbours(now, rows))
         if neighbours.clock_lag is not None:
@@ -184,7 +184,7 @@ class Detector:
         text = f"for {health.suspended_s:.1f} s; it waits for its neighbours"
         yield Observation(Cause.STANDSTILL, waits, lambda _: text)
 
-    def _outside(self, now: Situation) -> Iterator[Observation]:
+    def _position_and_arena(self, now: Situation) -> Iterator[Observation]:
         """Position, and the arena."""
         t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
@@ -236,7 +236,7 @@ class Detector:
         text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
         yield Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
 
-    def _unheard(self, t: float, heard: Array) -> Iterator[Observation]:
+    def _silent_devices(self, t: float, heard: Array) -> Iterator[Observation]:
         """Rows whose devices do not answer."""
         silent = t - heard > self._limits.own_silence_s
         yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
@@ -246,7 +246,7 @@ class Detector:
         yield Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
         yield Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
 
-    def _near(self, now: Situation, limit: float) -> Iterator[Observation]:
+    def _separation_of_robots(self, now: Situation, limit: float) -> Iterator[Observation]:
         """Separation from other robots at their extrapolated places."""
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit

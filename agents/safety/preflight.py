@@ -41,7 +41,7 @@ class Preflight:
         failing: dict[int, str] = {}
         checks = [self._situation(now, lacking), self._at_start(now.state), self._at_rest(now.state)]
         if self._limits.separation is not None:
-            checks.append(self._near(now, self._limits.separation))
+            checks.append(self._too_close(now, self._limits.separation))
         for rows, reason in chain.from_iterable(checks):
             for row in np.flatnonzero(rows).tolist():
                 failing.setdefault(row, reason(row))
@@ -97,7 +97,7 @@ class Preflight:
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
-    def _near(self, now: Situation, limit: float) -> Iterator[Failing]:
+    def _too_close(self, now: Situation, limit: float) -> Iterator[Failing]:
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit
         if some(near):

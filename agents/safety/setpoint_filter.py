@@ -105,7 +105,7 @@ class SetpointFilter:
         self._limit(safe, here, yaw, age)
         avoided = no_row
         if avoidance is not None:
-            wished = _wished(safe, *avoidance)
+            wished = _after_avoidance(safe, *avoidance)
             other = np.asarray((wished != safe).any(axis=1) & np.isfinite(wished).all(axis=1))
             other &= ~(invalid | not_finite)
             if some(other):
@@ -126,7 +126,7 @@ class SetpointFilter:
         """Bring setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
         if self._any_position:
             rows = self._position
-            setpoint[rows, :3] = self._near(setpoint[rows, :3], here[rows], rows)
+            setpoint[rows, :3] = self._clamp_target(setpoint[rows, :3], here[rows], rows)
         if self._any_velocity:
             rows = self._velocity
             setpoint[rows] = self._slow(setpoint[rows], here[rows], age[rows], rows)
@@ -134,7 +134,7 @@ class SetpointFilter:
             rows = self._twist
             setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
 
-    def _near(self, target: Array, here: Array, rows: Rows) -> Array:
+    def _clamp_target(self, target: Array, here: Array, rows: Rows) -> Array:
         """Goals inside the arena and not too far ahead of the robot."""
         target = clamp(target, self._low[rows], self._high[rows])
         step = target - here
@@ -172,7 +172,7 @@ class SetpointFilter:
         return twist
 
 
-def _wished(setpoint: Array, avoidance: Avoidance, own: OwnState, nearby: Nearby) -> Array:
+def _after_avoidance(setpoint: Array, avoidance: Avoidance, own: OwnState, nearby: Nearby) -> Array:
     """Setpoints (N, 4) after avoidance."""
     name = type(avoidance).__name__
     try:

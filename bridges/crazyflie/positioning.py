@@ -108,7 +108,7 @@ def configure(link: CrazyflieLink, settings: CrazyflieSettings) -> None:
     if isinstance(system, Lighthouse):
         _lighthouse(link, system)
     elif isinstance(system, Loco):
-        _loco(link, system)
+        _prepare_loco(link, system)
     elif isinstance(system, Outside):
         link.set_parameter("locSrv.extPosStdDev", system.position_sigma)
         link.set_parameter("locSrv.extQuatStdDev", system.attitude_sigma)
@@ -220,7 +220,7 @@ def _same_calibration(found: Mapping[int, Any], wanted: StationFile) -> bool:
     )
 
 
-def _loco(link: CrazyflieLink, system: Loco) -> None:
+def _prepare_loco(link: CrazyflieLink, system: Loco) -> None:
     from cflib.crazyflie.mem import MemoryElement  # noqa: PLC0415 - an optional extra
 
     memories = link.cf.mem.get_mems(MemoryElement.TYPE_LOCO2)

@@ -120,10 +120,10 @@ class KheperaBody:
     @staticmethod
     def _note(link: Khepera4Link, now: float) -> str:
         unanswered = UNANSWERED if link.unanswered(now) else ""
-        return "; ".join(part for part in (unanswered, KheperaBody._trouble(link, now)) if part)
+        return "; ".join(part for part in (unanswered, KheperaBody._link_fault(link, now)) if part)
 
     @staticmethod
-    def _trouble(link: Khepera4Link, now: float) -> str:
+    def _link_fault(link: Khepera4Link, now: float) -> str:
         if link.trouble and link.odometry.stamp > -math.inf:
             return f"silent for {now - link.odometry.stamp:.1f} s: {link.trouble}"
         return link.trouble or (f"battery at {link.battery:.0%}: too low to drive" if link.battery_empty else "")

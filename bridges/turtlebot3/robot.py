@@ -195,9 +195,9 @@ class Robot:
     def note(self, now: float, linked: bool) -> str:
         """Faults for users; empty if none."""
         unanswered = UNANSWERED if now - self._halted_since > ANSWER_S and not self.standing else ""
-        return "; ".join(part for part in (unanswered, self._trouble(now, linked)) if part)
+        return "; ".join(part for part in (unanswered, self._link_fault(now, linked)) if part)
 
-    def _trouble(self, now: float, linked: bool) -> str:
+    def _link_fault(self, now: float, linked: bool) -> str:
         if not linked:
             return "no router"
         if now - self.odometry_received > SILENCE_S:

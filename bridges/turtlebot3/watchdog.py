@@ -72,13 +72,13 @@ class Node:
         self._make = messages.TwistStamped if kind == TYPES["stamped"] else messages.Twist
         self._stamped = kind == TYPES["stamped"]
         self._publisher = self.node.create_publisher(self._make, topic, 10)
-        self.node.create_subscription(self._make, topic, self._hear, 10)
+        self.node.create_subscription(self._make, topic, self._receive, 10)
         self.node.create_timer(CHECK_S, self._check)
         self.node.get_logger().info(
             f"watches {topic} ({kind}): stops the robot after {silence_s:g} s without a command"
         )
 
-    def _hear(self, message: Any) -> None:
+    def _receive(self, message: Any) -> None:
         self.watchdog.hear(time.monotonic(), moves=moving(message.twist if self._stamped else message))
 
     def _check(self) -> None:

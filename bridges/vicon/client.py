@@ -86,7 +86,7 @@ class Reader:
         self._socket.setblocking(False)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            offered = self._offered(deadline)
+            offered = self._offered_streams(deadline)
             if Kind.GLOBAL_SEGMENTS not in offered:
                 raise Malformed("the server has no segments to offer")
             wanted = offered.intersection(vicon_datastream.POSES)
@@ -118,7 +118,7 @@ class Reader:
     def close(self) -> None:
         self._socket.close()
 
-    def _offered(self, deadline: float) -> set[int]:
+    def _offered_streams(self, deadline: float) -> set[int]:
         while True:
             if not self._readable(deadline):
                 raise TimeoutError("no answer")

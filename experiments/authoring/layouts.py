@@ -119,7 +119,7 @@ def henneberg(count: int, spacing: float, rng: np.random.Generator) -> Layout:
     links = {(0, 1)}
     for new in range(2, count):
         near = np.argsort(norm(place[:new] - place[new]))[:CANDIDATES]
-        links |= {(row, new) for row in _firmest(place, new, near)}
+        links |= {(row, new) for row in _best_anchors(place, new, near)}
     position = np.column_stack([place - place.mean(axis=0), np.zeros(count)])
     return Layout(f"{count} robots, minimally rigid (Henneberg)", position, _each_once(np.array(sorted(links))))
 
@@ -144,7 +144,7 @@ def _sides(triangles: Index) -> Index:
     return _each_once(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
 
 
-def _firmest(place: Array, new: int, near: Index) -> tuple[int, int]:
+def _best_anchors(place: Array, new: int, near: Index) -> tuple[int, int]:
     """The two of `near` that hold a new point best: nearly at right angles, and not far away."""
     way = place[near] - place[new]
     length = norm(way)

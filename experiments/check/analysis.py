@@ -286,11 +286,11 @@ def _shapes(  # noqa: PLR0917 - one caller
         for mirror in (1.0, -1.0):
             flipped = plane * [1.0, mirror, 1.0]
             flipped[:, :2] += (end[anchor] - flipped[anchor]).mean(axis=0)[:2]
-            yield _rest(flipped, end, moves)
-        yield _rest(aloft, end, moves)
+            yield _resting_place(flipped, end, moves)
+        yield _resting_place(aloft, end, moves)
         for _ in range(min(10, GUESSES // rows)):
             place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
-            yield _rest(np.column_stack([place, aloft[:, 2]]), end, moves)
+            yield _resting_place(np.column_stack([place, aloft[:, 2]]), end, moves)
 
     found = []
     for each in find_shapes(links, guesses(), moves, assignment.anchors):
@@ -300,6 +300,6 @@ def _shapes(  # noqa: PLR0917 - one caller
     return found
 
 
-def _rest(guess: Array, end: Array, moves: Mask) -> Array:
+def _resting_place(guess: Array, end: Array, moves: Mask) -> Array:
     """The guess, with leaders where their plans leave them."""
     return np.where(moves[:, None], guess, end)

@@ -206,9 +206,9 @@ def walls(analysis: Analysis) -> Iterator[Claim]:
     outside = beyond.max(axis=2) > FORGIVEN
     tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
     tight &= ~tight[0]  # a start there is a finding of `starts`
-    problems = [_left(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
+    problems = [_left_arena(analysis, int(row), outside[:, row]) for row in np.flatnonzero(outside.any(axis=0))]
     for row in np.flatnonzero(tight.any(axis=0) & ~outside.any(axis=0)):
-        time, place = _first(analysis, int(row), tight[:, row])
+        time, place = _first_time(analysis, int(row), tight[:, row])
         message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall at {time:.1f} s, at {place}"
         remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
         problems.append(Claim("warning", "near-wall", message, remedy, ("arena", "size")))
@@ -255,16 +255,16 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
             yield Claim("warning", "lands-on", message, remedy, targets)
 
 
-def _first(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
+def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
     """Time at which a row is first there, and its place then in words."""
     at = int(where.argmax())
     x, y, _ = analysis.prediction.position[at, row]
     return float(analysis.prediction.time[at]), f"({x:.2f}, {y:.2f})"
 
 
-def _left(analysis: Analysis, row: int, outside: Mask) -> Claim:
+def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Claim:
     name = analysis.names[row]
-    time, place = _first(analysis, row, outside)
+    time, place = _first_time(analysis, row, outside)
     begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.experiment.timeline[k].at_s <= time]
     message = f"{name} would leave the arena at {time:.1f} s, at {place}"
     if row in analysis.without_neighbours and begun:
@@ -334,14 +334,14 @@ def ends(analysis: Analysis) -> Iterator[Claim]:
     for robot, (number, plan) in last.items():
         at, row = timeline[number].at_s, analysis.names.index(robot)
         when = min(round(at * analysis.experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
-        lasts = _lasts(plan, analysis.prediction.position[when, row], analysis.experiment.robots[robot].start)
+        lasts = _plan_duration(plan, analysis.prediction.position[when, row], analysis.experiment.robots[robot].start)
         if lasts is not None and at + lasts > duration * (1.0 + 1e-9) + 0.1:
             message = f"the leg of {robot} at {at:g} s lasts {lasts:.3g} s, but the run ends at {duration:g} s"
             remedy = f"give a duration_s of {math.ceil(at + lasts):g} or more, or a faster or shorter plan"
             yield Claim("warning", "leg-cut", message, remedy, ("timeline", number, "plan"))
 
 
-def _lasts(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
+def _plan_duration(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
     """Duration for which a plan moves its robot [s], to within 1 %; None: for ever."""
     elapsed = np.geomspace(0.01, 1e6, 2000)
     heading = np.full(len(elapsed), start[2] if len(start) > 2 else 0.0)

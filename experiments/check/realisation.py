@@ -81,7 +81,7 @@ def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residua
             _of_vectors(apart[at] - links.relative[at], np.broadcast_to(np.eye(3), (len(at), 3, 3)), links, at)
         )
         at = np.flatnonzero(wants == BY_BEARING)
-        parts.append(_of_vectors(*_beside(apart[at], links.bearing[at]), links, at))
+        parts.append(_of_vectors(*_from_ray(apart[at], links.bearing[at]), links, at))
     if anchors is not None:
         parts.append(_of_anchors(anchors, position))
     columns = zip(*((each.value, each.tail, each.head, each.slope) for each in parts), strict=True)
@@ -101,7 +101,7 @@ def _of_vectors(value: Array, slope: Array, links: Links, at: Index) -> Residual
     )  # fmt: skip
 
 
-def _beside(apart: Array, bearing: Array) -> tuple[Array, Array]:
+def _from_ray(apart: Array, bearing: Array) -> tuple[Array, Array]:
     """Vector from the ray along each bearing to x, as in the law `bearing`, and its derivative."""
     flat = np.isnan(bearing[:, 2])
     bearing, apart = bearing.copy(), apart.copy()

@@ -65,7 +65,7 @@ def modes(
     offset = offset if anchors is None else offset + anchors.offset(position)
     turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
-    taken = _without(taken, _whole(position, receivers, len(position)) / root[:, None], expected)
+    taken = _remove_motions(taken, _rigid_motions(position, receivers, len(position)) / root[:, None], expected)
     scale = float(np.abs(taken).max(initial=0.0))
     if np.abs(taken - taken.T).max(initial=0.0) <= EVEN * scale:
         values = np.linalg.eigvalsh(0.5 * (taken + taken.T)).astype(complex)
@@ -111,7 +111,7 @@ def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None
     return blocks.reshape(2 * count, 2 * count)
 
 
-def _whole(position: Array, receivers: Index, rows: int) -> Array:
+def _rigid_motions(position: Array, receivers: Index, rows: int) -> Array:
     """Motions of the whole (2 L, 3): along x, along y, and turning, about the leaders if there are any."""
     led = np.setdiff1d(np.arange(rows), receivers)
     centre = position[led if len(led) else receivers].mean(axis=0)[:2]
@@ -121,7 +121,7 @@ def _whole(position: Array, receivers: Index, rows: int) -> Array:
     return np.stack([np.stack(each, axis=1).ravel() for each in motions], axis=1)
 
 
-def _without(taken: Array, whole: Array, expected: Array) -> Array:
+def _remove_motions(taken: Array, whole: Array, expected: Array) -> Array:
     """The loop without those motions of the whole (2 L, 3) that it answers as `expected`."""
     basis, size, mixed = np.linalg.svd(whole, full_matrices=False)
     kept = size > 1e-9 * max(1e-300, float(size.max(initial=0.0)))

@@ -83,8 +83,8 @@ def realisation(analysis: Analysis) -> Iterator[Claim]:
     if shape.worst <= OFF:
         yield Claim("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
     else:
-        yield from _unmet(analysis, shape)
-    for number, later in _later(analysis):
+        yield from _unrealisable(analysis, shape)
+    for number, later in _later_shapes(analysis):
         if later.worst > OFF and shape.worst <= OFF:
             severity: Severity = "error" if later.worst > FAR_OFF else "warning"
             worst = analysis.link(int(later.error.argmax()))
@@ -101,13 +101,13 @@ def _asked(analysis: Analysis) -> str:
     return "the " + " and ".join([word for want, word in words.items() if want in found] or ["anchors"])
 
 
-def _later(analysis: Analysis) -> list[tuple[int, Shape]]:
+def _later_shapes(analysis: Analysis) -> list[tuple[int, Shape]]:
     """The shape after each change, with the number that the change has in the file."""
     given = analysis.experiment.formation.changes
     return list(zip(sorted(range(len(given)), key=lambda k: given[k].at_s), analysis.later, strict=False))
 
 
-def _unmet(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
+def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
     severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
     anchors = analysis.assignment.anchors
     if anchors is not None and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):

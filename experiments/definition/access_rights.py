@@ -64,7 +64,7 @@ def _rights(experiment: Experiment) -> Rights:
         if len(others) >= MANY and {*others, *group} == set(experiment.robots):
             others = ["*"]
         led = [name for name in group if name in guided]
-        inputs = [*_each(group, keys.position, keys.ranges), *map(keys.goal, led)]
+        inputs = [*_key_per_name(group, keys.position, keys.ranges), *map(keys.goal, led)]
         own = [keys.below(name) for name in group]
         foreign, tokens = _ros_keys(group, experiment)
         grant = Grant(
@@ -94,7 +94,7 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
     located = plan.externally_measured
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})
-    goals = _each(plan.guided, keys.goal)
+    goals = _key_per_name(plan.guided, keys.goal)
     foreign, tokens = _ros_keys(names, experiment)
     everything = [keys.everything]
     observer = Grant(subscribe=everything, query=[keys.pose("*"), ADMIN], watch=everything)
@@ -113,20 +113,20 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
             publish=[
                 keys.below("world"),
                 keys.event,
-                *_each(far, keys.position, keys.truth),
-                *_each(ranged, keys.ranges),
+                *_key_per_name(far, keys.position, keys.truth),
+                *_key_per_name(ranged, keys.ranges),
             ],
             subscribe=[keys.setpoint("*"), keys.status("*"), keys.state("*"), keys.estop],
             answer=[keys.world_order],
             tokens=[keys.below("world")],
             watch=[keys.lives(keys.alive("*")), keys.below("world")],
         ),
-        "positioning": Grant(publish=_each(located, keys.position), watch=_each(measured, keys.alive)),
+        "positioning": Grant(publish=_key_per_name(located, keys.position), watch=_key_per_name(measured, keys.alive)),
         "twin": Grant(
-            publish=[*_each(twins, keys.truth), *foreign],
-            subscribe=[*_each(measured, keys.truth), *foreign],
+            publish=[*_key_per_name(twins, keys.truth), *foreign],
+            subscribe=[*_key_per_name(measured, keys.truth), *foreign],
             tokens=tokens,
-            watch=[*_each(measured, keys.alive), *tokens],
+            watch=[*_key_per_name(measured, keys.alive), *tokens],
         ),
         "centre": Grant(
             publish=[keys.centre, *goals],
@@ -143,7 +143,7 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
     }
 
 
-def _each(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
+def _key_per_name(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
     return [key(name) for name in names for key in of]
 
 

@@ -81,14 +81,14 @@ def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> 
                 )
                 gap = np.hypot(*(position[:, :2] - place).T) - radius - radius[row]
                 gap[row] = np.inf
-                if (gap > CLEAR).all() and _free(stands, place, kinds_of[row]):
+                if (gap > CLEAR).all() and _is_clear(stands, place, kinds_of[row]):
                     position[row, :2] = place
                     break
     rows = [list(experiment.robots).index(name) for name in names]
     return position[rows], yaw[rows]
 
 
-def _free(stands: Scene, place: Array, kind: Kind) -> bool:
+def _is_clear(stands: Scene, place: Array, kind: Kind) -> bool:
     """Whether a robot that stands at `place` (2,) [m] keeps clear of all obstacles."""
     return all(
         outlines.distance(stands, k, stands.pose[k], place) > kind.radius + CLEAR

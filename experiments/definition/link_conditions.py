@@ -41,7 +41,9 @@ def virtual_conditions(experiment: Experiment, over: Links, seeds: Sequence[int]
     Other messages between the same robots have another `stream`, and their own random numbers.
     """
     ends = _Ends.of(experiment, over.select(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
-    return Conditions.side_by_side(_seeded(_of(experiment.channel, ends, experiment.duration_s), ends, seeds, stream))
+    return Conditions.side_by_side(
+        _seeded(_link_conditions(experiment.channel, ends, experiment.duration_s), ends, seeds, stream)
+    )
 
 
 def receiver_conditions(
@@ -52,7 +54,7 @@ def receiver_conditions(
     `over.receiver` counts in `receivers`, `over.sender` in the robots of the file.
     """
     ends = _Ends.of(experiment, over, receivers)
-    bare = _of(experiment.channel, ends, experiment.duration_s)
+    bare = _link_conditions(experiment.channel, ends, experiment.duration_s)
     bare = replace(bare, delay=np.where(bare.delay > OWN_S, bare.delay, 0.0))
     return _seeded(bare, ends, [experiment.seed], stream)[0]
 
@@ -90,7 +92,7 @@ class _Ends:
         return found
 
 
-def _of(channel: Channel, ends: _Ends, duration: float) -> Conditions:
+def _link_conditions(channel: Channel, ends: _Ends, duration: float) -> Conditions:
     """Conditions of these links without random keys."""
     effects = [link_effects(channel), *(link_effects(channel, own) for own in channel.links.values())]
     count = len(ends.receiver)

@@ -19,7 +19,7 @@ def without_standby(experiment: Experiment) -> Experiment:
     if len(robots) == len(experiment.robots):
         return experiment
     formation, channel, architecture = experiment.formation, experiment.channel, experiment.architecture
-    links = _between(formation.links, robots)
+    links = _links_between(formation.links, robots)
     changes = [
         msgspec.structs.replace(change, links={text: to for text, to in change.links.items() if text in links})
         for change in formation.changes
@@ -27,7 +27,7 @@ def without_standby(experiment: Experiment) -> Experiment:
     outages = [
         msgspec.structs.replace(
             outage,
-            links=list(_between(dict.fromkeys(outage.links), robots)),
+            links=list(_links_between(dict.fromkeys(outage.links), robots)),
             robots=[name for name in outage.robots if name in robots],
         )
         for outage in channel.outages
@@ -52,7 +52,7 @@ def without_standby(experiment: Experiment) -> Experiment:
         ),
         timeline=[leg for leg in experiment.timeline if leg.robot in robots],
         architecture=architecture,
-        channel=msgspec.structs.replace(channel, links=_between(channel.links, robots), outages=outages),
+        channel=msgspec.structs.replace(channel, links=_links_between(channel.links, robots), outages=outages),
         hosts={
             name: msgspec.structs.replace(host, robots=[robot for robot in host.robots if robot in robots])
             for name, host in experiment.hosts.items()
@@ -60,7 +60,7 @@ def without_standby(experiment: Experiment) -> Experiment:
     )
 
 
-def _between(links: Mapping[str, T], robots: Collection[str]) -> dict[str, T]:
+def _links_between(links: Mapping[str, T], robots: Collection[str]) -> dict[str, T]:
     """Links with both ends among `robots`."""
     return {text: to for text, to in links.items() if {*link_pairs(text)[0]} <= {*robots}}
 

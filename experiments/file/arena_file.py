@@ -93,19 +93,19 @@ def load(name: str, folder: Path) -> ArenaFile:
     try:
         text = syntax.content(file, label)
     except FileNotFoundError:
-        hint = did_you_mean(name, _others(folder))
+        hint = did_you_mean(name, _known_arena_files(folder))
         raise Misnamed(Fault(_HERE, f"there is no arena file {label}", hint or "write one beside this file")) from None
     try:
         content = syntax.parsed(text, label, json=False)
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     read = ArenaFile(name, label, text, content.get("arena", {}))
-    _refuse(read, [*structure.number_faults(content), *_misshapen(content)])
+    _refuse(read, [*structure.number_faults(content), *_faults_of_shape(content)])
     _refuse(read, list(arena_faults(msgspec.convert(content, _Whole).arena)))
     return read
 
 
-def _others(folder: Path) -> list[str]:
+def _known_arena_files(folder: Path) -> list[str]:
     """Known arena files: those beside the experiment file (tables [arena], no robots), and those of the catalogue."""
     found = []
     for file in sorted(folder.glob("*.toml"))[:LOOKED_AT]:
@@ -118,7 +118,7 @@ def _others(folder: Path) -> list[str]:
     return list(dict.fromkeys([*found, *index.arenas()]))
 
 
-def _misshapen(content: Mapping[str, Any]) -> Iterator[Fault]:
+def _faults_of_shape(content: Mapping[str, Any]) -> Iterator[Fault]:
     """Faults by which the content is no arena file."""
     for fault in structure.faults(content, _Whole):
         if not fault.path:

@@ -65,7 +65,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     for name, robot in experiment.spares.items():
         yield from _robot(experiment, ("spares", name), robot)
     yield from standby_faults(experiment)
-    yield from _furnished(experiment)
+    yield from _start_conflicts(experiment)
     yield from consistency_formation.faults(experiment)
     yield from consistency_network.channel_faults(experiment)
     yield from consistency_network.host_faults(experiment)
@@ -103,7 +103,7 @@ def arena_faults(arena: Arena) -> Iterator[Fault]:
                 yield Fault(("arena", "starts", name, "at"), message, "move it, make it smaller, or enlarge size")
 
 
-def _furnished(experiment: Experiment) -> Iterator[Fault]:
+def _start_conflicts(experiment: Experiment) -> Iterator[Fault]:
     """Faults between robots, obstacles and start boxes at the start."""
     arena, robots = experiment.arena, experiment.robots
     scene = Scene.furnished(arena.size, arena.obstacles, {}, walled=arena.walls)

@@ -224,7 +224,7 @@ class _Reading:
             table = plain if override.case is None else _tables(plain).get(override.case, {})
             if override not in late and assign(table, override, part=override.case is not None):
                 unused.discard(override)
-        base = self._furnished(plain, "")
+        base = self._with_arena_file(plain, "")
         tables, cases = _tables(plain), {}
         for name, table in tables.items():
             own = deepcopy(merged(_without_cases(plain), _without_cases(table)))
@@ -232,7 +232,7 @@ class _Reading:
             for override in mine:
                 if override in above:
                     assign(own, override)
-            cases[name] = self._furnished(own, name)
+            cases[name] = self._with_arena_file(own, name)
             for override in mine:
                 if override not in above and assign(cases[name], override):
                     unused.discard(override)
@@ -244,7 +244,7 @@ class _Reading:
             raise DocumentError([_unused(override, known) for override in of_all if override in unused])
         return base, tables, cases
 
-    def _furnished(self, document: _Table, case: str) -> _Table:
+    def _with_arena_file(self, document: _Table, case: str) -> _Table:
         """Merge the arena file of a document."""
         name, files = arena_file.arena_file_name(document), self.source.arenas
         if name is None:

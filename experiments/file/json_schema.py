@@ -78,7 +78,7 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
 
 def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
     """Tuples as draft 7 writes them."""
-    result = _below(node, _draft7)
+    result = _map_children(node, _draft7)
     if "prefixItems" in result:
         result["items"], result["additionalItems"] = result.pop("prefixItems"), False
     return result
@@ -86,13 +86,13 @@ def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
 
 def _partial(node: Mapping[str, Any]) -> dict[str, Any]:
     """The same with nothing required: a case holds only what it changes."""
-    result = _below(node, _partial)
+    result = _map_children(node, _partial)
     if "$ref" in result:
         result["$ref"] += _CASE
     return {key: value for key, value in result.items() if key not in ("required", "default")}
 
 
-def _below(node: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
+def _map_children(node: Mapping[str, Any], change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
     """A node with every node right below it changed."""
     result: dict[str, Any] = {}
     for key, value in node.items():

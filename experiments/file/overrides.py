@@ -101,7 +101,7 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         inside = {} if inside is None else _as_table(inside, path)
         if not isinstance(inside, dict | list):
             raise override.refused(f"'{step}' is no table, so it has no '{below}'", f"set {step} itself")
-        if group and not part and isinstance(inside, dict) and below not in ("kind", *_own(inside, group)):
+        if group and not part and isinstance(inside, dict) and below not in ("kind", *_own_parameters(inside, group)):
             return False
         at[step] = inside
         at = inside
@@ -146,7 +146,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
         for text, given in links.items()
         if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
     ]
-    word = _TARGET_OF.get(_need(formation.get("law", _DEFAULTS.formation.law)), "distance")
+    word = _TARGET_OF.get(_needed_target(formation.get("law", _DEFAULTS.formation.law)), "distance")
     for text in bare:
         try:
             target = _target_in(shape or {}, document.get("robots"), text, word)
@@ -171,7 +171,7 @@ class _NoPlace(ValueError):
     """A link between robots without places; message and remedy."""
 
 
-def _need(law: object) -> str:
+def _needed_target(law: object) -> str:
     """Target that a law needs of every link; "any" if no such law is installed."""
     name = law.get("kind") if isinstance(law, Mapping) else law
     if not isinstance(name, str) or name not in registry.names(registry.LAWS):
@@ -212,10 +212,10 @@ def chosen_parameters(document: Mapping[str, Any], path: Path) -> Iterable[str]:
         at = at.get(step, {}) if isinstance(at, dict) else at[int(step)]
     choice = _as_table(at.get(path[-1], _default(path)), path)
     group = group_of(path)
-    return _own(choice, group) if group and isinstance(choice, dict) else []
+    return _own_parameters(choice, group) if group and isinstance(choice, dict) else []
 
 
-def _own(choice: Mapping[str, Any], group: str) -> list[str]:
+def _own_parameters(choice: Mapping[str, Any], group: str) -> list[str]:
     return parameters(group, str(choice.get("kind")))
 
 

@@ -156,10 +156,10 @@ def _walk(
         key = f"{path}.{name}" if path else name
         yield _entry(key, field, name in node.get("required", []), definitions, needed)
         if key != "cases":  # a case repeats what stands above
-            yield from _below(key, name, field, definitions)
+            yield from _keys_below(key, name, field, definitions)
 
 
-def _below(key: str, name: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[Entry]:
+def _keys_below(key: str, name: str, field: Mapping[str, Any], definitions: Mapping[str, Any]) -> Iterator[Entry]:
     """Keys of the tables that a field can hold."""
     for option in field.get("anyOf", [field]):
         inner = _resolved(option, definitions)

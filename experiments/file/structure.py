@@ -159,7 +159,7 @@ def _table(
         elif field.required and name not in meant:
             _, note = _plain(field.type, "")
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
-            found.append(Fault(path, f"'{name}' is missing{_in(path)}", hint))
+            found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))
     return found or _judged(value, struct, path, "", fields)
 
 
@@ -178,7 +178,7 @@ def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) ->
         return Fault((*path, key), f"unknown parameter '{key}' of {kind!r}", hint, on_key=True)
     if path and key in _FIELDS:
         hint = f"'{key}' belongs at the top of the file, above the first [table]"
-    return Fault((*path, key), f"unknown key '{key}'{_in(path)}", hint, on_key=True)
+    return Fault((*path, key), f"unknown key '{key}'{_place_in_file(path)}", hint, on_key=True)
 
 
 def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
@@ -296,7 +296,7 @@ def _name(path: Path) -> str:
     return "".join(f"[{step}]" if isinstance(step, int) else str(step) for step in path[first:])
 
 
-def _in(path: Path) -> str:
+def _place_in_file(path: Path) -> str:
     return f" in '{_name(path)}'" if path else ""
 
 

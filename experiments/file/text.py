@@ -107,7 +107,7 @@ def _toml_problem(text: str, label: str, message: str) -> Problem:
     column = int(match[2] or len(source.rstrip()) + 1)
     message = message[: match.start()]
     if message.startswith("Cannot"):  # a second time the same table or key; tomllib points behind it
-        word, first = _twice(lines, line)
+        word, first = _repeated_key(lines, line)
         message = f"{word} stands here a second time{f', first in line {first}' if first else ''}"
         column = len(source) - len(source.lstrip()) + 1
         return Problem(label, line, column, message, "rename or remove one of the two", source)
@@ -115,7 +115,7 @@ def _toml_problem(text: str, label: str, message: str) -> Problem:
     return Problem(label, line, column, message, hint, source)
 
 
-def _twice(lines: list[str], line: int) -> tuple[str, int | None]:
+def _repeated_key(lines: list[str], line: int) -> tuple[str, int | None]:
     """The header or key of a line, and the line above that has it too; a key is looked for in its own table."""
     word = _word(lines[line - 1])
     for number in range(line - 1, 0, -1):

@@ -42,12 +42,12 @@ class Clearance:
         for i, name in enumerate(names[:-1]):
             gap = solid.between(i)
             for j, other in enumerate(names[i + 1 :]):
-                robots[i] = _nearer(robots[i], trace.time, gap[:, j], (name, other))
-                robots[i + 1 + j] = _nearer(robots[i + 1 + j], trace.time, gap[:, j], (other, name))
+                robots[i] = _closer(robots[i], trace.time, gap[:, j], (name, other))
+                robots[i + 1 + j] = _closer(robots[i + 1 + j], trace.time, gap[:, j], (other, name))
                 overlaps += _overlaps(trace.time, gap[:, j], (name, other))
         for thing, gap in _to_things(trace, solid):
             for i, name in enumerate(names):
-                arena[i] = _nearer(arena[i], trace.time, gap[:, i], (name, thing))
+                arena[i] = _closer(arena[i], trace.time, gap[:, i], (name, thing))
                 overlaps += _overlaps(trace.time, gap[:, i], (name, thing))
         overlaps.sort(key=lambda each: (each.time_s, each.first, each.second))
         return cls(tuple(robots), tuple(arena), tuple(overlaps))
@@ -108,7 +108,7 @@ def _gap(level: Array, upright: Array, free: Mask) -> Array:
     return np.where(np.isfinite(gap), gap, np.inf)
 
 
-def _nearer(known: Approach | None, time: Array, gap: Array, between: tuple[str, str]) -> Approach | None:
+def _closer(known: Approach | None, time: Array, gap: Array, between: tuple[str, str]) -> Approach | None:
     """The closer of a known approach and of gaps (T,) over time."""
     k = int(gap.argmin())
     if not np.isfinite(gap[k]) or (known is not None and known.gap <= gap[k]):

@@ -57,7 +57,7 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _mean(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
+def _mean_indices(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
     """Each index averaged over the robots for which it is known; `acquired_s` only if all of them acquired."""
     mean: dict[str, float | None] = {}
     for index in INDICES:
@@ -134,7 +134,7 @@ def measure(trace: Trace) -> CaseMetrics:
         robots=robots,
         leaders=leading,
         died=died,
-        mean=_mean([robots[i] for i in kept]),
+        mean=_mean_indices([robots[i] for i in kept]),
         acquired_s=tuple(together),
         rotation_rad_s=tuple(rotation),
         j2=_benchmark_cost(trace, errors),
@@ -261,7 +261,7 @@ def _robots(
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
             overlap=max((each.overlap for each in own[i]), default=None),
-            short=_short(trace, errors.net, i),
+            short=_distance_to_goal(trace, errors.net, i),
             near=clearance.robots[i],
             near_arena=clearance.arena[i],
             intervened_share=_share(trace.interventions[i], trace.ticks[i]),
@@ -276,7 +276,7 @@ def _robots(
     )
 
 
-def _short(trace: Trace, net: Links, row: int) -> float | None:
+def _distance_to_goal(trace: Trace, net: Links, row: int) -> float | None:
     """Distance of a robot with a plan from its goal at the end [m]; None: no plan, or not known."""
     began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
     if not began or row in net.receiver:

@@ -82,7 +82,7 @@ class Records:
         try:
             with self.path.open("rb") as file:
                 if (magic := file.read(len(MCAP0_MAGIC))) != MCAP0_MAGIC:
-                    raise RecordingError(_stranger(self.path, magic))
+                    raise RecordingError(_foreign_format(self.path, magic))
                 yield file, self.path.stat().st_size
         except OSError as error:
             raise RecordingError(
@@ -177,7 +177,7 @@ class Records:
             self.metadata.append(Metadata.read(stream))
 
 
-def _stranger(path: Path, magic: bytes) -> str:
+def _foreign_format(path: Path, magic: bytes) -> str:
     if MCAP0_MAGIC.startswith(magic):
         return f"{path}: nothing was recorded, the recorder ended before its first record; delete the file"
     return f"{path}: not an MCAP file; give the .mcap file of a run"

@@ -118,12 +118,12 @@ class PastRun(msgspec.Struct, frozen=True):
 
 def past_runs(folders: Sequence[Path]) -> list[PastRun]:
     """The runs in some folders, and one level below them, the oldest first; folders of no run are passed over."""
-    places = [place for folder in folders for place in (folder, *_below(folder))]
+    places = [place for folder in folders for place in (folder, *_subfolders(folder))]
     found = [run for place in dict.fromkeys(places) if (run := _past_run(place)) is not None]
     return sorted(found, key=lambda run: run.made)
 
 
-def _below(folder: Path) -> list[Path]:
+def _subfolders(folder: Path) -> list[Path]:
     try:
         return sorted(place for place in folder.iterdir() if place.is_dir() and not place.is_symlink())
     except OSError:
@@ -167,16 +167,16 @@ def differences(first: PastRun, other: PastRun) -> list[str]:
     """How the file, the options, the seeds, the code and the versions of a run differ from those of another one."""
     before, after = (dict(_flat(_document(Path(run.folder)), "")) for run in (first, other))
     found = [
-        f"{key} {_shown(before.get(key))} → {_shown(after.get(key))}"
+        f"{key} {_formatted(before.get(key))} → {_formatted(after.get(key))}"
         for key in dict.fromkeys([*before, *after])
         if before.get(key) != after.get(key)
     ]
     for name in ("virtual", "bodies", "changes", "cases"):
         old, new = getattr(first.origin, name), getattr(other.origin, name)
         if old != new:
-            found.append(f"{name}: {_shown(old)} → {_shown(new)}")
+            found.append(f"{name}: {_formatted(old)} → {_formatted(new)}")
     if first.seeds != other.seeds:
-        found.append(f"seeds: {_shown(first.seeds)} → {_shown(other.seeds)}")
+        found.append(f"seeds: {_formatted(first.seeds)} → {_formatted(other.seeds)}")
     old_code, new_code = first.origin.made_by, other.origin.made_by
     if old_code is not None and new_code is not None:
         found += [f"made with {each}" for each in new_code.differences(old_code)]
@@ -199,7 +199,7 @@ def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 -
         yield path, value
 
 
-def _shown(value: object) -> str:
+def _formatted(value: object) -> str:
     if value in (None, [], {}):
         return "-"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

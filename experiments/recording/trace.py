@@ -88,7 +88,7 @@ class Goals:
         """
         assert receipts.extra is not None
         acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]
-        reached, first = _in_run(acted, duration), _first(acted, row, pose)
+        reached, first = _in_run(acted, duration), _first_of_pose(acted, row, pose)
         first &= reached
         return cls(
             sent=sent.take(_in_run(sent.stamp, duration)),
@@ -103,7 +103,7 @@ class Goals:
         )
 
 
-def _first(time: Array, row: Index, pose: Array) -> Mask:
+def _first_of_pose(time: Array, row: Index, pose: Array) -> Mask:
     """Mask of the goals (K,), acted on at `time`, that are the first of their robot to rest on that pose."""
     order = np.lexsort((time, row))
     changed = np.ones(len(order), dtype=bool)

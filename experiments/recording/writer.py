@@ -150,9 +150,9 @@ class Recording:
         if started is not None:
             about["started"] = repr(started)
         try:
-            self._guarded(self._begin, experiment, document, about)
+            self._write_or_fail(self._begin, experiment, document, about)
         except RecordingError:
-            self._let_go()
+            self._close_file()
             raise
 
     def write(self, message: Message, received: float | None = None, size: int = 0) -> None:
@@ -199,18 +199,18 @@ class Recording:
 
     def flush(self) -> None:
         """Brings everything so far to the disk."""
-        self._guarded(self._writer.flush)
+        self._write_or_fail(self._writer.flush)
 
     def close(self) -> None:
         """Finishes the file; a second call does nothing. After a write error it stays unfinished, and recoverable."""
         try:
             if not self._over:
-                self._guarded(self._writer.finish)
+                self._write_or_fail(self._writer.finish)
                 self._over = f"{self.path}: the recording is closed"
         finally:
-            self._let_go()
+            self._close_file()
 
-    def _let_go(self) -> None:
+    def _close_file(self) -> None:
         self._file.close()
         self._index.close()
 
@@ -238,7 +238,7 @@ class Recording:
         # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
         times = max(self._index.end, self._nanoseconds(logged)), self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
-        self._guarded(self._writer.add_message, channel, times[0], data, times[1], number)
+        self._write_or_fail(self._writer.add_message, channel, times[0], data, times[1], number)
         return True
 
     def _register(self, topic: _Written, name: str) -> int:
@@ -252,7 +252,7 @@ class Recording:
             self._latest = round(stamp * 1e9)
         return self._latest  # a broken clock must not stretch the time line of the whole file
 
-    def _guarded(self, write: Callable[..., object], *what: object) -> None:
+    def _write_or_fail(self, write: Callable[..., object], *what: object) -> None:
         """Writes. No writer survives an error or interrupt in the middle: the file then stays unfinished."""
         if self._over:
             raise RecordingError(self._over)

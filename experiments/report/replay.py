@@ -55,16 +55,16 @@ def embedded(traces: Sequence[Trace]) -> str:
     first = list({trace.case: trace for trace in reversed(traces)}.values())[::-1][:CASES]
     if not first:
         return ""
-    content = _film(first)
+    content = _replay_data(first)
     film = json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
     label = "Replay of " + ", ".join(trace.case for trace in first)
     script = SCRIPT.read_text("utf-8").replace("</", "<\\/").strip()
     at, links = content["still"], LINKS.format(good=100 * GOOD_M, fair=100 * FAIR_M)
-    still = _still(first, at, f"{label}, at {at:g} s")
+    still = _still_picture(first, at, f"{label}, at {at:g} s")
     return PAGE.format(label=_plain(label), links=links, at=at, still=still, script=script, film=film)
 
 
-def _still(traces: Sequence[Trace], at: float, label: str) -> str:
+def _still_picture(traces: Sequence[Trace], at: float, label: str) -> str:
     """The picture of the replay at a time [s], as SVG; empty where no position is known."""
     if not any(map(trajectories.has_positions, traces)):
         return ""
@@ -77,7 +77,7 @@ def _plain(text: str) -> str:
     return "".join(letter for letter in text if letter.isalnum() or letter in " ,-_.")
 
 
-def _film(traces: Sequence[Trace]) -> dict[str, Any]:
+def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:
     stage = Stage.of_experiment(traces[0].experiment)
     scene, end = stage.scene, max(float(trace.time[-1]) for trace in traces)
     width = 4 * len(stage.names) + len(stage.links) + 3 * len(scene.names)
@@ -124,12 +124,12 @@ def _case(trace: Trace, step: float) -> dict[str, Any]:
         "name": trace.case,
         "begin": 0.0,
         "step": step,
-        "p": [_whole(row.ravel()) for row in rows],
+        "p": [_thousandths(row.ravel()) for row in rows],
         "e": level.tolist(),
-        "o": [_whole(row) for row in poses],
+        "o": [_thousandths(row) for row in poses],
     }
 
 
-def _whole(values: Array) -> list[int | None]:
+def _thousandths(values: Array) -> list[int | None]:
     """Thousandths; None for what is unknown."""
     return [None if np.isnan(value) else round(1e3 * value) for value in values.tolist()]

@@ -119,9 +119,9 @@ def write(
     )
     facts = [
         ("Date", made.date),
-        ("Clock", _words(trace.clock for trace in traces)),
+        ("Clock", _joined(trace.clock for trace in traces)),
         ("Seed" if len(seeds) == 1 else "Seeds", seeds_in_words(seeds)),
-        ("Duration", _words(_length(case) for case in cases)),
+        ("Duration", _joined(_length(case) for case in cases)),
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
@@ -345,5 +345,5 @@ def _interval_note(cases: Sequence[CaseMetrics]) -> str:
     return f" Whiskers: 95 % confidence over {most} seeds." if most > 1 else ""
 
 
-def _words(words: Iterable[str]) -> str:
+def _joined(words: Iterable[str]) -> str:
     return " and ".join(dict.fromkeys(words))

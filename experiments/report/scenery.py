@@ -55,7 +55,7 @@ def from_above(axes: Axes, experiment: Experiment) -> None:
     x, y, _ = arena.size
     border: dict[str, Any] = {"linewidth": 1.0} if arena.walls else {"linewidth": 0.6, "linestyle": (0, (6, 3))}
     axes.add_patch(Rectangle((-x / 2, -y / 2), x, y, fill=False, edgecolor=INK, zorder=0.6, **border))
-    way = _ways(experiment, scene)
+    way = _obstacle_paths(experiment, scene)
     for k, name in enumerate(scene.names):
         outline = scene.outline[k]
         if outline is not None and not scene.closed[k]:
@@ -83,7 +83,7 @@ def in_space(axes: Axes3D, experiment: Experiment, low: Array, high: Array) -> N
     style: dict[str, Any] = {"linewidth": 0.8} if arena.walls else {"linewidth": 0.5, "linestyle": (0, (6, 3))}
     if (scene.low[:2] >= low[:2]).all() and (scene.high[:2] <= high[:2]).all():
         _loop(axes, 0.5 * np.array(arena.size[:2]) * _SQUARE, color=EDGE, **style)
-    way = _ways(experiment, scene)
+    way = _obstacle_paths(experiment, scene)
     for k in range(len(scene.names)):
         bottom, top = float(scene.bottom[k]), float(min(scene.top[k], high[2]))
         if bottom >= top:
@@ -107,7 +107,7 @@ def around(experiment: Experiment, low: Array, high: Array) -> tuple[Array, Arra
     """
     arena, scene = experiment.arena, bodies.scene(experiment)
     rings = [_ring(scene, k, scene.pose[k]) for k in range(len(scene.names))]
-    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _ways(experiment, scene)[[-1], k]]
+    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _obstacle_paths(experiment, scene)[[-1], k]]
     rings += [np.array(box.at) + 0.5 * np.array(box.size) * _SQUARE for box in arena.starts.values()]
     if rings:
         points = np.clip(np.concatenate(rings), scene.low[:2], scene.high[:2])
@@ -167,7 +167,7 @@ def _style(scene: Scene, k: int) -> dict[str, Any]:
     return _HANGS if scene.bottom[k] > 0.0 else _STANDS
 
 
-def _ways(experiment: Experiment, scene: Scene) -> Array:
+def _obstacle_paths(experiment: Experiment, scene: Scene) -> Array:
     """Poses (T, M, 3) of obstacles over the run, as finely as a picture shows them."""
     return scene.along(np.linspace(0.0, experiment.duration_s, 400))
 

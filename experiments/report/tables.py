@@ -1,7 +1,7 @@
 """Tables of a report, from measured cases; several seeds of a case become means with 95 % intervals.
 
-Two shapes: numbers of a case, with a column for each case (`_across`); and numbers of each robot or link (`_Rows`), in
-a table for each case or with the cases side by side.
+Two shapes: numbers of a case, with a column for each case (`_table_by_case`); and numbers of each robot or link
+(`_Rows`), in a table for each case or with the cases side by side.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ DEFINITIONS: Final = (
 # ---------------------------------------------------------------------- numbers of a case
 
 
-def _across(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line]) -> Table:
+def _table_by_case(head: str, cases: Sequence[CaseMetrics], lines: Iterable[Line]) -> Table:
     """A row for each number of a case, a column for each case."""
     grouped = by_case(cases)
     rows = [
@@ -147,12 +147,12 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     ]
     units: dict[str, list[Line]] = {
         "Acquired by all followers [s]": [
-            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _at(case.acquired_s, k), 1.0)  # type: ignore[misc]
+            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _value_at(case.acquired_s, k), 1.0)  # type: ignore[misc]
             for k in phases
         ],
         "Distances [cm]": lengths,
         "Net rotation [mrad/s]": [
-            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _at(case.rotation_rad_s, k), 1000.0)  # type: ignore[misc]
+            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _value_at(case.rotation_rad_s, k), 1000.0)  # type: ignore[misc]
             for k in phases
         ],
         "Delay of poses [ms]": [
@@ -174,7 +174,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ],
         "Cost (a number without unit)": [("J2", attrgetter("j2"), 1.0)],
     }
-    tables = [_across(unit, cases, lines) for unit, lines in units.items()]
+    tables = [_table_by_case(unit, cases, lines) for unit, lines in units.items()]
     sums = [
         Row((label, *(number(sum(getattr(run, field) for run in runs)) for runs in by_case(cases).values())))
         for field, label in TROUBLES
@@ -206,7 +206,7 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
     def centre(name: str) -> Callable[[CaseMetrics], float | None]:
         return lambda case: getattr(case.guidance, name, None)
 
-    table = _across(
+    table = _table_by_case(
         "Architecture",
         cases,
         [
@@ -453,7 +453,7 @@ def collision_table(cases: Sequence[CaseMetrics]) -> Table:
         depth, impulse = number(each.overlap, 100.0), number(each.impulse, 1000.0)
         rows.append(Row((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
     head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [cm]")
-    return Table(head, tuple(rows), note=_more(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
+    return Table(head, tuple(rows), note=_hidden_rows_note(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
 
 
 def clocks_table(traces: Sequence[Trace]) -> Table:
@@ -493,7 +493,7 @@ def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | N
 
     def table(chosen: Sequence[tuple[str, Event]]) -> Table:
         rows = [Row((case, f"{e.stamp:.2f}", e.kind, e.source, e.text)) for case, e in chosen[:MOST_EVENTS]]
-        return Table(head, tuple(rows), note=_more(len(chosen) - MOST_EVENTS, "the recording"), words=True)
+        return Table(head, tuple(rows), note=_hidden_rows_note(len(chosen) - MOST_EVENTS, "the recording"), words=True)
 
     telling = [(case, event) for case, event in events if event.kind not in ROUTINE]
     short = table(telling) if telling else Table(head, (), note="No hazard, no leg of the timeline, no order.")
@@ -525,7 +525,7 @@ def _merged_events(traces: Sequence[Trace]) -> list[tuple[str, Event]]:
     ]
 
 
-def _more(hidden: int, where: str) -> str:
+def _hidden_rows_note(hidden: int, where: str) -> str:
     return f"{hidden} more are in {where}." if hidden > 0 else ""
 
 
@@ -535,7 +535,7 @@ def _known(what: Callable[[Iterable[Any]], float], values: Iterable[float | None
     return what(known) if known else None
 
 
-def _at(values: Sequence[float | None], k: int) -> float | None:
+def _value_at(values: Sequence[float | None], k: int) -> float | None:
     return values[k] if k < len(values) else None
 
 

@@ -58,7 +58,7 @@ def _float(table: Table, width: float) -> str:
 def _fitting(table: Table, width: float) -> list[Table]:
     """Tables that fit a width [pt], each with the first column."""
     if sum(_widths(table)) > width:
-        table = replace(table, rows=tuple(part for row in table.rows for part in _below(row)))
+        table = replace(table, rows=tuple(part for row in table.rows for part in _stacked_rows(row)))
     first, *others = _widths(table)
     groups: list[list[int]] = [[]]
     room = width - first
@@ -76,7 +76,7 @@ def _columns(table: Table, which: Sequence[int]) -> Table:
     return replace(table, head=tuple(table.head[k] for k in which), rows=tuple(row for row in rows if any(row.cells)))
 
 
-def _below(row: Row) -> list[Row]:
+def _stacked_rows(row: Row) -> list[Row]:
     """A row, and a second one with what stood behind its values."""
     name, *cells = row.cells
     behind = ["" if isinstance(cell, str) else cell[1] for cell in cells]

@@ -20,7 +20,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [
         *failures(cases),
         *interruptions(cases),
-        *_troubles(cases),
+        *_other_findings(cases),
         *_lost_poses(cases),
         *_modelled(cases),
         *_deadlines(cases),
@@ -46,7 +46,7 @@ def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Robots that did not do their part; nothing else in a report means much before that is known."""
-    return [Finding("bad", f"Failed in {case.case}: {_first(case.failures)}.") for case in cases if case.failures]
+    return [Finding("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures]
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -89,9 +89,9 @@ def _lost_poses(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
 
 
-def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _other_findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Robots that began late, and messages that could not be read."""
-    return [Finding("bad", f"In {case.case}: {_first(case.troubles)}.") for case in cases if case.troubles]
+    return [Finding("bad", f"In {case.case}: {_first_few(case.troubles)}.") for case in cases if case.troubles]
 
 
 def _modelled(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -130,7 +130,9 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
 def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Times without the position of a robot that came back."""
     return [
-        Finding("fair", f"Position unknown in {case.case}: {_first(case.gaps)}; neither in nor out of the tolerance.")
+        Finding(
+            "fair", f"Position unknown in {case.case}: {_first_few(case.gaps)}; neither in nor out of the tolerance."
+        )
         for case in cases
         if case.gaps
     ]
@@ -331,7 +333,7 @@ def _room(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [Finding("fair" if far.excursion < 0.02 else "bad", text)] if far.excursion > 0.0 else []
 
 
-def _first(texts: Sequence[str]) -> str:
+def _first_few(texts: Sequence[str]) -> str:
     """The first few texts; the others are counted."""
     more = len(texts) - NAMED
     return "; ".join([*texts[:NAMED], *([f"{more} more like this"] if more > 0 else [])])

@@ -216,7 +216,7 @@ class SceneDrawing:
         self._draw_robots(moment, still=still)
         self._draw_links(moment)
         for handle, pose in zip(self._obstacles, moment.obstacles, strict=True):
-            if not _same(handle, pose):
+            if not _drawn_at(handle, pose):
                 handle.position, handle.wxyz = (pose[0], pose[1], 0.0), appearance.quaternions(pose[2])
         if trails:
             self._draw_trails(moment)
@@ -326,7 +326,7 @@ class SceneDrawing:
         return np.isin(np.array(self.stage.names), self.stage.leaders)
 
 
-def _same(handle: Any, pose: Array) -> bool:  # noqa: ANN401
+def _drawn_at(handle: Any, pose: Array) -> bool:  # noqa: ANN401
     """Whether an obstacle is drawn at this pose already."""
     place = np.array([pose[0], pose[1], 0.0])
     return bool(

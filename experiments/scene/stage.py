@@ -129,7 +129,7 @@ def place_of(body: str) -> Place:
 T = TypeVar("T")
 
 
-def _there(plug_in: Callable[[], T]) -> T | None:
+def _if_installed(plug_in: Callable[[], T]) -> T | None:
     """A plug-in of an experiment; None where it is not installed."""
     try:
         return plug_in()
@@ -156,8 +156,8 @@ class Stage:
     @classmethod
     def of_experiment(cls, experiment: Experiment) -> Stage:
         plan = Plan(experiment)
-        avoidance = _there(lambda: plan.avoidance)
-        formation = _there(lambda: plan.formation)
+        avoidance = _if_installed(lambda: plan.avoidance)
+        formation = _if_installed(lambda: plan.formation)
         margin = getattr(avoidance, "margin", getattr(avoidance, "clearance", 0.0)) or 0.0
         return cls(
             title=experiment.title,
@@ -261,7 +261,7 @@ class LinkTracker:
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         plan = stage.plan
-        self._law = None if plan is None else _there(lambda: plan.law)
+        self._law = None if plan is None else _if_installed(lambda: plan.law)
         formation = None if plan is None or self._law is None else plan.formation
         self._reshaping = None
         if formation is not None and (formation.changes or formation.presence is not None):

@@ -36,7 +36,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         index: Of the error: `iae`, `itae` or `rmse`.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
     """
-    known = [row for row in rows if not row.reference and _at(row, index) is not None]
+    known = [row for row in rows if not row.reference and _point_of(row, index) is not None]
     best = {id(row) for row in front(known, index)}
     figure = Figure(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
@@ -68,7 +68,9 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
 def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages."""
     found, least = [], math.inf
-    for row in sorted((row for row in rows if _at(row, index) is not None), key=lambda row: _at(row, index) or ()):
+    for row in sorted(
+        (row for row in rows if _point_of(row, index) is not None), key=lambda row: _point_of(row, index) or ()
+    ):
         if row.ratio[index].mean < least:  # type: ignore[operator]
             found.append(row)
             least = row.ratio[index].mean or 0.0
@@ -79,14 +81,14 @@ def curves(rows: Sequence[CellRow]) -> dict[str, list[CellRow]]:
     """Cells that differ only in the first parameter in which their case varies, by the name of case and others."""
     found: dict[str, list[CellRow]] = {}
     for row in rows:
-        along = _along(rows, row.case)
+        along = _varied_parameter(rows, row.case)
         others = [path for path in row.parameters if path != along and _varies(rows, row.case, path)]
         fixed = [f"{short(path)}={words_of(row.parameters[path])}" for path in others]
         found.setdefault(", ".join([row.case, *fixed]), []).append(row)
     return found
 
 
-def _along(rows: Sequence[CellRow], case: str) -> str | None:
+def _varied_parameter(rows: Sequence[CellRow], case: str) -> str | None:
     paths = dict.fromkeys(path for row in rows if row.case == case for path in row.parameters)
     return next((path for path in paths if _varies(rows, case, path)), None)
 
@@ -95,7 +97,7 @@ def _varies(rows: Sequence[CellRow], case: str, path: str) -> bool:
     return len({str(row.parameters.get(path)) for row in rows if row.case == case}) > 1
 
 
-def _at(row: CellRow, index: str) -> tuple[float, float] | None:
+def _point_of(row: CellRow, index: str) -> tuple[float, float] | None:
     messages, error = row.ratio["messages"].mean, row.ratio[index].mean
     return None if messages is None or error is None else (messages, error)
 
@@ -130,7 +132,7 @@ def _draw_curve(axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[
         some = np.array(best) == full
         axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "label": None})
     axes.plot([], [], **marker)
-    along = _along(rows, rows[0].case) if joined else None
+    along = _varied_parameter(rows, rows[0].case) if joined else None
     if along is not None:
         _name_points(axes, rows, along, points[:, :2], style["color"])
 

@@ -174,7 +174,7 @@ def combination(
         (first, compared_with[first], others),
         *((name, changed[name], values) for name in names),
     ):
-        own = [axis for axis in given if paths[axis][2] in (None, name) and _has(experiment, paths[axis][0])]
+        own = [axis for axis in given if paths[axis][2] in (None, name) and _path_exists(experiment, paths[axis][0])]
         mine = {axis.path: paths[axis][1] for axis in own}
         yield Cell(name, mine, experiment, reference, digest(experiment))
 
@@ -257,7 +257,7 @@ def _parsed(axis: Axis, value: str, read: Document) -> _Parsed:
     return override.path, override.value, override.case
 
 
-def _has(experiment: Experiment, path: Path) -> bool:
+def _path_exists(experiment: Experiment, path: Path) -> bool:
     """Whether a path leads to something in an experiment: a parameter of a plug-in does if that plug-in has it."""
     for end in range(1, len(path)):
         if group_of(path[:end]) is not None:

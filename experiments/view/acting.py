@@ -102,7 +102,7 @@ class Acting:
                 ("Land all", "land", viser.Icon.PLANE_ARRIVAL),
             ):  # fmt: skip
                 button = gui.add_button(text, icon=icon)
-                button.on_click(partial(self._give, messages.Order(what), what, None))  # type: ignore[arg-type]
+                button.on_click(partial(self._order_all, messages.Order(what), what, None))  # type: ignore[arg-type]
             drag = gui.add_checkbox("Drag targets", initial_value=False, hint="Of the leaders.")
             drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
@@ -182,18 +182,20 @@ class Acting:
         x, y, _ = event.target.position
         self._held_until = time.monotonic() + SETTLED_S + HELD_S
         order = messages.Order("go", goal=(float(x), float(y)))
-        self._later(name, lambda: self._give(order, f"{name} to x = {x:.2f} m, y = {y:.2f} m", [name]))
+        self._order_in_thread(name, lambda: self._order_all(order, f"{name} to x = {x:.2f} m, y = {y:.2f} m", [name]))
 
     def _slide(self, name: str, event: viser.GuiEvent[Any]) -> None:
         value = float(event.target.value)
         order = messages.Order("set", name=name, value=value)
-        self._later(name, lambda: self._give(order, f"{name} = {value:g}"))
+        self._order_in_thread(name, lambda: self._order_all(order, f"{name} = {value:g}"))
 
-    def _later(self, name: str, order: Callable[[], object]) -> None:
+    def _order_in_thread(self, name: str, order: Callable[[], object]) -> None:
         with self._lock:
             self._due[name] = (time.monotonic() + SETTLED_S, order)
 
-    def _give(self, order: messages.Order, what: str, robots: Sequence[str] | None = None, _: object = None) -> None:
+    def _order_all(
+        self, order: messages.Order, what: str, robots: Sequence[str] | None = None, _: object = None
+    ) -> None:
         """Gives an order to robots, to all that are there if none is named, and says what they answered."""
         replies = orders.send_order(self._session, self._keys, robots or sorted(self._alive), order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}

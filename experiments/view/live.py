@@ -94,7 +94,7 @@ class Camera:
         self._size: Array = np.ones(3)  # [m]
         self._placed: dict[int, Array] = {}  # [m] by page
         server.initial_camera.fov = FOV
-        server.on_client_connect(self._greet)
+        server.on_client_connect(self._add_client)
 
     def show(self, size: Array) -> None:
         """Another arena, with all that stands in it (3,) [m]."""
@@ -103,7 +103,7 @@ class Camera:
         for client in self._server.get_clients().values():
             self._place(client)
 
-    def _greet(self, client: viser.ClientHandle) -> None:
+    def _add_client(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._follow(client))
         self._place(client)
 

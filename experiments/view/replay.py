@@ -58,10 +58,10 @@ class Film:
             yaw=_taken(tracks, at, "yaw", 1)[:, 0],
             goal=goal,
             condition=conditions,
-            silent_for=np.array([_since(track.sent, t) for track in tracks]),
+            silent_for=np.array([_time_since(track.sent, t) for track in tracks]),
             error=self._links.errors(t, position),
-            broken=self.stage.broken_links(conditions, [_last(track.statuses, t) for track in tracks]),
-            obstacles=self.stage.obstacles_at(t, _last(self.tracks.world, t)),
+            broken=self.stage.broken_links(conditions, [_last_status(track.statuses, t) for track in tracks]),
+            obstacles=self.stage.obstacles_at(t, _last_status(self.tracks.world, t)),
             trail=trail,
             attitude=attitude if np.isfinite(attitude).any() else None,
             shadow=shadow if np.isfinite(shadow).any() else None,
@@ -99,7 +99,7 @@ def _condition(track: Track, sample: int, t: float) -> Condition:
     """Condition of a robot by its sample and its last status."""
     if sample < 0:
         return Condition.WAITING
-    phase, status = int(track.phase[sample]), _last(track.statuses, t)
+    phase, status = int(track.phase[sample]), _last_status(track.statuses, t)
     if status is not None and status.reason.startswith(EMERGENCY):
         return Condition.STOPPED
     if t - track.time[sample] > LOST_S and phase != DONE:
@@ -108,13 +108,13 @@ def _condition(track: Track, sample: int, t: float) -> Condition:
     return CONDITION_OF.get(phase, Condition.HELD if held else Condition.ACTIVE)
 
 
-def _last(messages: Sequence[M], t: float) -> M | None:
+def _last_status(messages: Sequence[M], t: float) -> M | None:
     """The last message at or before `t` [s]."""
     count = bisect_right(messages, t, key=attrgetter("stamp"))
     return messages[count - 1] if count else None
 
 
-def _since(sent: Array, t: float) -> float:
+def _time_since(sent: Array, t: float) -> float:
     """Time since the last of some events at or before `t` [s]."""
     k = int(np.searchsorted(sent, t + ROUNDING_S, side="right"))
     return t - float(sent[k - 1]) if k else inf
@@ -128,7 +128,7 @@ def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) ->
 
 
 def _row(name: str, track: Track, condition: Condition, error: float | None, t: float, *, ticks: bool) -> Row:
-    status = _last(track.statuses, t)
+    status = _last_status(track.statuses, t)
     rate = float(np.searchsorted(track.sent, t, side="right") - np.searchsorted(track.sent, t - 1.0, side="right"))
     if status is None:
         return Row(name, condition, error, rate)

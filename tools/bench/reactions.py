@@ -176,11 +176,11 @@ class _Park:
     def __enter__(self) -> _Park:
         try:
             self._open()
-            self._until(lambda: self._all("ready"), "ready")
+            self._await(lambda: self._all("ready"), "ready")
             self._order(messages.Order("takeoff"))
-            self._until(lambda: self._all("airborne"), "airborne")
+            self._await(lambda: self._all("airborne"), "airborne")
             self._order(messages.Order("start", at=time.time() + 0.5))
-            self._until(lambda: self._all("running"), "running")
+            self._await(lambda: self._all("running"), "running")
             self._over.wait(SETTLE_S)
             self._arrivals.missing.clear()  # at the begin of the run no pose had been received
         except BaseException:
@@ -301,7 +301,7 @@ class _Park:
             if not reply.ok:
                 raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")
 
-    def _until(self, true: Callable[[], bool], what: str) -> None:
+    def _await(self, true: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + PATIENCE_S
         while not true():
             if time.monotonic() > deadline:

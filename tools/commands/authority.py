@@ -132,13 +132,13 @@ def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Registe
     """
     known = register(folder)
     moved = {
-        name: msgspec.structs.replace(identity, common_name=_next(name, identity.common_name))
+        name: msgspec.structs.replace(identity, common_name=_next_steps(name, identity.common_name))
         for name, identity in _named(known, names).items()
     }
     return _issued(_opened(folder), known, moved, days=days)
 
 
-def _next(name: str, common_name: str) -> str:
+def _next_steps(name: str, common_name: str) -> str:
     number = int(common_name.removeprefix(f"{name}.")) if common_name != name else 1
     return f"{name}.{number + 1}"
 

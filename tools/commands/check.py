@@ -228,7 +228,7 @@ def _counted(count: int, what: str) -> str:
 
 def _rows(numbers: Mapping[str, Figures]) -> list[str]:
     """A line for each figure; where the cases differ, each with its name."""
-    worded = {name: _worded(each) for name, each in numbers.items()}
+    worded = {name: _formatted(each) for name, each in numbers.items()}
     lines = []
     for label in next(iter(worded.values())):
         values = {name: words[label] for name, words in worded.items()}
@@ -238,7 +238,7 @@ def _rows(numbers: Mapping[str, Figures]) -> list[str]:
     return lines
 
 
-def _worded(of: Figures) -> dict[str, str]:
+def _formatted(of: Figures) -> dict[str, str]:
     from experiments.check.findings import join_names
 
     def number(value: float | None, form: str, unit: str = "") -> str:
@@ -253,8 +253,8 @@ def _worded(of: Figures) -> dict[str, str]:
         "rigidity rank, heights held": f"{number(of.rank, 'd')} of {number(of.rank_needed, 'd')}",
         "rigidity rank in space": f"{number(of.rank_space, 'd')} of {number(of.rank_space_needed, 'd')}",
         "smallest rigidity eigenvalue": number(of.smallest_eigenvalue, ".2g", " m²"),
-        "single links it can lose": _spared(of.spare_links, len(of.vital_links)),
-        "single robots it can lose": _spared(of.spare_robots, len(of.vital_robots)),
+        "single links it can lose": _redundancy_text(of.spare_links, len(of.vital_links)),
+        "single robots it can lose": _redundancy_text(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
         "loop gain h·μ·λ, hunts at 2": number(of.loop_gain, ".3g"),
         "slowest mode": number(of.slowest_mode_s, ".1f", " s")
@@ -268,7 +268,7 @@ def _worded(of: Figures) -> dict[str, str]:
     }
 
 
-def _spared(spare: int | None, vital: int) -> str:
+def _redundancy_text(spare: int | None, vital: int) -> str:
     return "-" if spare is None else f"{spare} of {spare + vital}"
 
 

@@ -150,7 +150,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
                     print(f"{name}: {row['zenpark']}", flush=True)
                 if folder is not None and host.robots:
                     robots = certificates.of_host(name, experiment.hosts)
-                    right = not isinstance(there, HostError) and same and _trusted(there, folder, robots)
+                    right = not isinstance(there, HostError) and same and _has_certificates(there, folder, robots)
                     row["certificates"] = "has its certificates" if right else send(name, host, folder, robots)
                     if not as_json:
                         print(f"{name}: {row['certificates']}")
@@ -178,7 +178,7 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
 
 
-def _trusted(there: Station, folder: Path, robots: Sequence[str]) -> bool:
+def _has_certificates(there: Station, folder: Path, robots: Sequence[str]) -> bool:
     """Whether a host holds the certificates of its robots, and no others."""
     from experiments.real_time.hosts import certificates
 
@@ -298,12 +298,12 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     unreached = [each for each in routers if not each.well]
     row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
     row.trouble += [
-        f"{there.name}: {each.what} cannot be reached from there; {_mended(there, each, experiment)}"
+        f"{there.name}: {each.what} cannot be reached from there; {_router_remedy(there, each, experiment)}"
         for each in unreached
     ]
 
 
-def _mended(there: Station, router: Found, experiment: Experiment) -> str:
+def _router_remedy(there: Station, router: Found, experiment: Experiment) -> str:
     """Remedy for a router that a host does not reach."""
     from agents.network.endpoints import Endpoint
 

@@ -64,8 +64,8 @@ def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
         if kind not in _KINDS or not isinstance(value, dict):
             continue
         # a member of a mesh tells of its neighbours too, but not all of it; its own it calls those of a client
-        of_peers = _words(value.get("peers")) if mode == "router" else []
-        for owner in {*_words(value.get("clients")), *of_peers}:
+        of_peers = _strings(value.get("peers")) if mode == "router" else []
+        for owner in {*_strings(value.get("clients")), *of_peers}:
             held.setdefault(owner, {}).setdefault(_KINDS[kind], []).append(key)
     names = {
         place.split("/")[1]: _name(value)
@@ -81,7 +81,7 @@ def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:
     return sorted(found, key=lambda member: (member.name, member.id))
 
 
-def _words(value: object) -> list[str]:
+def _strings(value: object) -> list[str]:
     """The words of a list, if it is one: what stands in the admin space is another program's."""
     return [word for word in value if isinstance(word, str)] if isinstance(value, list) else []
 

@@ -133,7 +133,7 @@ def _alive(opened: zenoh.Session, keys: Keys) -> list[str]:
     return sorted(name for name in found if name is not None)
 
 
-def _give(what: messages.OrderKind, robots: Sequence[str], by: Operator) -> int:
+def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator) -> int:
     """Give an order to the robots themselves, to all if none is named, and tell the recorder; the exit code."""
     from agents.network import messages
     from experiments.real_time.conductor import orders
@@ -167,7 +167,7 @@ def _change(order: messages.RunOrder, by: Operator) -> int:
 
 def _order_command(what: messages.OrderKind) -> Callable[..., int]:
     def order(names: NamesOrAll = None, *, by: Operator) -> int:
-        return _give(what, names or [], by)
+        return _order_robots(what, names or [], by)
 
     return with_options(order)
 
@@ -191,7 +191,7 @@ for _order, _help in ORDERS.items():
 @with_options
 def stop(names: Names, *, by: Operator) -> int:
     """Cut the motors of robots: a drone falls. `./zenpark estop` cuts those of all."""
-    return _give("stop", names, by)
+    return _order_robots("stop", names, by)
 
 
 for _what, _help in CHANGES.items():

@@ -396,7 +396,7 @@ def _show_running(*, as_json: bool) -> None:
         print("no run is up on this machine")
 
 
-def _past(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
+def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
     from experiments.recording.run_folder import RUNS, past_runs
 
     folders = [Path(each) for each in below] if below else [RUNS]
@@ -407,7 +407,7 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     from experiments.recording.run_folder import day_of
     from tools.progress import columns
 
-    found = _past(words, below)
+    found = _past_runs(words, below)
     if as_json:
         print_json(found)
         return
@@ -458,7 +458,7 @@ def clean(
     now = time.time()
     chosen = [
         run
-        for run in _past(words or [], below)
+        for run in _past_runs(words or [], below)
         if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
         if older is None or age_days(run, now) > older
     ]

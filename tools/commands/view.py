@@ -73,7 +73,7 @@ def view(
     with on_termination(ended.set):
         if seconds is not None:
             threading.Timer(seconds, ended.set).start()
-        up = None if run is None else _up(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
+        up = None if run is None else _running_run(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
         if run is not None and up is None:
             return _replay(Path(run), ended, port=port, dark=dark, open_page=open_page)
         watched = _watched(connect, realm, lab, identity) if up is None else _of_run(up, identity)
@@ -129,7 +129,7 @@ class _Top:
         began, over = time.monotonic(), False
         limit_s = inf if seconds is None else seconds
         if as_json or not console.is_terminal:
-            while not (over := self._heard()) and time.monotonic() - began < min(FIRST_S, limit_s):
+            while not (over := self._all_reported()) and time.monotonic() - began < min(FIRST_S, limit_s):
                 if ended.wait(POLL_S):
                     break
             if as_json:
@@ -146,7 +146,7 @@ class _Top:
         console.print(Group(*self._lines(console.width, console.height - 1)))  # what stood there last stays
         return 0
 
-    def _heard(self) -> bool:
+    def _all_reported(self) -> bool:
         """Whether each robot has reported twice, or is gone."""
         self._observer.update()
         reports = self._observer.robots
@@ -286,7 +286,7 @@ def paced(pace: float) -> Iterator[Watch]:
         live.close_server(server)
 
 
-def _up(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
+def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
     """The run of a folder, if it is up, or is within `wait_s` [s]."""
     import time
 
@@ -302,7 +302,7 @@ def _up(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
 def _of_run(run: Run, identity: str | None) -> Watched:
     from experiments.view.acting import Watched
 
-    return Watched(run.endpoints, run.realm, identity or _usual(run.endpoints), run)
+    return Watched(run.endpoints, run.realm, identity or _default_identity(run.endpoints), run)
 
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
@@ -328,7 +328,7 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
     from experiments.view.acting import Watched
 
     if given := routers(connect, lab):
-        return Watched(given, realm, identity or _usual(given))
+        return Watched(given, realm, identity or _default_identity(given))
     up = [run for run in run_registry.runs() if run.what == "run" and run.alive]
     if not up:
         raise ViewError(
@@ -340,7 +340,7 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
     return _of_run(up[-1], identity)
 
 
-def _usual(endpoints: Sequence[str]) -> str:
+def _default_identity(endpoints: Sequence[str]) -> str:
     """Identity of a page: in a lab it only looks, unless --as names an operator."""
     from agents.network.lab import lab_of
 

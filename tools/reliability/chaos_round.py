@@ -170,7 +170,7 @@ class ChaosRound:
                 with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
                     self._observer = Observer(session, experiment)
                     self._follow(watched)
-                    nearest, missed = self._observer.invariants.nearest, self._missed()
+                    nearest, missed = self._observer.invariants.nearest, self._missed_share()
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
             if self._now is not None:
@@ -207,8 +207,8 @@ class ChaosRound:
             t = now - self._started
             self._judge(now)
             if self._now is not None:
-                self._heal(self._now, t, now)
-            elif self._nothing_left(t, duration) or not self._next(t, now):
+                self._lift_fault(self._now, t, now)
+            elif self._nothing_left(t, duration) or not self._inject_next(t, now):
                 return
             if t > duration + END_S:
                 self._wrong.append(f"it does not end {END_S:g} s after its time")
@@ -221,7 +221,7 @@ class ChaosRound:
         nature = self._left[0].properties
         return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
 
-    def _over(self) -> bool:
+    def _run_is_over(self) -> bool:
         """Whether the run's time is over: then the conductor lands all robots, and lets none in again."""
         return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
 
@@ -235,7 +235,7 @@ class ChaosRound:
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
 
-    def _next(self, t: float, now: float) -> bool:
+    def _inject_next(self, t: float, now: float) -> bool:
         """Inject the next fault when its time has come; False if the round is over."""
         if self._well is None:
             live = self._observer.running()
@@ -275,7 +275,7 @@ class ChaosRound:
             self._watch_landing(self._now)
         return True
 
-    def _heal(self, active: _ActiveFault, t: float, now: float) -> None:
+    def _lift_fault(self, active: _ActiveFault, t: float, now: float) -> None:
         """Lift the fault when its time is over, and wait until all is well."""
         fault = active.fault
         if fault.kind in ("freeze", "partition") and active.lifted is None:
@@ -302,8 +302,8 @@ class ChaosRound:
         well = now if well is None else well
         if active.fault.kind == "read-error":
             self._dead[active.victim] = now
-        left = set() if self._conductor_dead or self._over() else active.there - self._dead.keys()
-        down = [name for name in sorted(left) if self._down(name)]
+        left = set() if self._conductor_dead or self._run_is_over() else active.there - self._dead.keys()
+        down = [name for name in sorted(left) if self._is_down(name)]
         reasons = [f"{name}: {self._observer.status[name].reason}" for name in down]
         outcome = FaultResult(
             self._number,
@@ -342,7 +342,7 @@ class ChaosRound:
         live = self._observer.running() - self._dead.keys()
         check = getattr(self, f"_after_{active.fault.kind.replace('-', '_')}", self._after_any)
         away = active.there - live - self._dead.keys() - {active.victim}
-        away = {name for name in away if self._observer.invariants.in_the_air(name) or not self._down(name)}
+        away = {name for name in away if self._observer.invariants.in_the_air(name) or not self._is_down(name)}
         return (
             check(active, live)
             or (f"{', '.join(sorted(away))}: not back" if away else "")
@@ -393,7 +393,9 @@ class ChaosRound:
             self._off.add(victim)
             active.restarted = time.monotonic()
             self._injector.restart(victim, self._observer.session, self._observer.keys)
-        if (why := self._injector.answer.reason or self._injector.answer.refused.get(victim)) and not self._over():
+        if (
+            why := self._injector.answer.reason or self._injector.answer.refused.get(victim)
+        ) and not self._run_is_over():
             active.add_violation(f"{victim} is not let in again: {why}")
             return ""
         if victim not in self._observer.alive:
@@ -412,7 +414,7 @@ class ChaosRound:
         victim, second = active.victim, self._injector.second
         assert second is not None
         for order in self._observer.orders:
-            if order.robot == victim and not self._over():
+            if order.robot == victim and not self._run_is_over():
                 active.add_violation(f"the body of {victim} was ordered to {order.action}")
         if second.alive:
             return f"the second process of {victim} is not refused yet"
@@ -424,7 +426,7 @@ class ChaosRound:
         limit = self._setting.experiment.safety.link_silence_s + NOTICED_S
         free = []
         for name in live - self._off:
-            since = [each.stamp - active.utc for each in self._held(name, "router", active)]
+            since = [each.stamp - active.utc for each in self._incidents_since(name, "router", active)]
             if not since:
                 free.append(name)
             elif min(since) > limit:
@@ -433,18 +435,18 @@ class ChaosRound:
 
     def _after_mocap_clock(self, active: _ActiveFault, live: Set[str]) -> str:
         for name in self._observer.status:
-            for incident in self._held(name, "position", active):
+            for incident in self._incidents_since(name, "position", active):
                 active.add_violation(f"{name}: {incident.text}")
         return ""
 
     _after_clock = _after_mocap_clock
 
-    def _down(self, name: str) -> bool:
+    def _is_down(self, name: str) -> bool:
         """Whether a robot reports that it comes down, or is down."""
         status = self._observer.status.get(name)
         return status is not None and status.phase in ("landing", "done")
 
-    def _held(self, name: str, what: str, active: _ActiveFault) -> list[messages.Incident]:
+    def _incidents_since(self, name: str, what: str, active: _ActiveFault) -> list[messages.Incident]:
         """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
         last = active.incidents.get(name, 0)
         new = [each for each in self._observer.status[name].incidents if each.seq > last and what in each.text]
@@ -454,7 +456,7 @@ class ChaosRound:
         """Reason why a living victim is neither back nor down; empty if it is."""
         if self._observer.status_at.get(victim, 0.0) < lifted:
             return f"no status of {victim} yet"
-        if self._down(victim):
+        if self._is_down(victim):
             return f"{victim} has not come down yet" if self._observer.invariants.in_the_air(victim) else ""
         return "" if victim in live else f"{victim} is not back"
 
@@ -512,7 +514,7 @@ class ChaosRound:
             self._wrong.append(f"the run ended with exit code {code}: {' '.join(watched.output)}")
         return gone_s
 
-    def _missed(self) -> float:
+    def _missed_share(self) -> float:
         """Share of missed ticks of robots without a fault."""
         stopped = {each.victim for each in self.outcomes} | self._dead.keys()
         statuses = [status for name, status in self._observer.status.items() if name not in stopped and status.ticks]

@@ -64,7 +64,7 @@ class Injector:
         if kind == "read-error":
             self._switch(f"read-{victim}").write(1.0)
         if kind == "double":
-            self.second = self._again(victim)
+            self.second = self._start_duplicate(victim)
         if how.clock is not None:
             name, direction = how.clock
             companions = [robot for robot, group in self._groups.items() if group == self._groups.get(victim)]
@@ -105,10 +105,10 @@ class Injector:
         targets = [key(victim) for key in read]
         for key in targets:
             for _ in range(GARBAGE):
-                session.put(key, self._nonsense(victim), encoding=messages.JSON)
+                session.put(key, self._malformed_payload(victim), encoding=messages.JSON)
         return GARBAGE * len(targets)
 
-    def _nonsense(self, victim: str) -> bytes:
+    def _malformed_payload(self, victim: str) -> bytes:
         kind = int(self._random.integers(5))
         if kind == 0:
             return self._random.bytes(int(self._random.integers(1, 400)))
@@ -124,7 +124,7 @@ class Injector:
     def _switch(self, name: str) -> Switch:
         return self._switches.setdefault(name, Switch(self._folder / name))
 
-    def _again(self, victim: str) -> Process:
+    def _start_duplicate(self, victim: str) -> Process:
         """A second process of a name: the same command again."""
         pid = self._running(victim)[0]
         words = (PROC / str(pid) / "cmdline").read_bytes().decode().rstrip("\0").split("\0")

@@ -66,12 +66,12 @@ class Invariants:
 
     def violations(self) -> list[str]:
         """Violations that have begun since the last call."""
-        wrong = {*self._outside(), *self._overlaps()}
+        wrong = {*self._robots_outside(), *self._overlaps()}
         new = sorted(wrong - self._wrong)
         self._wrong = wrong
         return new
 
-    def _outside(self) -> list[str]:
+    def _robots_outside(self) -> list[str]:
         p = self.position
         out = ((p < self._low) | (p > self._high)).any(axis=1)
         return [f"{self.names[row]} is outside the arena" for row in np.flatnonzero(out).tolist()]

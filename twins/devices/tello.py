@@ -286,12 +286,12 @@ class TelloDevice:
         drone, yaw = self._drones[row], float(self._model.yaw[row])
         try:
             if word in ("cw", "ccw"):
-                (angle,) = _whole(arguments, 1)
+                (angle,) = _integers(arguments, 1)
                 _require("out of range", met=1 <= angle <= 360)
                 drone.mode = Mode.TURN
                 drone.heading = yaw + math.radians(angle) * (-1.0 if word == "cw" else 1.0)
             else:
-                ways, drone.pace = self._ways(drone, word, arguments)
+                ways, drone.pace = self._path_of_move(drone, word, arguments)
                 cos, sin = math.cos(yaw), math.sin(yaw)
                 turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
                 drone.goal, *drone.further = [self._model.position[row] + turn @ way for way in ways]
@@ -302,7 +302,7 @@ class TelloDevice:
         return ""
 
     @staticmethod
-    def _ways(drone: _Drone, word: str, arguments: list[str]) -> tuple[list[Array], float]:
+    def _path_of_move(drone: _Drone, word: str, arguments: list[str]) -> tuple[list[Array], float]:
         """Points (3,) of a move one after the other [m], forward, left and up of the drone, and its pace [m/s]."""
         if word == "flip":  # attitude is not simulated: a short way in its direction
             direction = FLIPS.get(" ".join(arguments))
@@ -312,12 +312,12 @@ class TelloDevice:
         if arguments and PAD.fullmatch(arguments[-1]):
             raise _Refusal("error No valid marker")  # there are no mission pads
         if word in MOVES:
-            (distance,) = _whole(arguments, 1)
+            (distance,) = _integers(arguments, 1)
             _require("out of range", met=20 <= distance <= 500)
             return [0.01 * distance * np.array(MOVES[word])], drone.pace
         count, fastest = {"go": (1, 100), "curve": (2, 60)}.get(word, (0, 0))
         _require("error", met=count > 0)
-        *way, speed = _whole(arguments, 3 * count + 1)
+        *way, speed = _integers(arguments, 3 * count + 1)
         _require("out of range", met=max(map(abs, way)) <= 500 and 10 <= speed <= fastest)
         points = 0.01 * np.array(way).reshape(count, 3)
         _require("error", met=bool((np.abs(points) >= 0.2).any(axis=1).all()))
@@ -415,7 +415,7 @@ def _require(answer: str, *, met: bool) -> None:
         raise _Refusal(answer)
 
 
-def _whole(arguments: list[str], count: int) -> list[int]:
+def _integers(arguments: list[str], count: int) -> list[int]:
     try:
         values = [int(argument) for argument in arguments]
     except ValueError:

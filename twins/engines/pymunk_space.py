@@ -76,9 +76,9 @@ class Place:
             wheels = self.wheels[row] = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
             self.space.add(wheels)
             if not mirrored:
-                self._grip(wheels, body, force, 0.5 * DRIVES[kind.name].base * force)
+                self._add_floor_friction(wheels, body, force, 0.5 * DRIVES[kind.name].base * force)
         elif not mirrored:
-            self.feet[row] = self._grip(self._floor, body, force, 0.0), force
+            self.feet[row] = self._add_floor_friction(self._floor, body, force, 0.0), force
 
     def furnish(self, scene: Scene) -> None:
         """Add obstacles and walls."""
@@ -99,7 +99,7 @@ class Place:
             pushed = math.isfinite(mass)
             if pushed:
                 force = float(scene.friction[k]) * mass * GRAVITY
-                self._grip(self._floor, body, force, force * _lever(scene, k))
+                self._add_floor_friction(self._floor, body, force, force * _friction_lever(scene, k))
             parts = ((LOOSE, LOOSE_BARE) if pushed else (FIXED, FIXED_BARE))[: 2 if loose else 1]
             for part in parts:
                 skin = self.surfaces.skin if part in (FIXED, LOOSE) else 0.0
@@ -129,7 +129,7 @@ class Place:
             self.numbers[shape] = number
             self.space.add(shape)
 
-    def _grip(self, on: pymunk.Body, body: pymunk.Body, force: float, torque: float) -> pymunk.PivotJoint:
+    def _add_floor_friction(self, on: pymunk.Body, body: pymunk.Body, force: float, torque: float) -> pymunk.PivotJoint:
         """Add friction with the floor: pulls a body to the velocity of `on`, within force [N] and torque [N m]."""
         hold = pymunk.PivotJoint(on, body, (0.0, 0.0), (0.0, 0.0))
         joints: list[pymunk.Constraint] = [hold]
@@ -159,7 +159,7 @@ def _moment(mass: float, scene: Scene, k: int) -> float:
     return pymunk.moment_for_poly(mass, outline.tolist())
 
 
-def _lever(scene: Scene, k: int) -> float:
+def _friction_lever(scene: Scene, k: int) -> float:
     """Mean lever of the friction under an obstacle that turns [m]."""
     outline = scene.outline[k]
     if outline is None:

@@ -211,8 +211,8 @@ def _tools(park: Park, notes: list[str]) -> None:
 
 
 def _rates(park: Park, notes: list[str]) -> Rates:
-    period = _most("task.controller.period", [task.period for _, task in park.tasks], 0.1, notes)
-    asked = _most("local_pose.T", [robot.pose_s for robot in park.robots], 0.02, notes)
+    period = _most_common("task.controller.period", [task.period for _, task in park.tasks], 0.1, notes)
+    asked = _most_common("local_pose.T", [robot.pose_s for robot in park.robots], 0.02, notes)
     return Rates(_divisor("poses", 1.0 / asked, notes), _divisor("decisions", 1.0 / period, notes))
 
 
@@ -259,7 +259,7 @@ def _most_thresholds(what: str, given: Sequence[Threshold], notes: list[str]) ->
     return counted.most_common(1)[0][0]
 
 
-def _most(what: str, given: Sequence[float], default: float, notes: list[str]) -> float:
+def _most_common(what: str, given: Sequence[float], default: float, notes: list[str]) -> float:
     """The value that most robots have."""
     if not given:
         return default

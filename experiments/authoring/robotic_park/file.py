@@ -259,18 +259,18 @@ def load(file: str, text: str) -> Entry:
     if not isinstance(value, dict):
         hint = "an experiment of Robotic Park has sections such as Operation and Robots"
         raise refusal(file, "is no table of sections", hint)
-    return Entry(file, "", _given(value, {}))
+    return Entry(file, "", _without_empty(value, {}))
 
 
-def _given(value: Any, done: dict[int, Any]) -> Any:  # noqa: ANN401 - whatever YAML holds
+def _without_empty(value: Any, done: dict[int, Any]) -> Any:  # noqa: ANN401 - whatever YAML holds
     """A value without keys that hold nothing; keys are text. A table that stands in several places stays one."""
     if isinstance(value, list):
-        return [_given(each, done) for each in value]
+        return [_without_empty(each, done) for each in value]
     if not isinstance(value, dict):
         return value
     if id(value) not in done:
         made = done[id(value)] = {}
-        made.update({str(key): _given(each, done) for key, each in value.items() if each is not None})
+        made.update({str(key): _without_empty(each, done) for key, each in value.items() if each is not None})
     return done[id(value)]
 
 
@@ -286,7 +286,7 @@ def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
     """
     root = load(file, text)
     older = [] if root.has("Robots") else [each for each in root.tables() if any(map(each.has, OLDER))]
-    park = _older(file, older) if older else _sections(root)
+    park = _read_older_format(file, older) if older else _sections(root)
     robots = tuple(replace(robot, pose=poses.get(robot.name, robot.pose)) for robot in park.robots)
     return replace(park, robots=robots)
 
@@ -301,9 +301,9 @@ def _sections(root: Entry) -> Park:
     entries = root.get("Robots").tables()
     if not entries:
         raise root.get("Robots").refused("has none", "list them as Robot01, Robot02, ...")
-    robots = _each(entries, lambda entry: _section_robot(entry, central=central))
+    robots = _robots_from(entries, lambda entry: _section_robot(entry, central=central))
     _check_names(entries, robots)
-    others, remarks = _others(root)
+    others, remarks = _other_sections(root)
     if central and architecture != CENTRAL:
         remarks.append(f"Architecture: {architecture}; their launcher starts a centre for '{CENTRAL}' alone, and for"
                        " this spelling no robot moves there; taken as centralized")  # fmt: skip
@@ -319,7 +319,7 @@ def _sections(root: Entry) -> Park:
     )
 
 
-def _others(root: Entry) -> tuple[list[str], list[str]]:
+def _other_sections(root: Entry) -> tuple[list[str], list[str]]:
     """Sections about their own tools that are switched on, and remarks on those that change the experiment."""
     sections = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
     found = [name for name in sections if root.get(name).typed(_Switch).enable]
@@ -331,7 +331,7 @@ def _others(root: Entry) -> tuple[list[str], list[str]]:
     return [*found, *(f"Other.{name}" for name in on if name != "Reconfiguration")], remarks
 
 
-def _each(entries: Sequence[Entry], made: Callable[[Entry], Robot]) -> list[Robot]:
+def _robots_from(entries: Sequence[Entry], made: Callable[[Entry], Robot]) -> list[Robot]:
     """A robot from each entry; the problems of all of them at once."""
     robots, problems = [], []
     for entry in entries:
@@ -480,7 +480,7 @@ def _check_names(entries: Sequence[Entry], robots: Sequence[Robot]) -> None:
                 raise entry.refused(f"no robot is called '{relation.name}'", hint)
 
 
-def _older(file: str, entries: Sequence[Entry]) -> Park:
+def _read_older_format(file: str, entries: Sequence[Entry]) -> Park:
     """The flat files and the indices of 2023."""
     listed = [(entry, _settings(entry, Path(file).parent)) for entry in entries]
     keys = [entry.name for entry in entries]
@@ -494,7 +494,7 @@ def _older(file: str, entries: Sequence[Entry]) -> Park:
     ]
     settings = {entry.key: own for entry, own in listed if entry.name not in marks}
     entries = [entry for entry in entries if entry.name not in marks]
-    robots = _each(entries, lambda entry: _older_robot(entry, settings[entry.key]))
+    robots = _robots_from(entries, lambda entry: _older_robot(entry, settings[entry.key]))
     task = robots[0].task if len(robots) == 1 else None
     if task and any(relation.name not in PLACES for relation in task.relations):
         hint = "import the file that lists the robots of the experiment: an index names this one as config_path"

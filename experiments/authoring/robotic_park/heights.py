@@ -96,7 +96,7 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     start = _starts(park, notes)
     start[~flies, 2] = 0.0
     start[flies & (start[:, 2] < LOWEST), 2] = ALOFT
-    wanted, anchors = _wanted(park, start, flies)
+    wanted, anchors = _wanted_distances(park, start, flies)
     plain = Heights(start, start, np.round(start[:, 2], 3), len(wanted) == 0, (0.0, 0.0, 0.0))
     if not len(wanted):
         return plain
@@ -161,7 +161,7 @@ def _starts(park: Park, notes: list[str]) -> Array:
     return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 
 
-def _wanted(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
+def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
     """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     pairs, distance, relative = [], [], []

@@ -53,7 +53,9 @@ def formation_lines(park: Park, found: Heights, notes: list[str]) -> FormationLi
     ]
     mean = float(np.mean(distances)) if distances else 1.0
     gains = {robot.name: _gain(park, robot, task, mean) for robot, task in jobs}
-    usual = {kind: _usual([gains[robot.name] for robot, task in jobs if task.kind == kind]) for kind in TASKS}
+    usual = {
+        kind: _most_common_gain([gains[robot.name] for robot, task in jobs if task.kind == kind]) for kind in TASKS
+    }
     clamps = Counter(task.clamp for _, task in jobs)
     if len(clamps) > 1:
         notes.append("task.controller.upperLimit: several; all get the commonest")
@@ -113,7 +115,7 @@ def shorten_names(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
-def _usual(gains: Sequence[float]) -> float | None:
+def _most_common_gain(gains: Sequence[float]) -> float | None:
     return Counter(gains).most_common(1)[0][0] if gains else None
 
 

@@ -233,7 +233,7 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
     for other in others:
         if (other.pid, other.born) == (me.pid, me.born) or not other.alive:
             continue
-        taken = sorted(name for name, body in me.robots.items() if body and _has(other, name, body))
+        taken = sorted(name for name, body in me.robots.items() if body and _drives_same_device(other, name, body))
         if taken:
             mesh_file = f"--connect @{other.folder}/{mesh.ENDPOINTS}"
             stop = lab_options(other.endpoints[0]) if len(other.endpoints) == 1 else mesh_file
@@ -245,7 +245,7 @@ def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], f
     return notes
 
 
-def _has(other: run_registry.Run, name: str, body: str) -> bool:
+def _drives_same_device(other: run_registry.Run, name: str, body: str) -> bool:
     """Whether another run drives the same device: an address that names none belongs to the robot of that name."""
     if plugins.body_name(body) == body:
         return other.robots.get(name) == body

@@ -95,7 +95,7 @@ class Conductor:
                 self._join(stack)
                 self._adopt()
                 self._processes.start()
-                if self._until("ready", self._patience(), recorder=True):
+                if self._await_phase("ready", self._patience(), recorder=True):
                     ready = time.monotonic() - began
                     self._view.report_clocks(clocks)
                     self._drift = stack.enter_context(Drift(self._context.hosts.in_use()))
@@ -149,7 +149,7 @@ class Conductor:
 
     # ------------------------------------------------------------------ phases
 
-    def _until(
+    def _await_phase(
         self, phase: str, limit_s: float, *, recorder: bool = False, meanwhile: Callable[[], None] = lambda: None
     ) -> bool:
         """Wait until every robot that is left has reached a phase; False if the user interrupted."""
@@ -163,14 +163,14 @@ class Conductor:
             late = [name for name, view in self._robots.items() if not (view.reached(phase) or view.gone)]
             lost = [name for name, view in self._robots.items() if view.left_because == "lost"]
             if lost and self._experiment.start.missing == "abort":
-                raise RunFailed(self._excuse(lost, "could not start"))
+                raise RunFailed(self._start_failure(lost, "could not start"))
             if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
                 if late and self._experiment.start.missing == "abort":
-                    raise RunFailed(self._excuse(late, f"not {phase} after {limit_s:g} s"))
+                    raise RunFailed(self._start_failure(late, f"not {phase} after {limit_s:g} s"))
                 for name in late:
-                    self._view.report("late", name, f"not {phase} after {limit_s:g} s: {self._why(name)}")
+                    self._view.report("late", name, f"not {phase} after {limit_s:g} s: {self._reason(name)}")
                 return True
             time.sleep(POLL_S)
 
@@ -183,7 +183,7 @@ class Conductor:
                 refused.remove(name)
                 refused.extend(self._order(messages.Order("takeoff"), [name]))
 
-        return self._until("airborne", CLIMB_S, meanwhile=again)
+        return self._await_phase("airborne", CLIMB_S, meanwhile=again)
 
     def _patience(self) -> float:
         """Limit for all robots to be ready [s]: robots that go on without a neighbour report it after the deadline."""
@@ -267,7 +267,7 @@ class Conductor:
             self._update()
             time.sleep(POLL_S)
         for name in late:
-            self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._why(name)}")
+            self._leave_behind(name, f"did not end its landing within {LAND_S:g} s: {self._reason(name)}")
         self._progress.phase = "done"
         self._show(self._progress)
 
@@ -342,17 +342,17 @@ class Conductor:
 
     # ------------------------------------------------------------------ words
 
-    def _why(self, name: str) -> str:
+    def _reason(self, name: str) -> str:
         status = self._robots[name].status
         if status is None:
             return "no status of its process yet"
         return status.reason or f"it is {status.phase}"
 
-    def _excuse(self, names: Sequence[str], what: str) -> str:
+    def _start_failure(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
             last = self._processes.last_line(name)
-            lines.append(f"  {name}: {self._why(name)}" + (f"\n    {last}" if last else ""))
+            lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))
         ended = all(self._robots[name].gone for name in names)
         remedy = "mend that" if ended else "give them more time with start.deadline_s"
         lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")

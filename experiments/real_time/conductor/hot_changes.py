@@ -201,7 +201,7 @@ class HotChanges:
             case "replace":
                 return self._replace(names, order)
             case _:
-                return self._let_in(names, order)
+                return self._admit(names, order)
 
     def _remove(self, names: Sequence[str]) -> Steps:
         yield from self._leave(names)
@@ -244,7 +244,7 @@ class HotChanges:
         status = self._robots[name].status
         return status is None or self._view.clock.utc() - status.stamp > FROZEN_S
 
-    def _let_in(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
+    def _admit(self, names: Sequence[str], order: messages.RunOrder) -> Steps:
         """Restart, or add: robots that were started by hand only get orders to join, all others are started."""
         robots, processes = self._robots, self._processes
         asked = time.monotonic()
@@ -294,12 +294,12 @@ class HotChanges:
             robots[name].left_because = ""
         try:
             yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
-            yield from self._room({name: self._here(name) for name in names}, ROOM_S)
-            yield from self._insist(names, messages.Order("takeoff"))
+            yield from self._room({name: self._last_place(name) for name in names}, ROOM_S)
+            yield from self._repeat_order(names, messages.Order("takeoff"))
             yield from self._reach(names, "airborne", CLIMB_S)
             for name in names:
                 start = messages.Order("start", at=self._start, origin=robots[name].origin)
-                yield from self._insist([name], start)
+                yield from self._repeat_order([name], start)
             yield from self._reach(names, "running", FROZEN_S)
         except Refused:
             self._leaving |= {*names}
@@ -309,7 +309,7 @@ class HotChanges:
                 robots[name].left_because = "removed"
             raise
 
-    def _insist(self, names: Sequence[str], order: messages.Order) -> Generator[None]:
+    def _repeat_order(self, names: Sequence[str], order: messages.Order) -> Generator[None]:
         """Repeat an order until it is accepted: a robot may not be ready yet, and a busy machine lose an answer."""
         began, left = time.monotonic(), list(names)
         while refused := {name: reply for name, reply in self._view.order(left, order).items() if not reply.ok}:
@@ -342,7 +342,7 @@ class HotChanges:
 
     # ------------------------------------------------------------------ room
 
-    def _here(self, name: str) -> tuple[float, ...]:
+    def _last_place(self, name: str) -> tuple[float, ...]:
         place = self._robots[name].place
         return tuple(self._processes.place(name)) if place is None else place[:2]
 

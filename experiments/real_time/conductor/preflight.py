@@ -259,10 +259,10 @@ class Inspector:
         try:
             self._wait_ready([name])
             if not self._robots[name].reached("ready"):
-                tried.failure = f"not ready: {self._why(name)}"
+                tried.failure = f"not ready: {self._reason(name)}"
                 return tried
             tried.states = self._states[name] = []
-            tried.failure = self._set_out(name, robot)
+            tried.failure = self._order_motion(name, robot)
             if not tried.failure:
                 if stop:
                     self._wait(TRY_S, lambda: _moved(tried.states, robot))
@@ -273,7 +273,7 @@ class Inspector:
             self._processes.end_robots()  # lands it, whatever has happened
         return tried
 
-    def _set_out(self, name: str, robot: Robot) -> str:
+    def _order_motion(self, name: str, robot: Robot) -> str:
         """Order a robot to move; the reason of a refusal."""
         reply = self._order(name, messages.Order("takeoff"))
         if reply.ok and robot.hover is None:
@@ -304,18 +304,18 @@ class Inspector:
         else:
             self._wait(CLIMB_S, lambda: over() or seen.reached("airborne"))
             if not seen.reached("airborne"):
-                tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._why(name)}"
+                tried.failure = f"not at {robot.hover:g} m after {CLIMB_S:g} s: {self._reason(name)}"
             elif not self._wait(hold_s, over):
                 tried.states = list(tried.states)  # the landing is no part of it
                 self._order(name, messages.Order("land"))
                 if not self._wait(LAND_S, lambda: seen.reached("done") or name in self._ended):
-                    tried.failure = f"not down after {LAND_S:g} s: {self._why(name)}"
+                    tried.failure = f"not down after {LAND_S:g} s: {self._reason(name)}"
                 return
         status = seen.status
         if name in self._ended or (status is not None and status.hazard):
-            tried.failure = tried.failure or self._why(name)
+            tried.failure = tried.failure or self._reason(name)
         elif robot.hover is not None and not tried.failure:
-            tried.failure = f"came down by itself: {self._why(name)}"
+            tried.failure = f"came down by itself: {self._reason(name)}"
 
     # ------------------------------------------------------------------ parts of the above
 
@@ -374,7 +374,7 @@ class Inspector:
     def _order(self, name: str, order: messages.Order) -> messages.Reply:
         return self._view.order([name], order)[name]
 
-    def _why(self, name: str) -> str:
+    def _reason(self, name: str) -> str:
         status = self._robots[name].status
         if name in self._ended or status is None:
             return self._ended.get(name, "its process says nothing")

@@ -265,7 +265,7 @@ def stop_at_rest(observed: Observed, tried: Tried) -> Check:
 def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     """Emergency stop of a drone that begins to climb, or of a robot that drives."""
     check = _stop("stop, motors on", observed, tried)
-    way = _way(tried.states)
+    way = _largest_displacement(tried.states)
     if check.verdict == "ok" and observed.robot.hover is None and way > STOP_WAY_M:
         return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
     if check.verdict == "ok" and observed.robot.kind == "crazyflie":
@@ -368,7 +368,7 @@ def _hop_remedy(above: float, side: float) -> str:
     )
 
 
-def _way(states: Sequence[messages.State]) -> float:
+def _largest_displacement(states: Sequence[messages.State]) -> float:
     """Largest distance from the first known position [m]; 0 if none is known."""
     positions = np.array([state.position for state in states if state.position is not None]).reshape(-1, 3)
     return float(np.linalg.norm(positions - positions[0], axis=1).max()) if len(positions) else 0.0

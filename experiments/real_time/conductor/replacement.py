@@ -41,7 +41,7 @@ class Spares:
         """
         spare = order.spare
         if spare is None and order.body is None:
-            spare = self._first(name, robot.kind)
+            spare = self._first_spare(name, robot.kind)
         if spare is not None and order.body is not None:
             raise Refused("a spare has a body of its own: leave --body or --with out")
         made = self._of_spare(spare, name, robot) if spare is not None else self._of_body(order.body or "", robot)
@@ -51,7 +51,7 @@ class Spares:
             made = self._put(made, order.at, order.yaw)
         return made, spare
 
-    def _first(self, name: str, kind: str) -> str:
+    def _first_spare(self, name: str, kind: str) -> str:
         for spare, robot in self._experiment.spares.items():
             if robot.kind == kind and spare not in self.used:
                 return spare

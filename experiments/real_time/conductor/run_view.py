@@ -183,7 +183,7 @@ class NetworkView:
         for token, there in self._watch.changes():
             if (known := self.robots.get(self._keys.whose(token) or "")) is not None:
                 known.alive, known.vanished = there, inf if there else time.monotonic()
-        return self._missed()
+        return self._missing_tokens()
 
     def order(self, names: Sequence[str], order: messages.Order) -> dict[str, messages.Reply]:
         """Give an order to robots, see `orders.send_order`."""
@@ -209,7 +209,7 @@ class NetworkView:
         for text in trouble:
             self.report("clock", "conductor", text)
 
-    def _missed(self) -> list[str]:
+    def _missing_tokens(self) -> list[str]:
         """Robots whose token has been missing for long: where there is another router, it comes back at once."""
         now = time.monotonic()
         self._watch_router(now)

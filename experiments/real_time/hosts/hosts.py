@@ -135,12 +135,12 @@ class Station:
         here = address or self.hello.seen_from or "127.0.0.1"
         try:
             # routers as the host reaches them
-            self.endpoints = [str(self._abroad(router, ports, here)) for router in self._routers]
+            self.endpoints = [str(self._reachable_endpoint(router, ports, here)) for router in self._routers]
         except StopIteration:
             raise HostError(f"{self.name}: ssh does not say which port it forwards; use listen in [network]") from None
 
     @staticmethod
-    def _abroad(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
+    def _reachable_endpoint(router: Endpoint, ports: Iterator[int], here: str) -> Endpoint:
         if router.is_loopback:
             through = router if router.port else Endpoint("tcp", "", 0, router.rest)
             return through.at("127.0.0.1", next(ports))

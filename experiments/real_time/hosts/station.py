@@ -84,7 +84,7 @@ def answer(question: Question, clock: float) -> Answer:
         case "devices":
             return Answer(code, clock, found=list(devices(question.bodies)))
         case "sweep":
-            return Answer(code, clock, found=[Found(str(pid), False, "was killed") for pid in kill(_others())])
+            return Answer(code, clock, found=[Found(str(pid), False, "was killed") for pid in kill(_other_processes())])
         case _:
             return Answer(
                 code,
@@ -140,7 +140,7 @@ def _radios() -> Iterator[Found]:
             yield Found(name, well, "may be used" if well else f"{node} may not be written: {UDEV}")
 
 
-def _others() -> list[int]:
+def _other_processes() -> list[int]:
     """Processes of the same run on this machine, but for this one and its parent."""
     run = os.environ.get(RUN)
     return [pid for pid, _ in tagged(f"{RUN}={run}") if pid not in (os.getpid(), os.getppid())] if run else []
@@ -192,9 +192,9 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
                     continue
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
     lost = time.monotonic()
-    while (left := _others()) and time.monotonic() < lost + patience_s:
+    while (left := _other_processes()) and time.monotonic() < lost + patience_s:
         if time.monotonic() > lost + FROZEN_S and all(_frozen(pid) for pid in left):
             break  # none of them lands any more
         time.sleep(POLL_S)
-    kill(_others())
+    kill(_other_processes())
     return 0

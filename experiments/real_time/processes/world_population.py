@@ -62,7 +62,7 @@ class Population:
         self._dt = 1.0 / experiment.rates.body_hz
         self._begun = math.nan
         self.time = 0.0
-        self._make()
+        self._create_body()
 
     # ------------------------------------------------------------------ motion
 
@@ -125,7 +125,7 @@ class Population:
         before = self.body.engine
         if name is None:
             rows = np.flatnonzero(self.carried).tolist()
-            self._make()
+            self._create_body()
         else:
             rows = [self._row(name)]
             if not self.carried[rows[0]]:
@@ -137,7 +137,7 @@ class Population:
             place = (*self._home[0][row, :2].tolist(), height)
             self.put(self.names[row], place, float(self._home[1][row]), flying=flying)
 
-    def _make(self) -> None:
+    def _create_body(self) -> None:
         """Makes the body, with robots and obstacles where the file has them."""
         experiment = self._experiment
         position, yaw = self._home

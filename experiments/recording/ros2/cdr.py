@@ -132,13 +132,13 @@ class _Writer:
                     parts.append(f"{field.name}=dict(zip({keys}, {values}))")
                     lines += [f"string[] {name}_keys", f"int64[] {name}_values"]
                 case _:
-                    rebuilt, ros = self._visit(field.type, inner, where)
+                    rebuilt, ros = self._encode_expression(field.type, inner, where)
                     parts.append(f"{field.name}={rebuilt}")
                     lines.append(f"{ros} {name}")
         self.definitions[own] = "\n".join(lines) + "\n"
         return f"{made}({', '.join(parts)})"
 
-    def _visit(self, kind: mi.Type, value: str, where: str) -> tuple[str, str]:
+    def _encode_expression(self, kind: mi.Type, value: str, where: str) -> tuple[str, str]:
         """Puts the expression `value`; returns the expression that rebuilds it, and its type in ROS."""
         match kind:
             case mi.StructType(cls=cls):
@@ -160,7 +160,9 @@ class _Writer:
                 missing = "-1" if isinstance(one, mi.IntType) else "NAN"
                 if isinstance(one, mi.TupleType):
                     missing = f"({'NAN, ' * len(one.item_types)})"
-                rebuilt, ros = self._visit(one, f"({missing} if ({held} := {value}) is None else {held})", where)
+                rebuilt, ros = self._encode_expression(
+                    one, f"({missing} if ({held} := {value}) is None else {held})", where
+                )
                 numbers = rebuilt.strip("(,)").split(", ")
                 known = "{0} == -1" if isinstance(one, mi.IntType) else "{0} != {0}"
                 absent = " and ".join(known.format(each) for each in numbers)
@@ -252,7 +254,7 @@ class _Writer:
             self._lines(f"for {each} in {held}:", f"{taken} = []")
             self._lines("", f"for _ in range({length}):")
             self._indent += "    "
-            rebuilt, ros = self._visit(item, each, where)
+            rebuilt, ros = self._encode_expression(item, each, where)
             self.flush()
             self._lines("", f"{taken}.append({rebuilt})")
             self._indent = self._indent[:-4]

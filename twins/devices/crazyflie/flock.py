@@ -232,7 +232,7 @@ class Flock:
         before = quadrotor.velocity
         quadrotor.advance()
         self._touch_floor(before)
-        self._lean(before)
+        self._update_attitude(before)
         self.place = quadrotor.position.copy()
         if self._jitter.present:
             self._jitter.advance()
@@ -256,7 +256,7 @@ class Flock:
         quadrotor.position[below, 2] = 0.0
         quadrotor.velocity[below] = 0.0
 
-    def _lean(self, before: Array) -> None:
+    def _update_attitude(self, before: Array) -> None:
         """Attitude that gives the acceleration from `before` (N, 3) [m/s] on, with a lag."""
         quadrotor = self.quadrotor
         self.acceleration = np.where(quadrotor.flying[:, None], (quadrotor.velocity - before) / self.dt, 0.0)
