@@ -205,6 +205,11 @@ class Agent:
         """Rows (N,) that land or have landed; not those on their way to a landing place."""
         return np.asarray((self.lifecycle.phase >= LANDING) & ~self._landing.aside)
 
+    @property
+    def state(self) -> BodyState:
+        """State of the bodies on this tick, without the positions that jumped."""
+        return self._now.state
+
     def land_here(self) -> None:
         """The bodies land by other means: rows stop moving aside."""
         self._landing.land_in_place()
@@ -219,7 +224,7 @@ class Agent:
         """First half of a tick: advance the phases, and decide which rows transmit their measured pose."""
         self.goal_computer.update_links(t)
         life = self.lifecycle
-        watched = self._every_row if life.all_running else (life.phase == AIRBORNE) | (life.phase == RUNNING)
+        watched = self._every_row if life.all_running else life.active | (life.phase == LANDING)
         jump = self._continuity.jumps(state.time, state.position, watched)
         if jump is not None:
             state = replace(state, position=np.where(np.isnan(jump)[:, None], state.position, np.nan))

@@ -480,7 +480,7 @@ class Runtime:
         slot = (self.agent.tick - 1) // self._state_every
         if slot != self._state_slot:
             self._state_slot = slot
-            telemetry.send_states(state, actions, t)
+            telemetry.send_states(self.agent.state, actions, t)
             telemetry.send_ranges(state)
         telemetry.send_statuses(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
         self._neighbours.changed = False

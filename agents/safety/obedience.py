@@ -47,7 +47,7 @@ class Continuity:
         Args:
             time: (N,) of the measurement [s].
             position: (N, 3) measured [m].
-            watched: (N,) rows that follow their setpoints: the others may be carried, and begin anew.
+            watched: (N,) rows in motion: the others may be carried, and begin anew unless they have jumped.
         """
         moved = position - self._place
         squared = np.vecdot(moved, moved)
@@ -56,6 +56,7 @@ class Continuity:
             if some(self._out):
                 self._out = np.zeros(len(time), dtype=bool)
             return None
+        watched = watched | self._out
         gap, unknown = np.sqrt(squared), watched & np.isnan(position).any(axis=1)
         plausible = JUMP_M + np.where(self._out, 0.0, self._fastest * np.clip(time - self._time, 0.0, GAP_S))
         self._out = watched & ((gap > plausible) | (unknown & self._out))

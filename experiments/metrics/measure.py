@@ -68,7 +68,7 @@ def _mean_indices(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
 
 
 def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
-    """The first thing that kept each robot from its part of the experiment."""
+    """The first thing that kept each robot from its part of the experiment, and a cut of its motors after that."""
     found: dict[str, str] = {}
     blind: dict[str, Event] = {}  # begin of the last loss of its own position
     for event in trace.events:
@@ -82,6 +82,8 @@ def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
                 begin = blind[event.source]
                 what = f"{begin.text.removeprefix('hold: ')}, until the end"
             found[event.source] = f"{event.source} at {max(begin.stamp, 0.0):.1f} s: {what}"
+        elif event.text.startswith("cut: ") and "cut: " not in found.get(event.source, "cut: "):
+            found[event.source] += f"; at {max(event.stamp, 0.0):.1f} s {event.text}"
     for each in robots:
         if each.known < PRESENT:
             found.setdefault(each.robot, f"{each.robot}: its position was known for {each.known:.0%} of the time only")

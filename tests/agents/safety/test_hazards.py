@@ -297,13 +297,13 @@ def test_wheels_whose_position_is_old_know_no_error():
     assert np.isfinite(swarm.agent("B").error).all()
 
 
-def jumped(swarm, name, at, until):
-    """The measured position of a robot is off by 1 m from `at` [s] on, before `until`."""
+def jumped(swarm, name, at, until, off=1.0):
+    """The measured position of a robot is `off` [m] from `at` [s] on, before `until`."""
     group = next(group for group in swarm.groups if name in group.names)
 
     def spoil(t, state):
         if at <= t < until:
-            state.position[group.names.index(name), 1] += 1.0
+            state.position[group.names.index(name), 1] += off
         return state
 
     group.spoil = spoil
@@ -320,6 +320,27 @@ def test_a_drone_whose_position_jumps_lands_unless_it_is_back_at_once(lasts_s, p
     first = happened(swarm)["F"][0]
     assert first.startswith("hold: its own position is lost: it jumped by 1.0")
     assert np.linalg.norm((swarm.row("F", "truth") - place)[:2]) < 0.1
+
+
+@pytest.mark.parametrize("begins", ["climbing", "running", "landing"])
+def test_a_position_far_away_that_was_refused_cuts_no_motors(begins):
+    swarm = drone()
+    if begins == "climbing":
+        swarm.run(0.1)
+        while swarm.row("F", "truth")[2] < 0.2:
+            swarm.conduct()
+            swarm.step()
+    else:
+        swarm.running().run(0.3)
+    if begins == "landing":
+        swarm.agent("F").lifecycle.land(0, "by a test")
+        swarm.run(0.2)
+    jumped(swarm, "F", swarm.t, np.inf, off=1e5)
+    while swarm.phase("F") != DONE:
+        swarm.step()
+        assert np.isnan(swarm.agent("F").state.position[0]).all()
+    assert swarm.row("F", "truth")[2] < 0.05  # it has landed
+    assert not any("flies away" in text for text in happened(swarm)["F"])
 
 
 def test_wheels_whose_position_jumps_stand_and_lead_nobody_astray_until_they_are_ordered_to_start():

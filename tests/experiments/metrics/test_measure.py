@@ -408,6 +408,10 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
         ([("hazard", "land: it came down by itself: its motors are off")],
          ("F at 3.0 s: land: it came down by itself: its motors are off",)),
         ([("hazard", "cut: it has tipped over: 80°")], ("F at 3.0 s: cut: it has tipped over: 80°",)),
+        (
+            [("hazard", "land: it left the arena: 0.3 m outside"), ("hazard", "cut: its landing takes too long: 20 s")],
+            ("F at 3.0 s: land: it left the arena: 0.3 m outside; at 4.0 s cut: its landing takes too long: 20 s",),
+        ),
         ([("lost", "its process ended (exit code 1)")], ("F at 3.0 s: was lost: its process ended (exit code 1)",)),
     ],
 )  # fmt: skip
