@@ -23,6 +23,7 @@ from agents.network import session as network
 from agents.network.endpoints import EndpointError
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
+from agents.safety.detection import SLOWEST
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
@@ -32,7 +33,7 @@ STALE_S: Final = 0.5  # older positions are lost; robots tolerate as much
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # how long `land` is repeated to a robot on wheels
-LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`
+LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`, and after a slow descent
 GROUNDED_S: Final = 1.0  # a robot in flight that is measured on the ground for so long has landed by itself
 AWAY_M: Final = 0.05  # [m] above the place of take-off: higher is in the air, lower is down
 SETTLED: Final = 0.1  # [m/s] slower robots stand
@@ -256,7 +257,8 @@ class ExternalBody:
             grounded & self._flying & ~climbing, np.minimum(self._grounded_since, now), np.inf
         )
         alone = ~landing & (now - self._grounded_since > GROUNDED_S)
-        down = self._flying & ((landing & np.where(aged, now - self._landing_since > LANDING_S, grounded)) | alone)
+        unseen = now - self._landing_since > np.fmax(LANDING_S, self._poses.position[:, 2] / SLOWEST)
+        down = self._flying & ((landing & np.where(aged, unseen, grounded)) | alone)
         self._flying &= ~down
         with self._lock:
             for row in np.flatnonzero(down).tolist():

@@ -17,6 +17,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
+from agents.safety.detection import SLOWEST
 from bridges import external
 from bridges.external import ExternalBody, open_external
 from tests.conftest import RouterProcess
@@ -381,7 +382,9 @@ def test_a_robot_that_lands_unseen_is_taken_for_down_in_the_end(
     far.hush()
     far.talk("TE01")
     body.land(np.array([0, 1]))
+    told = time.monotonic()
     drive.until(lambda: not drive.state.flying[0], "nobody has seen it for long")
+    assert time.monotonic() - told > 0.5 / SLOWEST, "from 0.5 m it may take so long"
     assert drive.state.flying[1]  # this one is seen, and does not come down
     assert drive.state.notes[0].startswith("no position for")
 
