@@ -20,7 +20,7 @@ from experiments.check.findings import FORGIVEN, Claim, Severity, first_of_each_
 from experiments.check.ideal_run import message_rate, predict, undisturbed
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
-from experiments.file.document import Document, Source
+from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
 NOT_RANDOM: Final = "not-random"
@@ -102,9 +102,13 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     predicted_s: float  # how much of the run was predicted
 
 
-def check(given: Document) -> list[Finding]:
-    """Findings of all cases: errors first, then warnings, then notes."""
-    return _findings(given, _analyses(given.cases()))
+def check(given: Document, cases: Sequence[str] = ()) -> list[Finding]:
+    """Findings of the named cases, of all if none is named: errors first, then warnings, then notes.
+
+    Raises:
+        DocumentError: If the experiment has no case of that name.
+    """
+    return _findings(given, _analyses(chosen(given, cases)))
 
 
 def analyses(given: Document) -> dict[str, Analysis]:

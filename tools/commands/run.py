@@ -117,14 +117,14 @@ class _Shown:
 
 def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
     """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
-    from experiments.file.document import chosen, load
+    from experiments.file.document import load
     from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
 
     read = load(origin.file, *origin.changes)
     _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
     _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
-    chosen(read, options.cases)
-    if not sound(read, seeds=origin.seeds, as_json=show.as_json and not origin.anyway) and not origin.anyway:
+    as_json = show.as_json and not origin.anyway
+    if not sound(read, options.cases, seeds=origin.seeds, as_json=as_json) and not origin.anyway:
         print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
         return 2
     folder = new_folder(read, show.out)
@@ -318,14 +318,21 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
             raise refusal(option, "is for real time", "leave out --virtual")
 
 
-def sound(read: Document, *, seeds: int, as_json: bool) -> bool:
+def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: bool) -> bool:
     """Print the warnings and errors of the check of a run of so many seeds; False if there are errors.
 
-    With `as_json`, errors are on standard output as JSON too.
+    Args:
+        read: The experiment.
+        cases: Names of the cases to be run; all if none is named.
+        seeds: How many are run.
+        as_json: Whether errors are on standard output as JSON too.
+
+    Raises:
+        DocumentError: If there is no such case.
     """
     from experiments.check.check import NOT_RANDOM, check
 
-    found = [finding for finding in check(read) if finding.severity != "note"]
+    found = [finding for finding in check(read, cases) if finding.severity != "note"]
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     for finding in found:

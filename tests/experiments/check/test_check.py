@@ -452,6 +452,13 @@ def test_only_the_case_at_fault_is_named():
     assert found["hunts"][3] == "--set cases.event.formation.gain=10"
 
 
+def test_only_the_cases_of_a_run_are_checked():
+    read = document.read(TRIANGLE, ["cases.periodic.robots.KH01.start=[0.6, -0.45]", "duration_s=1"])
+    assert {each.code for each in check(read) if each.severity == "error"} == {"start-overlap"}
+    assert {each.code for each in check(read, ["periodic"]) if each.severity == "error"} == {"start-overlap"}
+    assert not [each for each in check(read, ["event"]) if each.severity == "error" or "in case" in each.message]
+
+
 def test_the_place_is_in_the_case_that_changes_it(tmp_path):
     text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
