@@ -182,13 +182,14 @@ def fragment(title: str, verdict: Sequence[Finding], tables: Sequence[Table]) ->
     return "".join(parts)
 
 
-def numbered(drawn: Iterable[tuple[Figure, str]], first: int = 1) -> tuple[PageFigure, ...]:
-    """Figures and their captions, to stand in a page."""
+def numbered(drawn: Iterable[tuple[Figure | str, str]], first: int = 1) -> tuple[PageFigure, ...]:
+    """Figures, or their SVG, and their captions, to stand in a page."""
     from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
+    texts = ((each if isinstance(each, str) else figures.svg(each), caption) for each, caption in drawn)
     return tuple(
-        PageFigure(inline(figures.svg(figure), f"f{number}-", caption), number, caption)
-        for number, (figure, caption) in enumerate(drawn, start=first)
+        PageFigure(inline(svg, f"f{number}-", caption), number, caption)
+        for number, (svg, caption) in enumerate(texts, start=first)
     )
 
 

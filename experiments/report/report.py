@@ -85,6 +85,7 @@ def write(
     notes: Sequence[str] = (),
     run: Path | None = None,
     bands: Mapping[str, Band] | None = None,
+    drawings: Mapping[str, str] | None = None,
 ) -> Path:
     """Writes the report of one run.
 
@@ -102,6 +103,7 @@ def write(
             interrupted is seen from the traces.
         run: Folder of the run; the same as `folder` if left out.
         bands: Errors over all seeds, where most of their traces are not known.
+        drawings: SVG of every figure by its name, if they were drawn already.
 
     Raises:
         ValueError: If there is no trace (no robot had started: there is nothing to report), or one of less than two
@@ -125,18 +127,22 @@ def write(
         ("Robots", str(len(traces[0].robots))),
         ("Cases", ", ".join(by_case(cases))),
     ]
-    drawn = _pictures(cases, traces, bands or figures.error_bands(traces))
+    bands = bands or figures.error_bands(traces)
+    if drawings is None:
+        drawn = figures.every(cases, traces, bands=bands) | figures.shadow_figures(first)
+        drawings = {each: figures.svg(figure) for each, figure in drawn.items()}
+    pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
         *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
-        Section("Figures", pictures=drawn),
+        Section("Figures", pictures=pictures),
         Section("Events", tables=(short,), more=every_event),
         Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
         Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
         *_tables("Network model", NETWORK, network_tables(cases)),
-        *_of_worlds(cases, first, len(drawn)),
+        *_of_worlds(cases, drawings, len(pictures)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
         Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
@@ -270,7 +276,7 @@ def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
 
 
 def _pictures(
-    cases: Sequence[CaseMetrics], traces: Sequence[Trace], bands: Mapping[str, Band]
+    cases: Sequence[CaseMetrics], traces: Sequence[Trace], bands: Mapping[str, Band], drawings: Mapping[str, str]
 ) -> tuple[PageFigure, ...]:
     legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
     seeds = len({case.seed for case in cases})
@@ -290,11 +296,10 @@ def _pictures(
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, with its links.{scenery.caption(shown)}{seed}",
     }
-    drawn = figures.every(cases, traces, bands=bands)
-    return numbered((figure, captions[name]) for name, figure in drawn.items())
+    return numbered((svg, captions[name]) for name, svg in drawings.items() if name in captions)
 
 
-def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_before: int) -> list[Section]:
+def _of_worlds(cases: Sequence[CaseMetrics], drawings: Mapping[str, str], figures_before: int) -> list[Section]:
     """Contacts, close approaches and shadow twins, where there are any."""
     sections = []
     if any(case.near or case.near_arena or case.collisions for case in cases):
@@ -306,8 +311,8 @@ def _of_worlds(cases: Sequence[CaseMetrics], traces: Sequence[Trace], figures_be
             Section("Contacts and clearances", (source,), (*touched, *clearance_tables(cases)), folded=contacts)
         )
     if tables := shadow_tables(cases):
-        seed = f" Seed {traces[0].seed}." if len({case.seed for case in cases}) > 1 else ""
-        drawn = ((figure, f"{SHADOWS}{seed}") for figure in figures.shadow_figures(traces).values())
+        seed = f" Seed {cases[0].seed}." if len({case.seed for case in cases}) > 1 else ""
+        drawn = ((svg, f"{SHADOWS}{seed}") for name, svg in drawings.items() if name == "shadows")
         pictures = numbered(drawn, figures_before + 1)
         sections.append(
             Section("Twins beside robots", tables=tables, pictures=pictures, folded="shadow twins against their robots")

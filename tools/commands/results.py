@@ -333,10 +333,11 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     place = Path(runs[0].folder or folder) / "figures" / metrics_files.BANDS
     bands = {} if recorded else metrics_files.read_bands(place)
     drawn = figures.every(every, traces, width, bands) | figures.shadow_figures(list(runs[0].traces.values()), width)
-    if not (recorded or bands):
-        drawn.pop("errors", None)  # the one that is there is of all seeds
-    for name, figure in drawn.items():
-        style.save(figure, folder / "figures", name)
+    stays = [] if recorded or bands else ["errors"]  # the one that is there is of all seeds
+    drawings = {
+        name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name)[0].read_text("utf-8")
+        for name, figure in drawn.items()
+    }
     if len(runs) > 1 and (bands or recorded):
         metrics_files.write_bands(folder / "figures" / metrics_files.BANDS, bands or figures.error_bands(traces))
     return pages.write(
@@ -348,6 +349,7 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
         measured=every,
         notes=[n for each in runs for n in each.notes],
         bands=bands,
+        drawings=drawings if width == style.WIDTH else None,
     )
 
 
