@@ -37,11 +37,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     shown: dict[str, str] = {}
     for item in items:
         if (marker := item.get_closest_marker("mechanism")) is not None:
-            (name,) = marker.args
             if item.get_closest_marker("system") is None:
                 raise pytest.UsageError(f"{item.nodeid}: the mark `mechanism` is for tests with the mark `system`")
-            if (other := shown.setdefault(name, item.nodeid)) != item.nodeid:
-                raise pytest.UsageError(f"{item.nodeid}: {other} shows the mechanism {name!r} already")
+            for name in marker.args:
+                if (other := shown.setdefault(name, item.nodeid)) != item.nodeid:
+                    raise pytest.UsageError(f"{item.nodeid}: {other} shows the mechanism {name!r} already")
 
 
 PATIENT = """

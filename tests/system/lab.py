@@ -37,11 +37,11 @@ NEAR = [
     for part in ("--set", f"robots.{name}.start={start}")
 ]  # fmt: skip
 
+# The same of the triangle, whose drone is also soon up and down.
 NEAR_TRIANGLE = [
-    part
-    for name, start in {"KH01": "[-0.35, -0.3]", "KH02": "[0.35, -0.3]", "CF01": "[0.05, 0.2]"}.items()
-    for part in ("--set", f"robots.{name}.start={start}")
-]
+    "--set", "robots.KH01.start=[-0.35, -0.3]", "--set", "robots.KH02.start=[0.35, -0.3]",
+    "--set", "robots.CF01.start=[0.05, 0.44]", "--set", "robots.CF01.hover=0.3",
+]  # fmt: skip
 
 
 def zenpark(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:

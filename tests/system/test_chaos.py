@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.lab import zenpark
+from tests.system.lab import NEAR_TRIANGLE, zenpark
 
 pytestmark = pytest.mark.system
 
@@ -27,7 +27,7 @@ def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) -> None:
     folder = tmp_path / "chaos"
     faults = str(len(kinds))
-    of = ("--faults", faults, "--seed", "1", "--kinds", ",".join(kinds), "--set", "duration_s=40")
+    of = ("--faults", faults, "--seed", "1", "--kinds", ",".join(kinds), *NEAR_TRIANGLE, "--set", "duration_s=40")
     done = chaos(folder, "triangle", *of, "--json")
     assert done.stdout, done.stderr
     result = json.loads(done.stdout)

@@ -16,9 +16,8 @@ import zenoh
 
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.runtime.watchdog import HUNG
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, PATIENCE_S, ROOT, Flight, RobotProcess, Watcher, WorldProcess
+from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, WorldProcess
 
 pytestmark = pytest.mark.system
 
@@ -80,7 +79,7 @@ def fly(watcher: Truth) -> None:
 
 
 @pytest.mark.mechanism("watchdog: control loop hangs")
-def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
+def test_a_loop_that_hangs_is_landed_and_said(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     (tmp_path / "hangs.py").write_text(HANGS)
     about = tmp_path / "hangs-1.dist-info"
     about.mkdir()
@@ -112,7 +111,6 @@ def test_a_loop_that_hangs_is_landed_said_and_ended(router: RouterProcess, watch
         watcher.until(lambda: "TE01" not in watcher.alive, "nobody counts on it")
         watcher.until(lambda: watcher.height("TE01") < 0.02, "it is down")
         assert robot.poll() is None  # landed, not fallen
-        assert robot.wait(PATIENCE_S) == HUNG
     finally:
         for process in reversed(started):
             process.kill()

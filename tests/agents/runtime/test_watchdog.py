@@ -103,25 +103,30 @@ def test_one_that_hangs_for_good_is_told_again_cut_and_ended(stuck: str, eventua
 
 
 FROZEN = """
-import sys, threading
+import select, sys, threading
 from agents.runtime.watchdog import Watchdog
 class Body:
     def land(self, rows): print("landed", flush=True)
     stop = land
-with Watchdog(Body(), None, alarm=print, silence_s=0.5) as dog:
+with Watchdog(Body(), None, alarm=print, silence_s=0.5, down_s=0.1) as dog:
     print("runs", flush=True)
-    pause = threading.Event()
-    for _ in range(150):
+    pause, left = threading.Event(), 80
+    while left:
         dog.beat()
         pause.wait(0.01)
-print("over", flush=True)
+        left -= len(select.select([sys.stdin], [], [], 0.0)[0])  # from the end of its input on
+    print("over", flush=True)
+    threading.Event().wait()
 """
 
 
 @pytest.mark.mechanism("watchdog: suspended process")
 @pytest.mark.system
 def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
-    process = subprocess.Popen([sys.executable, "-c", FROZEN], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    """And one that hangs for good ends."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", FROZEN], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "runs\n"
     os.kill(process.pid, signal.SIGSTOP)
@@ -130,4 +135,8 @@ def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
     until(lambda: time.monotonic() > frozen + 1.0, "it was frozen for twice as long as the watchdog allows")
     os.kill(process.pid, signal.SIGCONT)
     out, _ = process.communicate(timeout=30)
-    assert out == "over\n"
+    assert process.returncode == HUNG
+    before, alarm, *landed = out.splitlines()
+    assert before == "over"
+    assert alarm.startswith("its control loop hangs: no tick for ")
+    assert set(landed) == {"landed"}
