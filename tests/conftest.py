@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import gc
 import os
 import signal
 import subprocess
@@ -15,6 +17,8 @@ from pathlib import Path
 
 import psutil
 import pytest
+import typer.main
+import typer.testing
 from hypothesis import settings as hypothesis_settings
 
 from agents.network.endpoints import free_endpoint
@@ -26,22 +30,40 @@ hypothesis_settings.load_profile("zenpark")
 # no test may find the runs of whoever uses this machine, least of all to stop them
 os.environ["ZENPARK_RUNS"] = tempfile.mkdtemp(prefix="zenpark-tests-")
 
+# each call builds all commands anew, 50 ms; a command keeps nothing of a call
+typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
+
 ROOT = Path(__file__).resolve().parent.parent
 
 # The background of a shell ignores Ctrl-C, and whatever a test starts would inherit that; a handler is not inherited.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Refuses two tests for one mechanism: each costs seconds in which nothing else runs.
+
+    With the profile `quick`, a test that names its number of random examples has no more than the others either.
+    """
     shown: dict[str, str] = {}
     for item in items:
+        own = getattr(getattr(item, "obj", None), "_hypothesis_internal_use_settings", None)
+        if own is not None and config.getoption("--hypothesis-profile") == "quick":
+            fewer = hypothesis_settings(
+                own, max_examples=min(own.max_examples, hypothesis_settings.default.max_examples)
+            )
+            item.obj._hypothesis_internal_use_settings = fewer
         if (marker := item.get_closest_marker("mechanism")) is not None:
             if item.get_closest_marker("system") is None:
                 raise pytest.UsageError(f"{item.nodeid}: the mark `mechanism` is for tests with the mark `system`")
             for name in marker.args:
                 if (other := shown.setdefault(name, item.nodeid)) != item.nodeid:
                     raise pytest.UsageError(f"{item.nodeid}: {other} shows the mechanism {name!r} already")
+
+
+def pytest_collection_finish() -> None:
+    """Lets the garbage collector pass over all that was imported and collected: a twentieth of the time."""
+    gc.collect()
+    gc.freeze()
 
 
 PATIENT = """

@@ -73,6 +73,7 @@ def test_the_help_of_every_command_ends_with_examples_that_it_takes(path, comman
             parse(words[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_experiments_of_a_page_are_sound(page):
     for text in BLOCK.findall(page.read_text("utf-8")):

@@ -25,6 +25,7 @@ def panels(part: Any) -> Iterator[str]:
             yield from panels(part[side])
 
 
+@pytest.mark.slow
 def test_the_layout_for_foxglove_names_what_a_recording_has(tmp_path):
     simulate(load("triangle", "duration_s=1.0", "timeline=[]"), cases=["event"], folder=tmp_path)
     file = tmp_path / "event.mcap"

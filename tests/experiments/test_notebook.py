@@ -27,6 +27,7 @@ def test_a_run_shows_its_verdict_and_table(run):
     assert len(repr(run)) < 200
 
 
+@pytest.mark.slow
 def test_figures_show_themselves(run):
     figures = run.figures(width=7.16)
     assert isinstance(figures, Figures)

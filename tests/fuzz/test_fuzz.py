@@ -15,6 +15,7 @@ from tests.fuzz.mutate import LARGEST, Mutator
 from tests.fuzz.places import PLACES
 
 ONCE = sorted((Path(__file__).parent / "once").glob("*.bin"))
+HUGE = 30_000  # bytes, over which an input takes seconds
 HEAVY = {name for name, place in PLACES.items() if place.quick <= 60}
 
 
@@ -29,7 +30,10 @@ def test_nothing_escapes(name: str) -> None:
     assert tally.refused < tally.inputs, "no good example is read"
 
 
-@pytest.mark.parametrize("file", ONCE, ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file",
+    [pytest.param(file, id=file.stem, marks=[pytest.mark.slow] * (file.stat().st_size > HUGE)) for file in ONCE],
+)
 def test_what_escaped_once_does_not_again(file: Path) -> None:
     assert replay(PLACES[file.name.partition("--")[0]], file.read_bytes())
 

@@ -36,6 +36,7 @@ def test_passes_when_the_packages_are_ours(tmp_path):
     assert done.stdout.startswith("zenpark ")
 
 
+@pytest.mark.slow
 def test_names_the_package_in_the_way_and_the_remedy(tmp_path):
     for name in ("agents", "twins"):
         (tmp_path / name).mkdir()
@@ -63,6 +64,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
     assert not loaded & {"agents", "bridges", "twins", "experiments", "tools.main", "typer", "numpy", "zenoh"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
 )
@@ -81,6 +83,7 @@ def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
     assert not loaded & {"typer", "pydantic", "tools.main"}
 
 
+@pytest.mark.slow
 def test_a_robot_loads_no_openssl():
     program = (
         "import atexit, runpy, sys; sys.argv = ['robot', '--help'];"

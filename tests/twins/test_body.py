@@ -83,6 +83,7 @@ def exercise(groups):
     return {field: np.array(values) for field, values in history.items()}
 
 
+@pytest.mark.slow
 def test_rows_of_one_body_are_separate_bodies_to_the_last_bit():
     together = exercise([range(6)])
     for groups in ([[row] for row in range(6)], [[5, 0, 3], [2], [4, 1]]):
@@ -174,6 +175,7 @@ def test_measurement_noise_is_not_the_truth_and_ground_robots_have_no_height():
     assert states[-1].time[0] == 1999 * DT
 
 
+@pytest.mark.slow
 def test_velocity_is_measured_as_that_of_robots_in_motion_capture():
     nature = {"all": Disturbance(position_sigma=0.001, hover_jitter=Jitter(0.01))}
     twin, seen = body("crazyflie", nature=nature), External(1)
@@ -201,6 +203,7 @@ def test_velocity_of_a_robot_that_drives_and_of_one_that_is_put_elsewhere():
     assert not twin.read(200 * DT).velocity.any()
 
 
+@pytest.mark.slow
 def test_odometry_drifts_with_the_way():
     errors = []
     for seed in range(40):

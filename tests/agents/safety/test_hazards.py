@@ -343,6 +343,7 @@ def test_a_position_far_away_that_was_refused_cuts_no_motors(begins):
     assert not any("flies away" in text for text in happened(swarm)["F"])
 
 
+@pytest.mark.slow
 def test_wheels_whose_position_jumps_stand_and_lead_nobody_astray_until_they_are_ordered_to_start():
     swarm = Swarm(pair(), [["A"], ["B"]]).running().run(10.0)
     before = [swarm.row(name, "truth") for name in ("A", "B")]
@@ -491,12 +492,14 @@ def test_a_landing_drone_that_does_no_good_is_cut(values):
     assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (DONE, ["its landing takes too long"])
 
 
+@pytest.mark.slow
 def test_a_landing_drone_that_hovers_is_never_cut():
     swarm = landing(flying=True, position=[0.0, 0.0, 0.5], velocity=[0.0, 0.0, 0.0]).run(30.0)
     assert swarm.phase("F") == LANDING
     assert "warn: it is told to land and hovers: at 0.50 m" in happened(swarm)["F"]
 
 
+@pytest.mark.slow
 def test_a_landing_that_takes_long_is_given_its_time():
     swarm = landing(flying=True)
     group = swarm.groups[0]

@@ -175,6 +175,7 @@ def test_what_the_experiment_makes_wrong_of_it_points_into_both_files(lab):
     assert message.startswith("in case 'small', arena.obstacles.cart.at: 'cart' stands outside")
 
 
+@pytest.mark.slow
 def test_findings_of_the_check_point_into_the_arena_file(lab):
     plan = '[[timeline]]\nat_s = 2.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [2.6, 0.0], speed = 0.2 }\n'
     file = lab(ONE + plan)

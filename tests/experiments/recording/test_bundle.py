@@ -14,6 +14,8 @@ from experiments.recording import bundle, run_folder, version
 from experiments.recording.reader import RecordingError, Records
 from tools.main import app
 
+pytestmark = pytest.mark.slow  # whole runs and their reports
+
 SHORT = """
 title = "Two, for three seconds"
 duration_s = 3.0

@@ -164,6 +164,7 @@ def test_a_file_cut_anywhere(path, tmp_path, recorded):
     assert found[-1] == 82
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(data=st.data())
 def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):

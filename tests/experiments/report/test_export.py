@@ -32,6 +32,7 @@ def flown(tmp_path_factory):
     return folder, simulate(read, folder=folder)
 
 
+@pytest.mark.slow
 def test_a_film_shows_the_run_from_its_start_to_its_end(flown):
     file = flown[0] / "film.gif"
     commands.export(str(flown[0]), video=file, speed=8.0)

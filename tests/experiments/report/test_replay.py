@@ -26,6 +26,7 @@ def film_of(page):
     return json.loads(re.search(r'getElementById\("film"\), (\{.*\})\);', page)[1])
 
 
+@pytest.mark.slow
 def test_positions_are_those_of_the_run_within_a_millimetre(traces):
     page = replay.embedded(traces)
     film = film_of(page)

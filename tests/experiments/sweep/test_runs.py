@@ -36,6 +36,7 @@ def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
         assert figures.updates == np.mean(followers)
 
 
+@pytest.mark.slow
 def test_a_lean_log_is_small(park):
     lean = simulate(park, [1], lean=True)
     assert lean.true_position.shape == (len(lean.time), 7, 3)
@@ -64,6 +65,7 @@ def test_a_run_comes_out_the_same_whoever_flies_beside_it(park):
     assert sum(run.dropped for run in together.runs) > 0
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stuck_does_not_take_the_others_with_it(park, monkeypatch):
     real = runs.simulate
 

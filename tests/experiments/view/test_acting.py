@@ -32,6 +32,7 @@ def test_numbers_of_the_trigger_and_the_law_have_sliders():
     assert dict(parameters(park)) == {"trigger.threshold": 0.01, "clamp": 0.1, "tracking_gain": 3.0}
 
 
+@pytest.mark.slow
 def test_a_watched_run_in_virtual_time_is_the_same_to_the_last_bit(monkeypatch):
     pytest.importorskip("viser", reason="needs viser")
     from experiments.view import live, paced  # noqa: PLC0415

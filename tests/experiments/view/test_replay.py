@@ -29,6 +29,7 @@ def flown(request, tmp_path_factory):
     return run.traces["event"], folder / "event.mcap"
 
 
+@pytest.mark.slow
 def test_positions_are_those_of_the_recording(flown):
     trace, file = flown
     film = Film(tracks.read(file))

@@ -65,6 +65,7 @@ FINDINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", FINDINGS)
 def test_check_finds_settings_that_make_no_sense(what, tmp_path):
     chosen, code = FINDINGS[what]

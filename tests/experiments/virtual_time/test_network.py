@@ -92,6 +92,7 @@ def test_a_delay_is_the_same_number_of_ticks_for_every_sample(delay, ticks):
     np.testing.assert_array_equal(got.seq[got.link == 1], np.arange(1, 501 - ticks))
 
 
+@pytest.mark.slow
 def test_jitter_adds_an_exponential_with_its_mean():
     talk = Talk(Parameters(delay_s=0.005, jitter_s=0.03)).run(4000, [0, 1]).run(200, [])
     when, got = talk.all()
@@ -113,6 +114,7 @@ def test_what_arrives_is_in_order_of_arrival_though_not_of_sending():
     assert (np.diff(got.seq[got.link == 1]) < 0).any()  # some overtook others
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.1, 0.5])
 def test_the_share_that_is_lost(loss):
     talk = Talk(Parameters(loss=loss)).run(5000, [0, 1]).run(2, [])

@@ -146,6 +146,7 @@ def said(*arguments):
     return CliRunner().invoke(app, [str(each) for each in arguments])
 
 
+@pytest.mark.slow
 def test_the_commands(tmp_path):
     folder = tmp_path / "lab"
     first = said("cert", "init", folder, "robotic-park", "KH09", "--host", "192.0.2.7", "--days", "10")

@@ -49,9 +49,10 @@ def test_an_error_of_the_experiment_is_1_and_a_malformed_file_2(file, tmp_path):
     (tmp_path / "wrong.toml").write_text("title = ")
     wrong = check(tmp_path / "wrong.toml", "--json")
     assert wrong.exit_code == 2
-    assert check("triangle").exit_code == 0
+    assert check("triangle", "--set", "duration_s=3").exit_code == 0
 
 
+@pytest.mark.slow
 def test_fix_prints_links_that_fit_together(file, tmp_path):
     said = check(file, "--fix")
     fixed = tomllib.loads(said.stdout[said.stdout.index("[formation.links]") :])["formation"]["links"]
@@ -65,8 +66,9 @@ def test_fix_prints_links_that_fit_together(file, tmp_path):
     assert float(re.search(r"distances met to +([0-9.]+) mm", again.stdout)[1]) < 0.2
 
 
+@pytest.mark.slow
 def test_plot_draws_and_refuses_other_names(file):
-    assert check("triangle", "--plot", file.parent / "a.svg").exit_code == 0
+    assert check("triangle", "--set", "duration_s=3", "--plot", file.parent / "a.svg").exit_code == 0
     drawing = (file.parent / "a.svg").read_text()
     assert drawing.count("<path") > 20
     refused = check("triangle", "--plot", file.parent / "a.xyz")

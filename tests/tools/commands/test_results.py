@@ -16,6 +16,8 @@ from experiments.report.tables import ratio_words
 from tests.experiments.recording.test_bundle import SHORT
 from tools.main import app
 
+pytestmark = pytest.mark.slow  # whole runs and their reports
+
 
 def zenpark(*words: str) -> str:
     done = CliRunner().invoke(app, [*words])

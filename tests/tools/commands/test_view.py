@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
-from tests.tools.test_cli import zenpark
+from tools.main import main
 
 
 @pytest.mark.parametrize(
@@ -18,9 +20,12 @@ from tests.tools.test_cli import zenpark
         (("view",), "no run is up on this machine"),
     ],
 )
-def test_refusals(arguments, said):
+def test_refusals(arguments, said, monkeypatch, capsys):
     pytest.importorskip("viser", reason="needs viser")
-    done = zenpark(*arguments)
-    assert done.returncode == 2, done.stderr
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
+    monkeypatch.setattr(sys, "argv", ["zenpark", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    printed = capsys.readouterr()
+    assert ended.value.code == 2, printed
+    assert said in printed.err
+    assert "Traceback" not in printed.err

@@ -103,6 +103,7 @@ def test_motors_carry_the_weight_and_the_drone_is_level(kind):
     np.testing.assert_allclose(engine.position, [[0.0, 0.0, 1.0]], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_small_step_is_that_of_the_linear_cascade():
     path = fly(hovering(), [[0.1, 0.0, 1.0, 0.0]], 4.0)[:, 0, 0]
     theory = linear_cascade(0.1, 4.0)
@@ -143,6 +144,7 @@ def flown_steps():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wanted", "rise", "overshoot", "law"),
     [
@@ -189,6 +191,7 @@ def test_tilt_and_speed_stay_within_the_limits():
     assert w * w + x * x + y * y + z * z == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_nose_points_where_it_flies_to():
     engine = hovering()
     fly(engine, [[0.0, 0.0, 1.0, math.pi / 2]], 4.0)
@@ -241,6 +244,7 @@ def test_motors_off_is_a_fall_and_a_leaning_one_tumbles_and_stays_down():
     assert not spinning.velocity.any()
 
 
+@pytest.mark.slow
 def test_what_is_on_its_back_is_switched_off_and_does_not_take_off():
     engine = hovering()
     drones = engine._drones
@@ -256,6 +260,7 @@ def test_what_is_on_its_back_is_switched_off_and_does_not_take_off():
     assert engine.position[0, 2] == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_tello_follows_velocities():
     engine = hovering(TELLO)
     path = fly(engine, [[0.5, 0.0, 0.0, 0.3]], 3.0)[:, 0]
@@ -265,6 +270,7 @@ def test_a_tello_follows_velocities():
     assert engine.velocity[0, 0] == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_rows_and_copies_are_what_they_are_alone_to_the_last_bit():
     kinds = (CRAZYFLIE, KHEPERA4, TELLO, CRAZYFLIE)
     start = [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]  # in each other: they do not touch

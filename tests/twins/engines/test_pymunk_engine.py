@@ -134,6 +134,7 @@ def test_two_driven_at_each_other_touch_once_and_do_not_overlap(kind, aside):
         assert apart == pytest.approx(2 * kind.radius, abs=2e-4)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     heading=st.floats(-math.pi, math.pi),
@@ -203,6 +204,7 @@ def test_a_blow_in_the_air_conserves_momentum_and_gives_no_energy():
     assert drive.touches[0].impulse == pytest.approx(1.5 * reduced * (before[0] - before[1]), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_jam_does_not_overlap():
     kinds = [TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4] * 4
     grid = 0.25 * np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) - 0.375

@@ -160,6 +160,7 @@ def test_places(tmp_path, relation, anchor, note):
     assert any(note in each for each in notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("architecture", "theirs"), [("distributed", True), ("centralized", False)])
 def test_the_origin_of_real_crazyflies_is_that_of_their_driver(tmp_path, architecture, theirs):
     relations = [[*each, "origin_0.4726"] for each in TRIANGLE]  # √(0.8²/3 + 0.1²): at 0.7 m, from (0, 0, 0.8)

@@ -219,6 +219,7 @@ def test_other_memories():
     assert wire.flock.memories[0].write_errors == 0
 
 
+@pytest.mark.slow
 def test_power_switch():
     """Off it answers no scan of its own, falls, and forgets what is not stored; on it is as new."""
     wire = Wire().hovering()
@@ -233,6 +234,7 @@ def test_power_switch():
     wire.hovering(0.5)
 
 
+@pytest.mark.slow
 def test_every_variable_packs():
     """In the type that it has on board, standing and flying."""
     wire = Wire(device={"multiranger": True}).hovering()

@@ -106,6 +106,7 @@ def test_what_is_not_there(corner):
         uploaded(b"", count=1).pieces(3, None, turned=False, reverse=False, scale=1.0)
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_flown():
     """Uploaded, defined and started by packets; afterwards it hovers at the end, and lands there."""
     wire = Wire().hovering()
@@ -156,6 +157,7 @@ def test_a_spiral_goes_round_its_centre(clockwise, sideways):
     assert float(np.dot(speed[:2], along)) == pytest.approx(0.5 * angle / span)
 
 
+@pytest.mark.slow
 def test_a_spiral_is_flown():
     wire = Wire().hovering()
     assert wire.plan(HighLevel.SPIRAL, struct.pack("<??fffff", 0, 0, math.pi / 2, 0.5, 0.5, 0.2, 3.0)) == Status.OK
