@@ -7,7 +7,6 @@ text = experiment_file(generated, Wanted())
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -44,16 +43,16 @@ class LayoutOptions:
     kind: str = "crazyflie"  # of all robots
     spacing: float = 0.6  # between neighbours [m]
     scatter: float | None = None  # of the starts [m]; None for as much as keeps neighbours apart
-    seed: int = 1  # of the file, and of the random numbers of the layout
+    seed: int = 1  # of the file
     duration_s: float = 60.0  # [s]
     law: str = "distance"  # distance, or displacement, which finds the shape from any starts
 
 
-def layout(what: str, size: str, wanted: LayoutOptions, jumps: Sequence[int] = (1, 2)) -> Layout:
+def layout(what: str, size: str, wanted: LayoutOptions) -> Layout:
     """A formation by name.
 
     Args:
-        what: polygon, grid, hemisphere, henneberg or circulant.
+        what: polygon, grid or hemisphere.
         size: How many robots; of a grid, ROWSxCOLUMNS.
     """
     kind = _kind(wanted)
@@ -63,13 +62,8 @@ def layout(what: str, size: str, wanted: LayoutOptions, jumps: Sequence[int] = (
             raise LayoutError(f"a grid is given as ROWSxCOLUMNS, such as 5x8, not {size!r}")
         return layouts.grid(int(rows), int(columns), wanted.spacing)
     count = int(size)
-    match what:
-        case "polygon":
-            return layouts.polygon(count, wanted.spacing)
-        case "circulant":
-            return layouts.circulant(count, jumps, wanted.spacing)
-        case "henneberg":
-            return layouts.henneberg(count, wanted.spacing, np.random.default_rng(wanted.seed))
+    if what == "polygon":
+        return layouts.polygon(count, wanted.spacing)
     if not kind.flies:
         raise LayoutError(f"a hemisphere needs robots that fly, not a {kind.name}: choose --kind crazyflie")
     return layouts.hemisphere(count, wanted.spacing, 2.0 * kind.radius + PASSING)
@@ -143,26 +137,18 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     )
 
 
-def generate(
-    what: str, size: str, target: str | None, wanted: LayoutOptions, jumps: str = "1,2"
-) -> tuple[Path, Layout]:
+def generate(what: str, size: str, target: str | None, wanted: LayoutOptions) -> tuple[Path, Layout]:
     """Write the experiment file of a formation; return its path and its layout.
 
     Raises:
         DocumentError: If there is no such formation, or the file cannot be written.
     """
-    flag = f"--{what} {size}"
     try:
-        numbers = [int(jump) for jump in jumps.split(",")]
-    except ValueError:
-        hint = "give whole numbers, such as 1,2"
-        raise refusal(f"--jumps {jumps}", "are no jumps", hint) from None
-    try:
-        made = layout(what, size, wanted, numbers)
+        made = layout(what, size, wanted)
         text = experiment_file(made, wanted)
     except LayoutError as error:
         message, _, hint = str(error).partition(": ")
-        raise refusal(flag, message, hint) from None
+        raise refusal(f"--{what} {size}", message, hint) from None
     path = entries.write_new(text, Path(target or f"{what}-{size.lower().replace('×', 'x')}.toml"))
     return path, made
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,7 +14,6 @@ GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))  # [rad] no two multiples of it
 RIM: Final = math.cos(math.radians(75.0))  # a hemisphere ends here: below, robots would stand above one another
 SLIVER: Final = math.cos(math.radians(120.0))  # a triangle of the rim that is blunter only bridges a bay of it
 LOWEST: Final = 0.4  # [m] of a robot of a hemisphere, clear of the ground effect
-CANDIDATES: Final = 8  # nearest earlier robots that a Henneberg step chooses from
 
 
 class LayoutError(ValueError):
@@ -40,26 +38,11 @@ def polygon(count: int, spacing: float) -> Layout:
     The ring alone could fold; with the second neighbours it is rigid in the plane.
     """
     _at_least(count, 3, "polygon")
-    made = circulant(count, (1, 2), spacing)
-    return Layout(f"{count} robots on a regular polygon", made.position, made.pairs)
-
-
-def circulant(count: int, jumps: Sequence[int], spacing: float) -> Layout:
-    """`count` robots on a circle, `spacing` [m] apart; i and i ± j are linked for each jump j."""
-    _at_least(count, 3, "circulant")
-    wrong = [jump for jump in jumps if not 0 < jump < count]
-    if not jumps or wrong:
-        what = f"jumps of {', '.join(map(str, wrong))}" if wrong else "no jumps"
-        raise LayoutError(f"a circulant of {count} cannot have {what}: give numbers from 1 to {count // 2}")
-    if math.gcd(count, *jumps) != 1:
-        raise LayoutError(f"jumps that all share a divisor with {count} leave the circle in parts: add 1 to them")
-    angle = 2.0 * math.pi * np.arange(count) / count
-    radius = spacing / (2.0 * math.sin(math.pi / count))
-    position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
     first = np.arange(count)
-    both = np.concatenate([np.column_stack([first, (first + jump) % count]) for jump in jumps])
-    words = ", ".join(map(str, sorted(set(jumps))))
-    return Layout(f"{count} robots on a circulant graph with jumps {words}", position, _each_once(both))
+    angle, radius = 2.0 * math.pi * first / count, spacing / (2.0 * math.sin(math.pi / count))
+    position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)])
+    pairs = np.concatenate([np.column_stack([first, (first + step) % count]) for step in (1, 2)])
+    return Layout(f"{count} robots on a regular polygon", position, _each_once(pairs))
 
 
 def grid(rows: int, columns: int, spacing: float) -> Layout:
@@ -105,25 +88,6 @@ def hemisphere(count: int, spacing: float, apart: float) -> Layout:
     return Layout(f"{count} robots on a hemisphere of {radius:.2f} m with Delaunay links", position, pairs)
 
 
-def henneberg(count: int, spacing: float, rng: np.random.Generator) -> Layout:
-    """`count` robots with 2N − 3 links, none of which could be left out: minimally rigid in the plane.
-
-    Built by Henneberg's first step (Die graphische Statik der starren Systeme, 1911): a new robot is linked to two that
-    are there. The places are a disc of points about `spacing` [m] apart, disturbed by `rng`.
-    """
-    _at_least(count, 2, "Henneberg construction")
-    number = np.arange(count)
-    way = 0.6 * spacing * np.sqrt(number + 0.5)
-    place = np.column_stack([way * np.cos(GOLDEN * number), way * np.sin(GOLDEN * number)])
-    place += 0.05 * spacing * rng.uniform(-1.0, 1.0, place.shape)
-    links = {(0, 1)}
-    for new in range(2, count):
-        near = np.argsort(norm(place[:new] - place[new]))[:CANDIDATES]
-        links |= {(row, new) for row in _best_anchors(place, new, near)}
-    position = np.column_stack([place - place.mean(axis=0), np.zeros(count)])
-    return Layout(f"{count} robots, minimally rigid (Henneberg)", position, _each_once(np.array(sorted(links))))
-
-
 def _without_slivers(point: Array, triangles: Index) -> Index:
     """Triangles (T, 3) less those on the rim that are blunt opposite to it, again and again."""
     while True:
@@ -142,17 +106,6 @@ def _without_slivers(point: Array, triangles: Index) -> Index:
 def _sides(triangles: Index) -> Index:
     """The sides (M, 2) of triangles (T, 3)."""
     return _each_once(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
-
-
-def _best_anchors(place: Array, new: int, near: Index) -> tuple[int, int]:
-    """The two of `near` that hold a new point best: nearly at right angles, and not far away."""
-    way = place[near] - place[new]
-    length = norm(way)
-    unit = way / length[:, None]
-    across = np.abs(unit[:, None, 0] * unit[None, :, 1] - unit[:, None, 1] * unit[None, :, 0])
-    best = int(np.argmax(across / (length[:, None] + length[None, :])))
-    one, other = divmod(best, len(near))
-    return int(near[one]), int(near[other])
 
 
 def _nearest(points: Array) -> float:

@@ -331,9 +331,6 @@ def new(
     polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
     grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
     hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
-    henneberg: Annotated[int | None, typer.Option(metavar="N", help="Minimally rigid: 2N - 3 links.")] = None,
-    circulant: Annotated[int | None, typer.Option(metavar="N", help="On a circle, linked by --jumps.")] = None,
-    jumps: Annotated[str, typer.Option(metavar="J,J", help="Of a circulant: i hears i ± J.")] = "1,2",
     kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
     spacing: Annotated[float, typer.Option(min=0.01, help="Between neighbours [m].")] = 0.6,
     scatter: Annotated[
@@ -347,7 +344,7 @@ def new(
     from experiments.authoring.generate import LayoutOptions, generate
     from experiments.file import catalogue
 
-    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere, "henneberg": henneberg, "circulant": circulant}
+    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere}
     formations = [(what, str(size)) for what, size in asked.items() if size is not None]
     if not formations:
         if name is None:
@@ -359,7 +356,7 @@ def new(
         what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
         raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
     wanted = LayoutOptions(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
-    path, made = generate(*formations[0], name, wanted, jumps)
+    path, made = generate(*formations[0], name, wanted)
     print(f"{path}: {made.title}, {len(made.pairs)} links; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
 
 
@@ -370,7 +367,7 @@ def import_(
     duration: Annotated[float, typer.Option(min=1.0, help="Their files do not say how long [s].")] = 60.0,
     poses: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), a Webots world (.wbt), or a table."),
+        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt)."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -156,7 +156,7 @@ def _starts(park: Park, notes: list[str]) -> Array:
     if unplaced:
         notes.append(
             f"starts: the file has none for {', '.join(unplaced)}; MADE UP here, on a ring; name a file that has them"
-            " with --poses (an index of robots, a Webots world or a table)"
+            " with --poses (an index of robots or a Webots world)"
         )
     return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
 

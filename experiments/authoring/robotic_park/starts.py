@@ -1,4 +1,4 @@
-"""Starts of robots from a file beside an experiment of Robotic Park: an index, a Webots world or a table."""
+"""Starts of robots from a file beside an experiment of Robotic Park: an index or a Webots world."""
 
 from __future__ import annotations
 
@@ -8,30 +8,26 @@ from pathlib import Path
 from typing import Final
 
 from experiments.authoring.robotic_park.file import Pose, kind_of, load, pose_of
-from experiments.file.problems import DocumentError, Problem, refusal
+from experiments.file.problems import refusal
 from experiments.file.text import content
 
 WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')
 
 
 def starts_from(file: str) -> dict[str, Pose]:
-    """Starts of robots by name: from an index or experiment (.yaml), a Webots world (.wbt) or a table.
-
-    A table has a robot a line: its name, x, y [m] and, if wanted, z [m] or, of robots on wheels, the yaw [rad].
+    """Starts of robots by name: from an index or experiment (.yaml), or a Webots world (.wbt).
 
     Raises:
         DocumentError: If the file cannot be read, or tells no start.
     """
+    hint = "name an index of robots (.yaml) or a Webots world (.wbt)"
     try:
         text = content(Path(file), file)
     except FileNotFoundError:
-        hint = "name an index of robots (.yaml), a Webots world (.wbt) or a table of name, x, y"
         raise refusal(file, "there is no such file", hint) from None
-    kind = Path(file).suffix.lower()
-    read = {".wbt": _world, ".yaml": _index, ".yml": _index}.get(kind, _table)
-    found = read(file, text)
+    found = (_world if Path(file).suffix.lower() == ".wbt" else _index)(file, text)
     if not found:
-        raise refusal(file, "tells the start of no robot", "a line of a table: dron01 0.5 -0.2")
+        raise refusal(file, "tells the start of no robot", hint)
     return found
 
 
@@ -43,26 +39,6 @@ def _index(file: str, text: str) -> dict[str, Pose]:
         for each in listed
         if each.has("pose") and not isinstance(each.value["pose"], dict)
     }
-
-
-def _table(file: str, text: str) -> dict[str, Pose]:
-    found, problems = {}, []
-    for number, line in enumerate(text.splitlines(), 1):
-        name, *rest = [part for part in re.split(r"[,;\s]+", line.partition("#")[0]) if part] or [""]
-        if not name:
-            continue
-        try:
-            values = [float(part) for part in rest]
-        except ValueError:
-            values = []
-        if len(values) not in (2, 3) or not all(map(math.isfinite, values)):
-            problems.append(Problem(file, number, 1, "is no start", "name, x, y and, if wanted, z or the yaw"))
-            continue
-        x, y, z = (*values, 0.0)[:3]
-        found[name] = (x, y, z)
-    if problems:
-        raise DocumentError(problems)
-    return found
 
 
 def _world(file: str, text: str) -> dict[str, Pose]:

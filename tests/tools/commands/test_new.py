@@ -20,8 +20,7 @@ def typed(tmp_path, monkeypatch, *words):
         (["--hemisphere", "40"], "hemisphere-40.toml", 40),
         (["--polygon", "5", "--kind", "khepera4", "mine.toml"], "mine.toml", 5),
         (["--grid", "2x3", "--spacing", "0.8"], "grid-2x3.toml", 6),
-        (["--henneberg", "6", "--seed", "3"], "henneberg-6.toml", 6),
-        (["--circulant", "9", "--jumps", "1,4", "--scatter", "0", "--duration", "12"], "circulant-9.toml", 9),
+        (["--polygon", "9", "--scatter", "0", "--duration", "12"], "polygon-9.toml", 9),
     ],
 )
 def test_formations(tmp_path, monkeypatch, words, file, robots):

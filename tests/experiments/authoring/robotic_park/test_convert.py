@@ -392,10 +392,11 @@ def flat(name, speaks="EvenBased", **changed):
     return FLAT.format(**(given | changed))
 
 
-def test_a_flat_file_of_2023_with_starts_from_a_table(tmp_path):
+def test_a_flat_file_of_2023_with_starts_from_an_index(tmp_path):
     marker = "dron09:\n  name: khepera01\n  control_mode: None\n  task:\n    enable: False\n    relationship: Null\n"
-    poses = tmp_path / "poses.txt"
-    poses.write_text("# name x y\ndron01 0.1 0.5\nkhepera01, -0.4, 0.0\nkhepera02 0.5 0.1 3.1\n")
+    poses = tmp_path / "poses.yaml"
+    places = {"dron01": "0.1 0.5", "khepera01": "-0.4, 0.0", "khepera02": "0.5 0.1 3.1"}
+    poses.write_text("".join(f"{name}:\n  pose: {place}\n" for name, place in places.items()))
     made, notes = convert_text("".join(map(flat, OTHERS)) + marker, "AA.yaml", 20.0, str(poses))
     (tmp_path / "aa.toml").write_text(made)
     experiment = document.read(tmp_path / "aa.toml").experiment
@@ -507,9 +508,7 @@ def test_starts_from_a_webots_world_and_an_index(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("poses.txt", "dron01 0.1\n", "is no start"),
-        ("poses.txt", "dron01 0.1 nan\n", "is no start"),
-        ("poses.txt", "# nothing\n", "tells the start of no robot"),
+        ("poses.txt", "dron01: 0.1\n", "tells the start of no robot"),
         ("park.wbt", "Robot {", "tells the start of no robot"),
         ("park.wbt", 'Robot { name "dron01" translation 1 x 2 }', "cannot be read near '1 x 2'"),
         ("park.wbt", 'Robot { name "dron01" translation', "cannot be read"),
