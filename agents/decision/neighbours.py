@@ -91,7 +91,7 @@ class NeighbourStates:
         self._present: Mask = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._in_law = self._available = np.zeros(len(links), dtype=bool)
         self.active = np.zeros(0, dtype=np.intp)
-        self.links = links.select(self.active)
+        self.links = links.take(self.active)
 
     def receive(self, received: PoseTable) -> None:
         self.poses.receive(received)
@@ -155,5 +155,5 @@ class NeighbourStates:
         in_law = self._available & self._present
         changed: Index = self._all.receiver[in_law != self._in_law]
         self._in_law, self.active = in_law, np.flatnonzero(in_law)
-        self.links = self._all if in_law.all() else self._all.select(in_law)
+        self.links = self._all if in_law.all() else self._all.take(in_law)
         return changed

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec.structs import replace
 
-from agents.arrays import Array, Index, norm
+from agents.arrays import Array, Columns, Index, norm
 
 
-@dataclass(frozen=True)
-class Anchors:
+class Anchors(Columns, frozen=True):
     """Distances (A) to a fixed point, to a line along `axis` through it, or to a plane across `axis` through it."""
 
     row: Index  # (A,) robot
@@ -21,13 +19,11 @@ class Anchors:
     distance: Array  # (A,) wanted [m]; 0: on it
     gain: Array  # (A,) [1/(m² decision)], or [1/decision] where the distance is 0
 
-    def __len__(self) -> int:
-        return len(self.row)
-
     def repeated(self, times: int, rows: int) -> Anchors:
         """Anchors of `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))
-        return self._take(np.tile(np.arange(len(self)), times), np.tile(self.row, times) + shift)
+        many = self.take(np.tile(np.arange(len(self)), times))
+        return replace(many, row=many.row + shift)
 
     def offset(self, position: Array) -> Array:
         """u (N, 3) [m] of all rows: ½ g (d² − ‖x‖²) x, with x from the nearest point to p; −g x where d = 0.
@@ -51,7 +47,3 @@ class Anchors:
         apart = position[self.row] - self.point
         part = np.vecdot(apart, self.axis) * self.along
         return np.asarray(self.whole[:, None] * apart + part[:, None] * self.axis)
-
-    def _take(self, which: Index, row: Index) -> Anchors:
-        columns = (self.point, self.axis, self.whole, self.along, self.distance, self.gain)
-        return Anchors(row, *(column[which] for column in columns))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from agents.arrays import Array, Columns, Index, Mask, norm
@@ -77,7 +78,7 @@ def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> 
                 length = norm(relative)
                 follows = length > 0.0  # false for NaN: a bearing of its own is seen from above, and not scaled
                 bearing = np.where(follows[:, None], relative / np.where(follows, length, 1.0)[:, None], bearing)
-    return replace(links, distance=distance, relative=relative, bearing=bearing)
+    return msgspec.structs.replace(links, distance=distance, relative=relative, bearing=bearing)
 
 
 def _interpolated(old: Array, new: Array, share: Array) -> Array:

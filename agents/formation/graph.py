@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from msgspec.structs import replace
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array, Columns, Index, Mask
 
 BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # kinds of link targets
 
 
-@dataclass(frozen=True)
-class Links:
+class Links(Columns, frozen=True, dict=True):
     """Directed links (E), sorted by receiver.
 
     A link wants a distance, a relative position or a direction; it is stored in each form that follows from it. In a
@@ -56,10 +55,6 @@ class Links:
         """Indices of the links of each sender, by its name among those of all robots."""
         return {names[sender]: np.flatnonzero(self.sender == sender) for sender in np.unique(self.sender)}
 
-    def select(self, which: Index | Mask) -> Links:
-        """Subset of the links, or another order of them."""
-        return Links(*(None if column is None else column[which] for column in self._columns()))  # type: ignore[arg-type]
-
     def max_by_receiver(self, per_link: Array, rows: int) -> Array:
         """Largest value of a quantity (E,) per receiver -> (rows,), 0 without links."""
         most = np.zeros(rows)
@@ -70,7 +65,7 @@ class Links:
     def to_receivers(self, rows: Index) -> Links:
         """Links to these rows; receivers are renumbered 0..len(rows)-1, senders keep their numbers."""
         at, receiver = self.indices_to_receivers(rows)
-        return replace(self.select(at), receiver=receiver)
+        return replace(self.take(at), receiver=receiver)
 
     def indices_to_receivers(self, rows: Index) -> tuple[Index, Index]:
         """Indices of the links to these rows, in the order of `to_receivers`, and new receiver numbers."""
@@ -83,7 +78,7 @@ class Links:
     def repeated(self, times: int, rows: int) -> Links:
         """The same links in `times` copies of an experiment of `rows` robots, one copy behind the other."""
         shift = np.repeat(np.arange(times) * rows, len(self))
-        many = self.select(np.tile(np.arange(len(self)), times))
+        many = self.take(np.tile(np.arange(len(self)), times))
         return replace(many, receiver=many.receiver + shift, sender=many.sender + shift)
 
     def append(self, others: Links) -> Links:
@@ -92,17 +87,13 @@ class Links:
             ours, theirs = self, others
         else:
             ours, theirs = self._with_all_columns(), others._with_all_columns()
-        both = zip(ours._columns(), theirs._columns(), strict=True)
-        return Links(*(None if a is None or b is None else np.concatenate([a, b]) for a, b in both))  # type: ignore[arg-type]
+        return Links.joined([ours, theirs])
 
     def _with_all_columns(self) -> Links:
         if self.wants is not None:
             return self
         blank = np.full((len(self), 3), np.nan)
         return replace(self, relative=blank, bearing=blank, wants=np.full(len(self), BY_DISTANCE))
-
-    def _columns(self) -> tuple[Array | Index | None, ...]:
-        return self.receiver, self.sender, self.distance, self.gain, self.relative, self.bearing, self.wants
 
 
 def links(

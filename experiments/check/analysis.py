@@ -152,7 +152,7 @@ class Analysis:
         if pattern.changes:
             links = changed_targets(links, pattern.changes, np.full(len(links), time[at]))
         there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
-        links = links if there is None else links.select(there[0])
+        links = links if there is None else links.take(there[0])
         offset = self.assignment.law.offset(here, here[links.sender], links)
         offset = offset if anchors is None else offset + anchors.offset(here)
         stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
@@ -166,7 +166,7 @@ class Analysis:
 
     def pair(self, number: int) -> str:
         """A pair of `edges(...)` of the links that stand at the beginning, in words."""
-        first, second = edges(self.asked.select(self.standing))[number]
+        first, second = edges(self.asked.take(self.standing))[number]
         return f"{self.names[first]} - {self.names[second]}"
 
     def link_path(self, number: int) -> Path:
@@ -226,7 +226,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
             )
             stages.append(stage)
         shape = _best(stages[0])
-        here = asked.select(standing)
+        here = asked.take(standing)
         planar, spatial = formation_rigidity(shape.position, here, silent, assignment.anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
             spare = formation_redundancy(shape.position, here, silent)
@@ -274,7 +274,7 @@ def _shapes(  # noqa: PLR0917 - one caller
     silent: Index,
 ) -> list[Shape]:
     """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
-    end, rows, links = prediction.position[-1], len(aloft), wanted.select(there)
+    end, rows, links = prediction.position[-1], len(aloft), wanted.take(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False
     rng = np.random.default_rng(experiment.seed)

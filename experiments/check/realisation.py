@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
@@ -67,7 +68,7 @@ def targets_of_law(law: Law, links: Links) -> Links:
     wants = TAKES.get(getattr(law, "NEEDS", "any"))
     if wants is None or links.wants is None:
         return links
-    return replace(links, wants=None if wants == BY_DISTANCE else np.full(len(links), wants))
+    return msgspec.structs.replace(links, wants=None if wants == BY_DISTANCE else np.full(len(links), wants))
 
 
 def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residuals:

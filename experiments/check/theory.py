@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from agents.arrays import Index, Mask
@@ -117,7 +117,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         yield Claim(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
         return
     off = f"at best, {analysis.link(int(shape.error.argmax()))} is {1e3 * shape.worst:.1f} mm off"
-    rings = contradictions(analysis.asked.select(analysis.standing))
+    rings = contradictions(analysis.asked.take(analysis.standing))
     for ring in rings[:1]:
         names = [analysis.names[row] for row in ring.rows]
         way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
@@ -125,7 +125,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         link = int(np.flatnonzero(analysis.standing)[ring.link])
         remedy = "give offsets of one drawing: those around a ring add up to zero"
         yield Claim(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
-    found = conflicts(analysis.asked.select(_measured(analysis)), np.nan_to_num(analysis.assignment.hover))
+    found = conflicts(analysis.asked.take(_measured(analysis)), np.nan_to_num(analysis.assignment.hover))
     heights = [each for each in found if math.isfinite(each.ceiling)]
     for high in list(dict.fromkeys(each.high for each in heights)):
         lowest = min((each for each in heights if each.high == high), key=lambda each: each.ceiling)
@@ -208,7 +208,7 @@ def presence(analysis: Analysis) -> Iterator[Claim]:
     there = pattern.present(prediction.time, prediction.position)
     if there is None or analysis.parts > 1:
         return
-    apart = np.array([components(pattern.links.select(mask), len(analysis.names)) for mask in _runs(there)])
+    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in _runs(there)])
     begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
     broken = np.flatnonzero(apart > 1)
     count = there.sum(axis=1)
@@ -259,7 +259,7 @@ def strength(analysis: Analysis) -> str:
     law, links = analysis.assignment.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law.offset(place, place[links.sender], links)
-    double = law.offset(place, place[links.sender], replace(links, gain=2.0 * links.gain))
+    double = law.offset(place, place[links.sender], msgspec.structs.replace(links, gain=2.0 * links.gain))
     if analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True):
         return GAIN
     plugin = registry.struct(registry.LAWS, registry.split(analysis.experiment.formation.law)[0])

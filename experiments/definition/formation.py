@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
@@ -50,14 +51,14 @@ class FormationArrays:
         """Some of the links, or the same in another order."""
         changes = tuple(change.select(which) for change in self.changes)
         return FormationArrays(
-            self.links.select(which), changes, None if self.presence is None else self.presence.take(which)
+            self.links.take(which), changes, None if self.presence is None else self.presence.take(which)
         )
 
     def to_receivers(self, rows: Index) -> FormationArrays:
         """Links on which these rows receive, as `Links.of` gives them."""
         at, receiver = self.links.indices_to_receivers(rows)
         mine = self.select(at)
-        return replace(mine, links=replace(mine.links, receiver=receiver))
+        return replace(mine, links=msgspec.structs.replace(mine.links, receiver=receiver))
 
     def without_receivers(self, rows: Index) -> FormationArrays:
         """Links on which other rows than these receive."""

@@ -40,7 +40,7 @@ def virtual_conditions(experiment: Experiment, over: Links, seeds: Sequence[int]
 
     Other messages between the same robots have another `stream`, and their own random numbers.
     """
-    ends = _Ends.of(experiment, over.select(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
+    ends = _Ends.of(experiment, over.take(np.arange(len(over) // len(seeds))), tuple(experiment.robots))
     return Conditions.side_by_side(
         _seeded(_link_conditions(experiment.channel, ends, experiment.duration_s), ends, seeds, stream)
     )

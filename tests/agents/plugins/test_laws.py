@@ -159,8 +159,8 @@ def test_a_law_for_all_does_on_each_link_what_its_own_law_does(seed):
     total, error = np.zeros_like(position), np.zeros(len(net))
     for law, wants in ((Distance(), BY_DISTANCE), (Displacement(), BY_RELATIVE), (Bearing(), BY_BEARING)):
         mine = net.wants == wants
-        total += law.offset(position, heard[mine], net.select(mine))
-        error[mine] = law.error(position, heard[mine], net.select(mine))
+        total += law.offset(position, heard[mine], net.take(mine))
+        error[mine] = law.error(position, heard[mine], net.take(mine))
     np.testing.assert_allclose(Mixed().offset(position, heard, net), total, atol=1e-12)
     np.testing.assert_array_equal(Mixed().error(position, heard, net), error)
 

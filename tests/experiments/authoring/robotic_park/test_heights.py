@@ -55,7 +55,7 @@ def test_what_contradicts_itself_is_measured():
 
 def test_a_shape_that_is_met_at_the_heights_of_the_starts_is_not_folded():
     ring = np.array([(np.cos(a), np.sin(a), 0.7) for a in 2.0 * np.pi * np.arange(6) / 6])
-    found = find_shape(asked(ring).select(np.arange(0, 15, 2)), None, ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
+    found = find_shape(asked(ring).take(np.arange(0, 15, 2)), None, ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
     assert found.worst < ENOUGH
     assert found.position[:, 2] == pytest.approx(0.7)
 
