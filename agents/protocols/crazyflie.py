@@ -15,6 +15,7 @@ from agents.body.interface import BodyError, settings
 from agents.protocols.crazyradio import software
 
 Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
 LogRate = Annotated[float, Meta(ge=5, le=100)]
 Wait = Annotated[float, Meta(gt=0, le=60)]
@@ -81,6 +82,8 @@ class CrazyflieSettings(Part, frozen=True):
     link: Literal["udp", "radio"] = "udp"  # for the twin only: `radio` puts a software Crazyradio between
     # for the twin only: files of cflib's cache with the parameters and the log variables that it lists; empty: built in
     tables: list[str] = []
+    # for the twin only: gaps of its radio, begin after the take-off and duration [s]
+    gaps: list[tuple[NotNegative, Positive]] = []
     connect_s: Wait = 60.0  # [s] limit for connecting, from its turn on its radio
     converge_s: Wait = 10.0  # [s] limit for the position estimate to settle
 

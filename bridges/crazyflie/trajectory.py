@@ -109,18 +109,19 @@ class Trajectories:
 
     def note_answer(self, address: int, status: int) -> None:
         """Answer of the drone about a part that was written."""
-        if self._sent is not None and self._sent[0] == address:
+        sent = self._sent
+        if sent is not None and sent[0] == address:
             if status == 0:
-                self._written[address] = self._sent[1]
+                self._written[address] = sent[1]
             self._sent = None
 
     def hold(self, target: Target, seconds: float) -> int:
         """Write the next part of a setpoint that is held for some seconds, or start it when all of it is confirmed.
 
-        A setpoint that has been begun is started before another one is written. Returns the number of packets that it
-        has taken if it was started, else 0.
+        A setpoint that has been begun is started before another one is written, unless it has become old in a gap.
+        Returns the number of packets that it has taken if it was started, else 0.
         """
-        if self._upcoming is None:
+        if self._upcoming is None or time.monotonic() - self._sent_at > START_EXPIRY_S:
             short = _fits(target)
             data = compressed(target, seconds) if short else polynomials(target, seconds)
             one, other = COMPRESSED if short else POLYNOMIALS

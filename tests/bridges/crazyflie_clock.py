@@ -17,6 +17,7 @@ from agents.protocols.crazyflie import chosen
 from agents.protocols.crtp import HighLevel, Log, Port
 from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.flight import Flight, Phase
+from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOOP_HZ
 from bridges.crazyflie.telemetry import Board, Telemetry
 from tests.twins.loopback import request
@@ -83,7 +84,7 @@ class Drone:
         fleet.twin.lines[row].queue.clear()  # answers
         self.trajectories._send = self._send
         self.flight.link = self
-        self.error, self.busy = None, False
+        self.error, self._received = None, fleet.now
         self.cf = self.commander = self.high_level_commander = self
         self.thread = Thread(fleet.now + fleet.random.random() / LOOP_HZ, self._control)
 
@@ -96,6 +97,10 @@ class Drone:
         self._send_at_once(Port.LOG, 1, bytes((Log.START, number, round(100.0 / rate_hz))))
         self._blocks[number] = list(variables), [PACKINGS[kind] for kind in kinds], logged
 
+    @property
+    def busy(self):
+        return self._fleet.now - self._received > BUSY_S
+
     def planner_reply(self, command):
         return self._replies.get(command, (0, 0))
 
@@ -107,6 +112,7 @@ class Drone:
 
     def receive(self, packet):
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
+        self._received = self._fleet.now
         if (port, channel) == (Port.LOG, 2):
             names, packings, logged = self._blocks[data[0]]
             values, at = {}, 4
@@ -213,11 +219,14 @@ class Fleet:
     def _exchange(self, row):
         line, drone = self.twin.lines[row], self.drones[row]
         line.t = self.now - self._begin
-        _, answer, packet = line.exchange(drone.out.popleft() if drone.out else NULL, 3)
+        _, answer, packet = line.exchange(drone.out[0] if drone.out else NULL, 3)
+        if not answer:
+            return  # the driver repeats the packet
+        if drone.out:
+            drone.out.popleft()
         if packet is not None:
             self.twin._deliver(row, packet)
-        if answer[0] & 0xF3 != 0xF3:
-            drone.receive(answer)
+        drone.receive(answer)
 
 
 def flight_of(fleet):

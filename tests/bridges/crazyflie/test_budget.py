@@ -51,3 +51,16 @@ def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
         assert fleet.phases == {Phase.GROUND}
         assert line.dropped == 0
         assert not fleet.twin.flock.quadrotor.flying.any()
+
+
+def test_gaps_after_the_take_off(monkeypatch):
+    """Of the file: the first is flown through, the second ends in a landing."""
+    with Fleet(monkeypatch, 2, 400.0, gaps=[[4.0, 1.2], [2.0, 0.5]]) as fleet:
+        fleet.run(1.0)
+        fleet.order(lambda flight: flight.takeoff(HEIGHT))
+        gaps = []
+        for _ in range(700):
+            fleet.run(0.01, speed=0.1)
+            gaps.append([fleet.now - line.heard - 100.0 for line in fleet.twin.lines])
+        assert np.max(gaps[:400], axis=0) == pytest.approx(0.5, abs=0.02)
+        assert np.max(gaps, axis=0) == pytest.approx(1.2, abs=0.02)

@@ -345,7 +345,7 @@ def test_a_radio_that_carries_too_little_is_refused(monkeypatch):
     monkeypatch.setattr(body, "MEASURING_S", 0.5)
     device = RADIO | {"log_hz": 50.0, "stream_hz": 100.0, "positioning": {"system": "external", "rate_hz": 100.0}}
     with (
-        pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 710 packets/s.*write log_hz = .*stream_hz"),
+        pytest.raises(RuntimeError, match=r"radio 0: 2 robots ask for 700 packets/s.*write log_hz = .*stream_hz"),
         flown(rows=2, device=device, external=True, exchanges_hz=300.0),
     ):
         pass

@@ -132,6 +132,16 @@ def test_the_trajectory_that_is_flown_is_never_written(board, yaw, numbers, leas
     assert board.hold(0.4, yaw) == 1, "the one before is still there"
 
 
+def test_a_setpoint_of_before_a_gap_is_not_started(board):
+    board.lost = 1
+    assert board.client.hold((3.0, 2.0, 0.5, 0.0), HOLD_S) == 0
+    board.now += START_EXPIRY_S + 0.1
+    board.client.note_answer(0, 0)
+    board.hold(1.0)
+    assert board.flown(DT)[0] == pytest.approx([1.0, 2.0, 0.5, 0.0])
+    assert len(board.started) == 1
+
+
 def test_setpoints_of_an_earlier_flight_are_not_started(board):
     board.lost = 1
     assert board.client.hold((3.0, 3.0, 1.0, 0.0), HOLD_S) == 0

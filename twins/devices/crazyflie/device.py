@@ -40,21 +40,29 @@ class LossyLink:
         self.peer: Peer | None = None  # client; None before the first packet
         self.t = 0.0  # current time [s]
         self.faults, self._random = request.faults, random
+        self._gap = (np.inf, -np.inf)  # begin and end of an outage [s]
         self._waiting: deque[tuple[float, bytes]] = deque()
 
     @property
     def connected(self) -> bool:
         """Whether the firmware counts its link as connected; without polls of a radio: whether it could be polled."""
-        return not (self.faults.silent(self.t) and self.faults.silent(self.t - crazyradio.ACTIVITY_S))
+        return not (self._silent(self.t) and self._silent(self.t - crazyradio.ACTIVITY_S))
 
     @property
     def address(self) -> str:
         return f"udp://{HOST}:{self.socket.getsockname()[1]}"
 
+    def silence(self, seconds: float) -> None:
+        """Begin an outage: nothing is received in either direction."""
+        self._gap = self.t, self.t + seconds
+
     def lost(self) -> bool:
         """Whether the current packet is lost."""
-        faults = self.faults
-        return faults.silent(self.t) or (faults.loss > 0.0 and self._random.random() < faults.loss)
+        loss = self.faults.loss
+        return self._silent(self.t) or (loss > 0.0 and self._random.random() < loss)
+
+    def _silent(self, t: float) -> bool:
+        return self.faults.silent(t) or self._gap[0] <= t < self._gap[1]
 
     def send(self, port: Port, channel: int, data: bytes) -> None:
         """Send a packet to the client, if there is one."""
@@ -117,6 +125,8 @@ class CrazyflieTwin:
         self.lines = self._open_links(request)
         self.drones = [Drone(self.flock, row, line.send) for row, line in enumerate(self.lines)]
         self.addresses = tuple(line.address for line in self.lines)
+        self._gaps = [sorted(gaps) for gaps in self.flock.gaps]  # that have not begun
+        self._took_off = np.full(len(self.lines), np.inf)  # [s] first time of each
 
     def _open_links(self, request: DeviceRequest) -> Sequence[LossyLink | RadioLink]:
         random = [np.random.default_rng([seed, row]) for row, seed in enumerate(request.body.seeds)]
@@ -153,8 +163,12 @@ class CrazyflieTwin:
 
     def advance(self, t: float) -> None:
         locked = self.flock.advance(t)
+        self._took_off[self.flock.quadrotor.flying & (self._took_off > t)] = t
         for line, drone in zip(self.lines, self.drones, strict=True):
             line.t = t
+            gaps = self._gaps[drone.row]
+            if gaps and t - self._took_off[drone.row] >= gaps[0][0]:
+                line.silence(gaps.pop(0)[1])
             if locked[drone.row]:
                 drone.console("SUP: Locked, reboot required\n")
             if not line.connected:

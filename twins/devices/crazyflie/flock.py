@@ -106,6 +106,7 @@ class Flock:
         self._flow = ~(outside | np.array(self.lighthouse) | np.array(self.loco))
         self.flow = self._flow.tolist()
         self.tables = [tuple(each.tables) for each in settings]
+        self.gaps = [each.gaps for each in settings]
         self._faults, self._fault_tumbled = faults, False
         by_hand = [faults.refuse_arming or each.platform == "brushless" for each in settings]
         self.refuse_arming = faults.refuse_arming
