@@ -145,3 +145,9 @@ def main() -> None:
     except _explained() as error:
         _report(str(error), problems=getattr(error, "problems", None))
         sys.exit(2)
+    except Exception as error:
+        registry = sys.modules.get("agents.plugins.registry")  # not loaded: no plug-in is
+        if registry is None or (place := registry.culprit(error)) is None:
+            raise
+        _report(f"{place}: {type(error).__name__}: {error}")
+        sys.exit(2)

@@ -169,7 +169,7 @@ class GoalComputer:
         try:
             offset = law.offset(position, believed, neighbours.links)
         except FAILURES as error:
-            raise PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}") from error
+            raise _failed(law, error) from error
         if np.shape(offset) != position.shape:
             raise PluginError(_wrong_shape(law, "offset", "a vector for each robot", position.shape, offset))
         return offset if anchors is None else offset + anchors.offset(position)
@@ -178,11 +178,14 @@ class GoalComputer:
         """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them.
 
         Raises:
-            PluginError: If the law gives something else than one error for each link.
+            PluginError: If the law fails, or gives something else than one error for each link.
         """
         law, neighbours = self._assignment.law, self.neighbours
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        error = law.error(position, believed, neighbours.links)
+        try:
+            error = law.error(position, believed, neighbours.links)
+        except FAILURES as failure:
+            raise _failed(law, failure) from failure
         if np.shape(error) != neighbours.links.receiver.shape:
             raise PluginError(
                 _wrong_shape(law, "error", "one value for each link", neighbours.links.receiver.shape, error)
@@ -242,6 +245,10 @@ def _error_and_energy(error: Array) -> Array:
     both = np.empty((len(error), 2))  # `stack` takes three times as long
     both[:, 0], both[:, 1] = error, 0.5 * error * error
     return both
+
+
+def _failed(law: laws.Law, error: Exception) -> PluginError:
+    return PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}")
 
 
 def _wrong_shape(law: laws.Law, method: str, wanted: str, shape: tuple[int, ...], given: Array) -> str:

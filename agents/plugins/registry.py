@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from traceback import walk_tb
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -23,6 +24,7 @@ PREDICTORS: Final = "zenpark.predictors"
 PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
+STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
 
@@ -77,6 +79,18 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
         raise PluginError(f"{_origin(entry)} fails to import: {type(error).__name__}: {error}") from error
 
 
+def unusable(use: Callable[[str, str], object]) -> list[str]:
+    """Why registered plug-ins with parameters cannot be used: a line for each that `use(group, name)` refuses."""
+    lines = []
+    for group in STRUCTS:
+        for name in names(group):
+            try:
+                use(group, name)
+            except PluginError as error:
+                lines.append(f"left out: {' '.join(str(error).split())}; mend or uninstall it (docs/plugins.md)")
+    return lines
+
+
 def struct(group: str, name: str) -> type[msgspec.Struct]:
     """The struct of parameters registered under a name.
 
@@ -127,6 +141,20 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     return kind, {key: value for key, value in choice.items() if key != "kind"}
 
 
+def culprit(error: BaseException) -> str | None:
+    """The line of another distribution's plug-in in which an error came about; None if there is none."""
+    owners = {
+        entry.module: entry.dist.name
+        for group in (BODIES, DEVICES, *STRUCTS)
+        for entry in _installed().select(group=group)
+        if entry.dist is not None and entry.dist.name != "zenpark"
+    }
+    for frame, line in reversed(list(walk_tb(error.__traceback__))):
+        if (module := frame.f_globals.get("__name__")) in owners:
+            return f"plug-in {module} of {owners[module]} failed at {frame.f_code.co_filename}:{line}"
+    return None
+
+
 def body_name(address: str) -> str:
     """Name of the body in an address: `"radio"` of `"radio://0/80/2M"`, `"twin"` of `"twin"`."""
     return address.partition("://")[0]
@@ -134,8 +162,7 @@ def body_name(address: str) -> str:
 
 def distributions(text: str | None = None) -> dict[str, str]:
     """Installed distributions with plug-ins, and their versions, but for our own; those that a text names, if given."""
-    groups = (BODIES, DEVICES, TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)
-    entries = [entry for group in groups for entry in _installed().select(group=group)]
+    entries = [entry for group in (BODIES, DEVICES, *STRUCTS) for entry in _installed().select(group=group)]
     if text is not None:
         words = {*re.findall(r"[\w.-]+", text)}
         entries = [entry for entry in entries if entry.name in words]
@@ -169,5 +196,6 @@ def _origin(entry: EntryPoint) -> str:
 FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
 # Exceptions from the import of a foreign module.
 _IMPORT_FAILURES: Final = (
-    ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError
+    ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError,
+    ArithmeticError, AssertionError,
 )  # fmt: skip

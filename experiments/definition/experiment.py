@@ -71,7 +71,7 @@ class Rates(Part, frozen=True):
 class Robot(Part, frozen=True):
     """Robot: kind, start, body and settings."""
 
-    kind: Annotated[str, Meta(description="crazyflie, tello, khepera4 or turtlebot3")]
+    kind: Annotated[str, Meta(description="its size, speed and setpoint: `./zenpark explain crazyflie`")]
     start: Annotated[list[float], Meta(min_length=2, max_length=3, description="x, y [m] and, if wanted, yaw [rad]")]
     body: Annotated[
         str, Meta(description="twin (in its own process), world (in the twin service), or the address of the real one")

@@ -29,7 +29,7 @@ _CASE: Final = "InCase"
 
 
 def schema() -> dict[str, Any]:
-    """The schema, with every plug-in that is installed."""
+    """The schema, with every plug-in that is installed and can be used; `unusable` names the others."""
     _, definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
     definitions = {name: _draft7(each) for name, each in definitions.items()}
     for owner, path in _OWNERS.items():
@@ -54,6 +54,11 @@ def schema() -> dict[str, Any]:
     return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
 
 
+def unusable() -> list[str]:
+    """Plug-ins that the schema leaves out: a line for each, with the reason and the remedy."""
+    return registry.unusable(_parameters)
+
+
 def write_schema(path: File) -> None:
     path.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=2) + b"\n")
 
@@ -62,9 +67,10 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
     """A plug-in by name, if it needs no parameters, or as a table with its `kind`."""
     bare, tables = [], []
     for name in registry.names(group):
-        (reference,), parts = msgspec.json.schema_components(
-            [registry.struct(group, name)], ref_template="#/definitions/{name}"
-        )
+        try:
+            reference, parts = _parameters(group, name)
+        except registry.PluginError:
+            continue
         own = parts.pop(reference["$ref"].rpartition("/")[2])
         definitions.update({part: _draft7(each) for part, each in parts.items()})
         own = _draft7(own)
@@ -74,6 +80,21 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
         own["required"] = ["kind", *own.get("required", [])]
         tables.append(own)
     return {"anyOf": ([{"enum": bare}] if bare else []) + tables}
+
+
+def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Reference to the parameters of a plug-in, and the definitions that they need.
+
+    Raises:
+        PluginError: If the plug-in cannot be used, or no file can have a parameter of the type.
+    """
+    chosen = registry.struct(group, name)
+    try:
+        (reference,), parts = msgspec.json.schema_components([chosen], ref_template="#/definitions/{name}")
+    except (TypeError, NameError) as error:
+        why = str(error).splitlines()[-1]  # before it are remedies for programs
+        raise registry.PluginError(f"plug-in {name!r} ({chosen.__module__}:{chosen.__name__}): {why}") from error
+    return reference, parts
 
 
 def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:

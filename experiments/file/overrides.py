@@ -176,7 +176,10 @@ def _needed_target(law: object) -> str:
     name = law.get("kind") if isinstance(law, Mapping) else law
     if not isinstance(name, str) or name not in registry.names(registry.LAWS):
         return "any"
-    return str(getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"))
+    try:
+        return str(getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"))
+    except registry.PluginError:  # said with its place where the law is read
+        return "any"
 
 
 def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:

@@ -280,13 +280,20 @@ def explain(
     as_json: AsJson = False,
 ) -> int:
     """Explain a key of the experiment file, a plug-in or a kind of robot: text, unit, default, limits, an example."""
-    from agents.plugins.registry import did_you_mean
-    from experiments.file import reference
+    import difflib
+
+    from experiments.file import json_schema, reference
 
     found = reference.matching(key) if key else reference.tables()
+    warn(json_schema.unusable())
     if not found:
-        hint = did_you_mean(key, reference.nearest(key)).replace("known", "the nearest")
-        print(f"zenpark: nothing in the experiment file is named {key!r}; {hint}", file=sys.stderr)
+        nearest, about = reference.nearest(key), reference.about(key)
+        near = difflib.get_close_matches(key, nearest, 1, 0.75 if about else 0.6)
+        hint = f"did you mean {near[0]!r}?" if near else f"the nearest: {', '.join(nearest)}"
+        listed = () if near else about
+        warn([f"nothing in the experiment file is named {key!r}; {'keys about it:' if listed else hint}"])
+        for entry in listed:
+            print(textwrap.shorten(f"  {entry.key}  {entry.text}", WIDEST, placeholder=" ..."), file=sys.stderr)
         return 2
     if as_json:
         print_json(found)
@@ -342,9 +349,10 @@ def new(
 ) -> None:
     """Begin an experiment file from a ready-made one, or with a formation of any size."""
     from experiments.authoring.generate import LayoutOptions, generate
-    from experiments.file import catalogue
+    from experiments.file import catalogue, json_schema
 
     asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere}
+    warn(json_schema.unusable())
     formations = [(what, str(size)) for what, size in asked.items() if size is not None]
     if not formations:
         if name is None:
@@ -420,4 +428,5 @@ def schema() -> None:
 
     from experiments.file import json_schema
 
+    warn(json_schema.unusable())
     print(json.dumps(json_schema.schema(), indent=2))

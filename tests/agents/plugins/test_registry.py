@@ -147,3 +147,28 @@ def test_two_of_one_name_are_refused_not_chosen_from(foreign):
 def test_a_plugin_that_can_be_changed_is_refused(foreign):
     with pytest.raises(registry.PluginError, match=r"Keeper.* can be changed.* frozen=True"):
         registry.build(foreign, "keeper")
+
+
+def test_plugins_that_cannot_be_used_are_named_with_reason_and_remedy(foreign, monkeypatch):
+    monkeypatch.setattr(registry, "STRUCTS", (foreign,))
+    lines = registry.unusable(registry.struct)
+    assert [line.partition(" (")[0] for line in lines] == [
+        f"left out: plug-in '{name}'" for name in ("function", "gone", "keeper", "misnamed")
+    ] + ["left out: 'twice' among the test is ambiguous: plug-in 'twice'"]
+    assert all(line.endswith("; mend or uninstall it (docs/plugins.md)") for line in lines)
+
+
+def failing():
+    raise LookupError("of the plug-in")
+
+
+def test_an_error_in_a_plugin_of_another_distribution_has_its_line(monkeypatch):
+    entry = SimpleNamespace(module=__name__, dist=SimpleNamespace(name="theirs"))
+    monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: [entry]))
+    with pytest.raises(LookupError) as caught:
+        failing()
+    place = registry.culprit(caught.value)
+    assert place is not None
+    assert place.startswith(f"plug-in {__name__} of theirs failed at {__file__}:")
+    entry.dist.name = "zenpark"
+    assert registry.culprit(caught.value) is None

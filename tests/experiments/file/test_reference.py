@@ -1,12 +1,15 @@
 """Reference of the experiment file: every key has a type and an example that is TOML and holds the key."""
 
 import tomllib
+from importlib.metadata import EntryPoint
 
 import pytest
 from typer.testing import CliRunner
 
 from agents.plugins import registry
 from experiments.file import reference
+from experiments.file.document import loads
+from experiments.file.problems import DocumentError
 from tools.main import app
 
 
@@ -103,3 +106,59 @@ def test_an_unknown_key_is_wrong_input():
     said = CliRunner().invoke(app, ["explain", "saftey"])
     assert said.exit_code == 2
     assert "did you mean 'safety'?" in said.output
+
+
+@pytest.mark.parametrize(
+    ("word", "key"),
+    [
+        ("battery", "safety.battery_low"),
+        ("noise", "disturbance.KIND.position_sigma"),
+        ("obstacle", "arena.obstacles"),
+        ("consensus", "formation.law(displacement)"),
+        ("latency", "channel.delay_s"),
+        ("camera", "positioning"),
+        ("crash", "safety.separation"),
+        ("wind", "disturbance.KIND.hover_jitter"),
+    ],
+)
+def test_a_word_that_is_no_key_finds_the_keys_about_it(word, key):
+    assert key in [entry.key for entry in reference.about(word)]
+    said = CliRunner().invoke(app, ["explain", word])
+    assert said.exit_code == 2
+    assert f"nothing in the experiment file is named '{word}'; keys about it:" in said.output
+    assert f"\n{key} " in said.output
+
+
+@pytest.fixture
+def broken(monkeypatch):
+    """A registered law without its module."""
+    entry, listed = EntryPoint("broken", "no_such_module_anywhere:Law", registry.LAWS), registry._registered
+
+    def with_it(group):
+        return {**listed(group), "broken": [entry]} if group == registry.LAWS else listed(group)
+
+    monkeypatch.setattr(registry, "_registered", with_it)
+    reference.entries.cache_clear()
+    yield
+    reference.entries.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "words", [["explain", "formation.law"], ["schema"], ["new", "triangle", "mine.toml"]], ids=lambda words: words[0]
+)
+def test_a_plug_in_that_fails_to_import_stops_no_command_that_can_do_without(broken, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = CliRunner().invoke(app, words)
+    assert said.exit_code == 0
+    assert "left out: plug-in 'broken' (no_such_module_anywhere:Law)" in said.stderr
+    assert said.stderr.count("\n") == 1
+    assert "broken" not in said.stdout
+
+
+def test_a_file_that_uses_such_a_plug_in_is_refused_with_place_and_reason(broken):
+    with pytest.raises(DocumentError) as caught:
+        loads('title = "A"\nduration_s = 5.0\n[robots.A]\nkind = "khepera4"\nstart = [0.0, 0.0]\n'
+              '[formation]\nlaw = "broken"\n')  # fmt: skip
+    (problem,) = caught.value.problems
+    assert problem.line == 7
+    assert "fails to import: ModuleNotFoundError" in problem.message
