@@ -9,6 +9,7 @@ import ast
 import inspect
 import re
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 NOTEBOOKS: Final = ("experiments.run",)
 PLUGINS: Final = (
     "agents.arrays",
+    "agents.formation.graph",
     "agents.plugins.laws",
     "agents.plugins.triggers",
     "agents.plugins.predictors",
@@ -180,17 +182,20 @@ def network() -> Iterator[str]:
     yield from _structs(messages)
 
 
-def _structs(module: ModuleType) -> Iterator[str]:
-    """Structs of a module as tables; the text of a field is the comment at the field, or right above it."""
+def _structs(module: ModuleType, level: int = 2, *, parameters: bool = True) -> Iterator[str]:
+    """Structs of a module as tables below headings of a level; the text of a field is the comment at it, or above it.
+
+    Those of `parameters` alone, which the reference of the experiment file has, are left out on request.
+    """
     source = inspect.getsource(module)
     lines = source.splitlines()
     for node in ast.parse(source).body:
         if not isinstance(node, ast.ClassDef) or node.name.startswith("_"):
             continue
         fields = [each for each in node.body if isinstance(each, ast.AnnAssign)]
-        if not fields:
+        if not (fields if parameters else [each for each in fields if _comment(each, lines)]):
             continue
-        yield f"\n## {node.name}\n"
+        yield f"\n{'#' * level} {'' if parameters else 'Fields of '}{node.name}\n"
         yield f"{ast.get_docstring(node) or ''}\n"
         yield from ("| field | type | meaning |", "|---|---|---|")
         for each in fields:
@@ -216,7 +221,10 @@ def api() -> Iterator[str]:
     yield from (f"::: {module}\n" for module in NOTEBOOKS)
     yield "## Plug-ins\n"
     yield "How to write one: [Plug-ins](../plugins.md).\n"
-    yield from (f"::: {module}\n" for module in PLUGINS)
+    for module in PLUGINS:
+        yield f"::: {module}\n"
+        yield from _structs(import_module(module), 3, parameters=False)
+        yield ""
 
 
 PAGES: Final[dict[str, Callable[[], Iterator[str]]]] = {

@@ -1,5 +1,6 @@
 """The documentation site: builds without a warning, has every page, and its reference has every key."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -9,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from agents.body.interface import BodyRequest, BodyState
+from agents.formation.graph import Links
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
@@ -69,4 +72,6 @@ def test_the_reference_has_every_key_command_topic_and_column(site):
     pages = {page.stem: text(page) for page in (site / "reference").glob("*.html")}
     assert not [name for name, words in pages.items() if "&lt;" in words or "None \\|" in words or "\\| None" in words]
     assert "park/CF01/pose" in text(site / "reference" / "network.html")
-    assert "simulate" in text(site / "reference" / "api.html")
+    api = text(site / "reference" / "api.html")
+    fields = [each.name for made in (BodyRequest, BodyState) for each in dataclasses.fields(made)]
+    assert not {"simulate", *Links.__annotations__, *fields} - set(api.split())
