@@ -5,7 +5,7 @@ import pytest
 
 from experiments.authoring.generate import LayoutOptions, experiment_file, generate, layout
 from experiments.authoring.layouts import LayoutError
-from experiments.check.check import check, figures
+from experiments.check.check import check, examine
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -34,8 +34,9 @@ def written(tmp_path, what, size, wanted=None):
 )
 def test_files_pass_the_check_without_a_word(tmp_path, what, size, kind):
     read = written(tmp_path, what, size, LayoutOptions(kind=kind))
-    assert [found for found in check(read) if found.severity != "note"] == []
-    numbers = figures(read.experiment)
+    found, figures = examine(read)
+    assert [each for each in found if each.severity != "note"] == []
+    (numbers,) = figures.values()
     assert numbers.residual_mm < 0.3
     assert 0.3 < numbers.loop_gain < 1.1
     if (what, size) == ("hemisphere", "40"):  # nothing is needed

@@ -99,6 +99,7 @@ def test_what_can_be_pushed_is_pushed_if_the_engine_can(said):
     assert "not-pushed" not in said('[world]\nengine = "pymunk"\n', crate)
 
 
+@pytest.mark.usefixtures("unflown")
 def test_a_robot_in_a_wall_is_an_error_where_walls_are_touched(said):
     near = ROBOTS.replace("[-1.5, 0.0]", "[-1.95, 0.0]")
     found = said('[world]\nengine = "pymunk"\n', robots=near)["start-overlap"]
@@ -108,6 +109,7 @@ def test_a_robot_in_a_wall_is_an_error_where_walls_are_touched(said):
     assert "start-overlap" not in said('[world]\nengine = "pymunk"\n', "[arena]\nwalls = false\n", robots=near)
 
 
+@pytest.mark.usefixtures("unflown")
 def test_who_has_no_range_sensors_is_told_what_it_cannot_avoid(said):
     found = said(AVOIDS, POST)["sees-nothing"]
     assert found.message == "CF01 has no range sensors: it cannot avoid 'post'"
@@ -116,6 +118,7 @@ def test_who_has_no_range_sensors_is_told_what_it_cannot_avoid(said):
     assert "sees-nothing" not in said(AVOIDS, POST, robots=ROBOTS.replace("hover", 'sensors = ["multiranger"]\nhover'))
 
 
+@pytest.mark.usefixtures("unflown")
 def test_who_hears_nobody_either_avoids_nothing(said):
     blind = ROBOTS.replace('kind = "khepera4"', 'kind = "khepera4"\nsensors = []')
     found = said(AVOIDS, robots=blind)["sees-nothing"]
@@ -124,11 +127,13 @@ def test_who_hears_nobody_either_avoids_nothing(said):
     assert "sees-nothing" not in said(AVOIDS, 'hears = "all"\n', robots=blind)
 
 
+@pytest.mark.usefixtures("unflown")
 def test_links_of_avoidance_are_none_of_the_formation(said):
     found = said(AVOIDS, 'hears = "all"\n')
     assert found["connected"].message == "the network is whole; every robot is reached by KH01"
 
 
+@pytest.mark.usefixtures("unflown")
 def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_clear(said):
     more = ROBOTS + '[robots.A]\nkind = "khepera4"\nstart = [-1.0, -1.0]\n[robots.B]\nkind = "khepera4"\n'
     more = more.replace('CF01" = 1.0\n', 'CF01" = 1.0\n"A > B" = 0.5\n') + "start = [-1.0, -1.5]\n"
@@ -136,6 +141,7 @@ def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_c
     assert said(AVOIDS, robots=more)["parts"].severity == "note"
 
 
+@pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize(
     ("robot", "code", "part"),
     [
@@ -153,12 +159,14 @@ def test_worlds_and_shadows_that_make_no_sense(said, robot, code, part):
     assert part in found.message
 
 
+@pytest.mark.usefixtures("unflown")
 def test_worlds_and_shadows_that_make_sense(said):
     real = ROBOTS.replace('kind = "khepera4"\n', 'kind = "khepera4"\nbody = "khepera4-twin"\nshadow = {}\n')
     found = said(LOW, robots=real.replace("shadow", 'ranges = "world"\nshadow'))
     assert not {"ranges-twice", "ranges-of-nothing", "shadow-of-twin"} & found.keys()
 
 
+@pytest.mark.usefixtures("unflown")
 def test_the_summary_names_the_obstacles(tmp_path, capsys):
     file = tmp_path / "one.toml"
     cart = '[arena.obstacles.cart]\nbox = [0.2, 0.3]\nat = [0.5, 1.0]\nplan = "hold"\n'
