@@ -173,8 +173,8 @@ def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Ma
         out, _ = flight.communicate(timeout=60)
     finally:
         lab["lab3"].plug_in_again()
-    assert flight.returncode == 0, out
-    assert "lost CF01: its process ended" in out
+    assert flight.returncode == 1, out
+    assert re.search(r"Failed in event: CF01 at \d+\.\d s: was lost: its process ended", out), out
     assert "done (finished)" in said(folder / "logs", "KH01")
     until(lambda: not busy(lab), "nothing is left")
 
@@ -189,7 +189,7 @@ def test_a_robot_that_dies_on_a_machine_is_started_again_there(lab: Machines, tm
     (first,) = (each for each in lab["lab1"].processes() if "KH01" in each.cmdline())
     first.kill()
     out, _ = flight.communicate(timeout=90)
-    assert flight.returncode == 0, out
+    assert flight.returncode == 1, out  # it was away for a part of the run
     for each in ("lost KH01: its process ended", "restart KH01: asked by on_loss", "changed KH01: takes part again"):
         assert each in out, out
     assert said(folder / "logs", "KH01").count("done (finished)") == 1
