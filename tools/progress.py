@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 0.25
 LINE_S: Final = 5.0
-MARKS: Final = {"good": "✓", "fair": "!", "bad": "✗", "plain": "·"}
 QUIET: Final = ("robot",)  # kinds of events that the table shows better
 
 
@@ -184,5 +183,7 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def print_findings(findings: Sequence[Finding]) -> None:
     """Print the verdict of a page, a line for each finding."""
+    from experiments.report.page import MARKS
+
     for finding in findings:
         print(f"{MARKS[finding.mark]} {finding.text}")

@@ -21,6 +21,14 @@ CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: t
 FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
 
 
+def instants(since: float, until: float, step: float) -> list[float]:
+    """Times [s] of the steps that lead from `since` to `until`."""
+    steps = round((until - since) / step)
+    if steps * step > CATCH_UP_S:
+        steps = 1
+    return [until - left * step for left in range(steps - 1, -1, -1)]
+
+
 class TwinBody:
     """Simulated robots of any kinds; implements `agents.body.interface.Body`. Advances to the time of each `read`."""
 
@@ -71,13 +79,11 @@ class TwinBody:
         """See `Body.open`."""
 
     def read(self, t: float) -> BodyState:
-        steps = round((t - self._t) / self._dt)
-        if steps * self._dt > CATCH_UP_S:
-            steps = 1
-        for k in range(steps):
-            self._advance(t - (steps - 1 - k) * self._dt)
+        steps = instants(self._t, t, self._dt)
+        for now in steps:
+            self._advance(now)
         self._t = t
-        if steps > 0:
+        if steps:
             self._state = self._measure()
         return self._state
 

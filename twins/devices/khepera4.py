@@ -18,7 +18,7 @@ from agents.arrays import Array
 from agents.body.interface import BodyError, settings
 from agents.body.kinds import KHEPERA4
 from agents.protocols import khepera4 as protocol
-from twins.body import CATCH_UP_S
+from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
@@ -327,13 +327,10 @@ class KheperaDevice:
                 server.serve(ready, t)
 
     def advance(self, t: float) -> None:
-        steps = round((t - self._t) / self._dt)
-        if steps * self._dt > CATCH_UP_S:
-            steps = 1
-        for step in range(steps):
+        for now in instants(self._t, t, self._dt):
             self._step()
             for server in self._servers:
-                server.advance(t - (steps - 1 - step) * self._dt)
+                server.advance(now)
         self._t = t
         for server in self._servers:
             if not self._faults.silent(t):

@@ -18,7 +18,7 @@ from agents.arrays import Array
 from agents.body.interface import BodyError, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
-from twins.body import CATCH_UP_S, FULL_WOBBLE
+from twins.body import FULL_WOBBLE, instants
 from twins.devices.device import DeviceRequest, Faults
 from twins.models.disturbance import HoverJitter, Latency
 from twins.models.noise import Noise
@@ -177,10 +177,7 @@ class TelloDevice:
                     self._receive(row, packet, sender, t)
 
     def advance(self, t: float) -> None:
-        steps = round((t - self._t) / self._dt)
-        if steps * self._dt > CATCH_UP_S:
-            steps = 1
-        for _ in range(steps):
+        for _ in instants(self._t, t, self._dt):
             self._step(t)
         self._t = t
         for row, drone in enumerate(self._drones):

@@ -25,12 +25,12 @@ from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
+from twins.body import instants
 from twins.devices.device import Device, DeviceRequest, Faults
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
 from twins.models.noise import Noise
 
-CATCH_UP_S: Final = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
 JOIN_S: Final = 5.0  # deadline of the router's answer
 
 Surroundings = Callable[[Array, float, Array], Array]
@@ -129,13 +129,11 @@ class TurtleBot3Twin:
         """Never called."""
 
     def advance(self, t: float) -> None:
-        steps = round((t - self._t) / self._dt)
-        if steps * self._dt > CATCH_UP_S:
-            steps = 1
+        steps = instants(self._t, t, self._dt)
         self._t = t
         silent = self._faults.silent(t)
         self._receive_commands(t, silent)
-        for _ in range(steps):
+        for _ in steps:
             self._model.command(self._twist)  # repeated: this robot has no timeout, unlike the model
             before = self._model.position[:, :2].copy()
             self._model.advance()

@@ -12,7 +12,7 @@ from agents.body.interface import BodyRequest
 from agents.body.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
-from twins.body import CATCH_UP_S, FULL_WOBBLE
+from twins.body import FULL_WOBBLE, instants
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import Plan, Planner
@@ -200,12 +200,9 @@ class Flock:
 
     def advance(self, t: float) -> Mask:
         """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked or crashed on the way."""
-        steps = max(1, round((t - self.t) / self.dt))
-        if steps * self.dt > CATCH_UP_S:
-            steps = 1
         locked = np.zeros(len(self.charge), dtype=bool)
-        for left in range(steps - 1, -1, -1):
-            locked |= self._step(t - left * self.dt)
+        for now in instants(self.t, t, self.dt) or [t]:
+            locked |= self._step(now)
         return locked
 
     def _step(self, t: float) -> Mask:
