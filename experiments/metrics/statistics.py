@@ -27,11 +27,14 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
     """
     if index in SUMS and not same_length([*runs, *reference]):
         return [None] * len(runs)
-    if sorted(run.seed for run in runs) == sorted(run.seed for run in reference):
-        of_seed = {run.seed: run.mean[index] for run in reference}
-        return [ratio(run.mean[index], of_seed[run.seed]) for run in runs]
-    mean = spread([run.mean[index] for run in reference]).mean
-    return [ratio(run.mean[index], mean) for run in runs]
+    return ratios_by_seed(*({run.seed: run.mean[index] for run in each} for each in (runs, reference)))
+
+
+def ratios_by_seed(values: Mapping[int, float | None], reference: Mapping[int, float | None]) -> list[float | None]:
+    """Values over those of the same seed if all seeds are the same, else over their mean."""
+    mean = spread([*reference.values()]).mean
+    paired = values.keys() == reference.keys()
+    return [ratio(value, reference[seed] if paired else mean) for seed, value in values.items()]
 
 
 def same_length(runs: Sequence[CaseMetrics]) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import shutil
-import statistics
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -107,7 +106,7 @@ class PastRun(msgspec.Struct, frozen=True):
     megabytes: float  # of all files
     recorded: bool  # whether it has a recording
     seeds: list[int]
-    cases: dict[str, dict[str, float | None]]  # `KEY_FIGURES` of each case: means over seeds; None: not known
+    cases: dict[str, dict[str, dict[int, float | None]]]  # `KEY_FIGURES` of each case, by seed; None: not known
 
     def matches(self, words: Sequence[str]) -> bool:
         """Whether each word is one of its tags, or stands in its folder's name, its title or a case, in any case."""
@@ -140,10 +139,10 @@ def _past_run(folder: Path) -> PastRun | None:
     recorded = any(folder.glob("*.mcap"))
     if not (recorded or cases or origin.begun):
         return None
-    figures: dict[str, dict[str, float | None]] = {}
+    figures: dict[str, dict[str, dict[int, float | None]]] = {}
     for case in dict.fromkeys(each["case"] for each in cases):
-        means = [each["mean"] for each in cases if each["case"] == case]
-        figures[case] = {name: _mean([mean.get(name) for mean in means]) for name in KEY_FIGURES}
+        means = {each["seed"]: each["mean"] for each in cases if each["case"] == case}
+        figures[case] = {name: {seed: _number(mean.get(name)) for seed, mean in means.items()} for name in KEY_FIGURES}
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     seeds = sorted({each["seed"] for each in cases})
     return PastRun(str(folder), origin, origin.begun or source.stat().st_mtime, size / 1e6, recorded, seeds, figures)
@@ -158,9 +157,8 @@ def _cases(folder: Path) -> list[dict[str, Any]]:
     return [each for each in read if {"case", "seed", "mean"} <= each.keys() and isinstance(each["mean"], dict)]
 
 
-def _mean(values: Sequence[Any]) -> float | None:
-    known = [value for value in values if isinstance(value, int | float)]
-    return statistics.fmean(known) if known else None
+def _number(value: object) -> float | None:
+    return value if isinstance(value, int | float) else None
 
 
 def differences(first: PastRun, other: PastRun) -> list[str]:

@@ -33,13 +33,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; `words` aligns to the left."""
+    """A table."""
 
     head: tuple[str, ...]
     rows: tuple[Row, ...]
     title: str = ""
     note: str = ""
-    words: bool = False
+    words: bool = False  # aligns to the left
+    keys: int = 1  # columns that name a row, the first ones
 
 
 def number(value: float | None, scale: float = 1.0) -> str:

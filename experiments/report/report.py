@@ -185,7 +185,10 @@ def result_tables(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> l
     whole, robots = whole_tables(cases), robot_tables(cases)
     if seeds > 1:
         whole = tuple(
-            table if table.head[0].startswith("Sum ") else replace(table, note=over_seeds(seeds)) for table in whole
+            table
+            if table.head[0].startswith("Sum ")
+            else replace(table, note=f"{over_seeds(seeds)} {table.note}".strip())
+            for table in whole
         )
         robots = tuple(replace(table, note=f"Means over {seeds} seeds. {table.note}".strip()) for table in robots)
     return [summary, *whole, *robots]

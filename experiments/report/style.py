@@ -57,7 +57,7 @@ STYLE: Final[Mapping[Any, Any]] = {
     "ytick.labelsize": 7,
     "legend.fontsize": 7,
     "legend.frameon": False,
-    "legend.handlelength": 1.4,
+    "legend.handlelength": 2.0,  # a dashed line shows its pattern
     "legend.columnspacing": 1.0,
     "legend.borderaxespad": 0.2,
     "legend.handletextpad": 0.5,
@@ -177,7 +177,7 @@ def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], c
 
 def fitting(width: float, labels: Sequence[str], columns: int) -> int:
     """Columns of a legend, at most `columns`, that fit into a width [in]; labels fill one column after the other."""
-    wide = [27.0 + 3.2 * len(label) for label in labels]  # [pt]
+    wide = [31.0 + 3.2 * len(label) for label in labels]  # [pt]
     for count in range(min(columns, len(labels)), 1, -1):
         rows = [len(part) for part in np.array_split(np.arange(len(labels)), count)]
         ends = np.cumsum(rows)

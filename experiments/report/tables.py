@@ -78,6 +78,9 @@ DEFINITIONS: Final = (
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
 
+EXTREMES: Final = "Of worst, largest, longest and closest values too the mean over seeds."
+EXTREME_UNITS: Final = ("Distances [cm]", "Delay of poses [ms]", "Hardest impulse [mN s]")
+
 
 # ---------------------------------------------------------------------- numbers of a case
 
@@ -130,20 +133,20 @@ def over_seeds(seeds: int) -> str:
 def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Numbers of the formation as a whole, a table for each unit; without rows of what did not occur in any case."""
     phases = range(max(len(case.starts_s) for case in cases))
-    over = " (mean over seeds)" if max(map(len, by_case(cases).values())) > 1 else ""
-    ends = {k: f"Worst link{_phase_end(cases, k, len(phases))}{over}" for k in phases}
+    several = max(map(len, by_case(cases).values())) > 1
+    ends = {k: f"Worst link{_phase_end(cases, k, len(phases))}" for k in phases}
     lengths: list[Line] = [(ends[k], lambda case, k=k: _worst(case, k), 100.0) for k in phases]  # type: ignore[misc]
     lengths += [
         ("Belief error, RMS", attrgetter("belief_rms"), 100.0),
-        (f"Belief error, largest{over}", attrgetter("belief_max"), 100.0),
-        (f"Closest two robots, between centres{over}", attrgetter("closest"), 100.0),
+        ("Belief error, largest", attrgetter("belief_max"), 100.0),
+        ("Closest robots, between centres", attrgetter("closest"), 100.0),
         (
-            f"Closest two robots, between surfaces{over}",
+            "Closest robots, between surfaces",
             lambda case: None if case.near is None else case.near.gap,
             100.0,
         ),
-        (f"Closest to the arena{over}", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
-        (f"Farthest outside the arena{over}", attrgetter("excursion"), 100.0),
+        ("Closest to the arena", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
+        ("Farthest outside the arena", attrgetter("excursion"), 100.0),
     ]
     units: dict[str, list[Line]] = {
         "Acquired by all followers [s]": [
@@ -158,7 +161,7 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         "Delay of poses [ms]": [
             ("mean", lambda case: _delay(case, mean_delay), 1000.0),
             (
-                f"longest{over}",
+                "longest",
                 lambda case: _delay(case, lambda links: _known(max, (each.delay_max for each in links))),
                 1000.0,
             ),
@@ -170,16 +173,19 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ],
         "Collisions": [("Number", lambda case: float(len(case.collisions)), 1.0)],
         "Hardest impulse [mN s]": [
-            (f"of a collision{over}", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
+            ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
         "Cost (a number without unit)": [("J2", attrgetter("j2"), 1.0)],
     }
-    tables = [_table_by_case(unit, cases, lines) for unit, lines in units.items()]
+    tables = [
+        replace(_table_by_case(unit, cases, lines), note=EXTREMES if several and unit in EXTREME_UNITS else "")
+        for unit, lines in units.items()
+    ]
     sums = [
         Row((label, *(number(sum(getattr(run, field) for run in runs)) for runs in by_case(cases).values())))
         for field, label in TROUBLES
     ]
-    tables.append(Table((f"Sum over all robots{' and seeds' if over else ''}", *by_case(cases)), tuple(sums)))
+    tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
     if any(case.belief for case in cases):  # a formation that was never acquired is a result
         return tables[0], *(shown for table in tables[1:] if (shown := _occurred(table)).rows)
     return tuple(shown for table in tables if (shown := _occurred(table)).rows)

@@ -10,11 +10,11 @@ from typing import Final
 from experiments.report import style
 from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.page import Row as Line
-from experiments.report.tables import over_seeds
+from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import front, pareto
 from experiments.sweep.sweep import SweepResult
-from experiments.sweep.table import NONE, NUMBERS, CellRow, numbers, short, with_interval, words_of
+from experiments.sweep.table import NUMBERS, CellRow, parameter_columns
 
 PAGE: Final = "sweep.html"
 MOST_LINES: Final = 40  # of a table that stands open
@@ -28,7 +28,8 @@ TERMS: Final = (
 )  # fmt: skip
 CAPTIONS: Final = (
     "Messages against IAE; towards the lower left is better. Full: no other has fewer messages and no more error (grey "
-    "line). Numbers at the ends of a curve: the first parameter that was changed. Whiskers: 95 % confidence.",
+    "line). Along a curve the named parameter changes, markers tell the others; more than 7 curves or markers are not "
+    "joined. Whiskers: 95 % confidence.",
     "Messages against ITAE, likewise.",
 )
 
@@ -102,23 +103,21 @@ def verdict(tuned: TuningResult) -> list[Finding]:
     return found
 
 
-def table(rows: Sequence[CellRow]) -> Table:
-    paths = list(dict.fromkeys(path for row in rows for path in row.parameters))
-    head = ("Case", *map(short, paths), *NUMBERS)
-    lines = []
-    for row in rows:
-        values = [words_of(row.parameters[path]) if path in row.parameters else NONE for path in paths]
-        lines.append(Line((row.case, *values, *numbers(row)), sum=row.reference))
-    reference = next((row.case for row in rows if row.reference), "the reference")
-    return Table(head, tuple(lines), note=f"Messages, IAE and ITAE are relative to {reference} with the same seed.")
+def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) -> Table:
+    """A row for each cell: case, parameters, numbers; some of them (keys of `NUMBERS`), if `chosen`.
 
-
-def paper_table(title: str, rows: Sequence[CellRow]) -> Table:
-    """The cells for a paper: case and parameters in one column."""
+    With a `title`, for a paper: a number that is the same in all cells stands in the note, with the number of seeds.
+    """
+    parameters = parameter_columns(rows)
+    columns = {NUMBERS[name][0]: [NUMBERS[name][1](row) for row in rows] for name in chosen or NUMBERS}
+    alike = {head: cells[0] for head, cells in columns.items() if title and not chosen and len({*cells}) == 1}
+    columns = parameters | {head: cells for head, cells in columns.items() if head not in alike}
+    lines = [Line((row.case, *(cells[k] for cells in columns.values())), row.reference) for k, row in enumerate(rows)]
     reference = next((row.case for row in rows if row.reference), "the reference")
-    seeds = max((row.seeds for row in rows), default=0)
-    note = f"Messages, IAE and ITAE are relative to {reference} with the same seed. {over_seeds(seeds)}"
-    return Table(("Cell", *NUMBERS), tuple(Line((row.label, *numbers(row))) for row in rows), title=title, note=note)
+    note = [f"Ratios are relative to {reference} with the same seed."]
+    note += [f"In all cells: {', '.join(f'{head} {cell}' for head, cell in alike.items())}."] if alike else []
+    note += [over_seeds(max((row.seeds for row in rows), default=0))] if title else []
+    return Table(("Case", *columns), tuple(lines), title=title, note=" ".join(note), keys=1 + len(parameters))
 
 
 def pictures(
@@ -150,4 +149,4 @@ def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
 def _saved(row: CellRow) -> str:
     messages = row.ratio["messages"].mean
     less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %"
-    return f"{less} messages, IAE {with_interval(row.ratio['iae'])}, ITAE {with_interval(row.ratio['itae'])}"
+    return f"{less} messages, IAE {ratio_words(row.ratio['iae'])}, ITAE {ratio_words(row.ratio['itae'])}"

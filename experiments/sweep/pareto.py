@@ -13,12 +13,14 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from agents.arrays import Array
-from experiments.report.style import CASES, INK, PAPER, WIDTH, legend_above, plain, styled
+from experiments.report.style import CASES, INK, PAPER, WIDTH, fitting, legend_above, plain, styled
 from experiments.sweep.table import CellRow, short, words_of
 
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
-MOST_CURVES: Final = 9  # a colour and a marker each; more could not be told apart, and are drawn as clouds
-LONG: Final = 14  # letters of a name of which three do not stand beside each other
+MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be told apart, and are drawn as clouds
+LEGEND_LINE: Final = 0.14  # [in]
+GREY: Final = "#7a7a7a"
+THIN: Final[dict[str, Any]] = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3}
 NAMED: Final = 12  # points of a curve that all have their value beside them, if it is the first one,
 CLOSE: Final = 0.06  # and are farther apart than this share
 SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
@@ -28,8 +30,9 @@ SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, width: float = WIDTH) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
-    Full markers: no other cell has fewer messages and no more error; these are joined by a grey line. Hollow: another
-    one is better. Whiskers are 95 % confidence intervals. The reference is the cross at (1, 1).
+    Of several parameters the first runs along the curves, markers tell the others. Full markers: no other cell has
+    fewer messages and no more error; these are joined by a grey line. Hollow: another one is better. Whiskers are
+    95 % confidence intervals. The reference is the cross at (1, 1).
 
     Args:
         rows: The cells; those whose ratios are unknown are left out.
@@ -41,16 +44,31 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     figure = Figure(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
     _draw_front(axes, [row for row in known if id(row) in best], index)
+    cases = list(dict.fromkeys(row.case for row in known))
     found = curves(known)
-    joined = joined and len(found) <= MOST_CURVES
+    marks = list(dict.fromkeys(other for _, other in found))
+    joined = joined and max(len(cases), len(marks)) <= MOST_CURVES
     if not joined:
-        found = {case: [row for row in known if row.case == case] for case in dict.fromkeys(row.case for row in known)}
-    for k, (name, curve) in enumerate(found.items()):
-        marker = MARKERS[(k + k // len(CASES)) % len(MARKERS)]
-        style = {"color": CASES[k % len(CASES)], "marker": marker, "label": plain(name)}
+        found = {(case, ""): [row for row in known if row.case == case] for case in cases}
+    several = joined and len(marks) > 1  # then markers tell the other parameters apart, colours the cases
+    for (case, other), curve in found.items():
+        k = cases.index(case)
+        style = {
+            "color": CASES[k % len(CASES)],
+            "marker": MARKERS[(marks.index(other) if several else k) % len(MARKERS)],
+        }
         style |= {} if joined else {"linestyle": ""}
-        _draw_curve(axes, curve, index, [id(row) in best for row in curve], style)
-    axes.plot(1.0, 1.0, "+", color=INK, markersize=7, markeredgewidth=1.0, label=_reference(rows), zorder=4)
+        full = [id(row) in best for row in curve]
+        _draw_curve(axes, curve, index, full, style, named=other == next(o for c, o in found if c == case))
+    for k, case in enumerate(cases):
+        marker = {"marker": "" if several else MARKERS[k % len(MARKERS)], "linestyle": "-" if joined else ""}
+        axes.plot([], [], color=CASES[k % len(CASES)], label=plain(case), **{**THIN, **marker})
+    for k, other in enumerate(marks if several else ()):
+        if other:
+            marker = {"marker": MARKERS[k % len(MARKERS)], "linestyle": ""}
+            axes.plot([], [], color=GREY, label=plain(other), **{**THIN, **marker})
+    cross: dict[str, Any] = {"color": INK, "markersize": 7, "markeredgewidth": 1.0, "zorder": 4}
+    axes.plot(1.0, 1.0, "+", label=f"{_reference(rows)} (reference)", **cross)
     axes.set_xlabel(f"messages relative to {_reference(rows)}")
     axes.set_ylabel(f"{index.upper()} relative to {_reference(rows)}")
     low = min((row.ratio["messages"].mean or 1.0 for row in known), default=1.0)
@@ -60,31 +78,32 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid()
-    longest = max(len(name) for name in [*found, _reference(rows)])
-    legend_above(figure, axes.get_legend_handles_labels(), columns=3 if longest <= LONG else 2)
+    entries = axes.get_legend_handles_labels()
+    lines = math.ceil(len(entries[1]) / fitting(width, entries[1], 3))
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 2))
+    legend_above(figure, entries, columns=3)
     return figure
 
 
 def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages."""
-    found, least = [], math.inf
-    for row in sorted(
-        (row for row in rows if _point_of(row, index) is not None), key=lambda row: _point_of(row, index) or ()
-    ):
-        if row.ratio[index].mean < least:  # type: ignore[operator]
+    found: list[CellRow] = []
+    known = [row for row in rows if _point_of(row, index) is not None]
+    for row in sorted(known, key=lambda row: _point_of(row, index) or ()):
+        at, last = _point_of(row, index), _point_of(found[-1], index) if found else None
+        if at and (last is None or at[1] < last[1] or at == last):
             found.append(row)
-            least = row.ratio[index].mean or 0.0
     return found
 
 
-def curves(rows: Sequence[CellRow]) -> dict[str, list[CellRow]]:
-    """Cells that differ only in the first parameter in which their case varies, by the name of case and others."""
-    found: dict[str, list[CellRow]] = {}
+def curves(rows: Sequence[CellRow]) -> dict[tuple[str, str], list[CellRow]]:
+    """Cells that differ only in the first parameter in which their case varies, by case and the other parameters."""
+    found: dict[tuple[str, str], list[CellRow]] = {}
     for row in rows:
         along = _varied_parameter(rows, row.case)
         others = [path for path in row.parameters if path != along and _varies(rows, row.case, path)]
-        fixed = [f"{short(path)}={words_of(row.parameters[path])}" for path in others]
-        found.setdefault(", ".join([row.case, *fixed]), []).append(row)
+        fixed = ", ".join(f"{short(path)} = {words_of(row.parameters[path])}" for path in others)
+        found.setdefault((row.case, fixed), []).append(row)
     return found
 
 
@@ -116,13 +135,16 @@ def _points(rows: Sequence[CellRow], index: str) -> Array:
 def _draw_front(axes: Axes, rows: Sequence[CellRow], index: str) -> None:
     points = _points(rows, index)
     x, y = points[points[:, 0].argsort(), :2].T
-    axes.plot(x, y, drawstyle="steps-post", color="#9a9a9a", linewidth=2.2, alpha=0.5, zorder=1)
+    line: dict[str, Any] = {"color": "#9a9a9a", "linewidth": 2.2, "alpha": 0.5}
+    axes.plot(x, y, drawstyle="steps-post", label="front (full markers)", zorder=1, **line)
 
 
-def _draw_curve(axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[bool], style: dict[str, Any]) -> None:
+def _draw_curve(
+    axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[bool], style: dict[str, Any], *, named: bool
+) -> None:
     points = _points(rows, index)
     x, y, dx, dy = points.T
-    marker = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3, **style}
+    marker = {**THIN, **style}
     joined = "linestyle" not in style
     axes.errorbar(
         x, y, dy, dx, color=style["color"], linewidth=0.8 if joined else 0.0, elinewidth=0.7 if joined else 0.4,
@@ -131,8 +153,7 @@ def _draw_curve(axes: Axes, rows: Sequence[CellRow], index: str, best: Sequence[
     for full, face in ((True, style["color"]), (False, PAPER)):
         some = np.array(best) == full
         axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "label": None})
-    axes.plot([], [], **marker)
-    along = _varied_parameter(rows, rows[0].case) if joined else None
+    along = _varied_parameter(rows, rows[0].case) if joined and named else None
     if along is not None:
         _name_points(axes, rows, along, points[:, :2], style["color"])
 
@@ -150,5 +171,6 @@ def _name_points(axes: Axes, rows: Sequence[CellRow], along: str, points: Array,
         words = (f"{short(along)} = {value}" if k == 0 else value).replace("-", "\N{MINUS SIGN}")
         halo = [withStroke(linewidth=1.2, foreground=PAPER)]
         style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color": colour, "path_effects": halo}
-        axes.annotate(plain(words), tuple(at), (3.0, 4.0), **style)
+        left = at[0] >= 1.0  # beside the right edge
+        axes.annotate(plain(words), tuple(at), (-3.0 if left else 3.0, 4.0), ha="right" if left else "left", **style)
         last = at

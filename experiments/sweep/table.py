@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
 from experiments.metrics.statistics import Spread, ratio, spread
+from experiments.report.page import NONE, interval
+from experiments.report.tables import ratio_words
 from experiments.sweep.plan import Cell
 from experiments.sweep.runs import Figures
 
 MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
 RATIOS: Final = ("messages", "iae", "itae", "rmse")
-NONE: Final = "–"
 
 
 class CellRow(msgspec.Struct, frozen=True):
@@ -111,26 +112,24 @@ def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
         raise ValueError(str(error)) from None
 
 
-NUMBERS: Final = ("f [Hz]", "messages ratio", "IAE ratio", "ITAE ratio", "acquired", "gap [ms]", "dropped")  # heads
-
-
-def numbers(row: CellRow) -> tuple[str, ...]:
-    """The main numbers of a cell for people: those of `NUMBERS`; messages, IAE and ITAE are ratios."""
-    return (
-        figure(row.mean["f_hz"].mean),
-        *(with_interval(row.ratio[index]) for index in ("messages", "iae", "itae")),
-        NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %",
-        NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}",
-        figure(row.mean["dropped"].mean),
-    )
+NUMBERS: Final[Mapping[str, tuple[str, Callable[[CellRow], str]]]] = {  # for people, by the name behind `--metrics`
+    "f": ("f [Hz]", lambda row: interval(row.mean["f_hz"])),
+    "messages": ("messages ratio", lambda row: ratio_words(row.ratio["messages"])),
+    "iae": ("IAE ratio", lambda row: ratio_words(row.ratio["iae"])),
+    "itae": ("ITAE ratio", lambda row: ratio_words(row.ratio["itae"])),
+    "acquired": ("acquired", lambda row: NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %"),
+    "gap": ("gap [ms]", lambda row: NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}"),
+    "dropped": ("dropped", lambda row: interval(row.mean["dropped"])),
+}
 
 
 def text(rows: Sequence[CellRow]) -> list[str]:
     """The main columns, for the terminal."""
-    lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *NUMBERS)]
+    heads = [head for head, _ in NUMBERS.values()]
+    lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *heads)]
     for row in rows:
         seeds = str(row.seeds) + (f" ({row.failed} failed)" if row.failed else "")
-        lines.append((row.case, row.words, seeds, *numbers(row)))
+        lines.append((row.case, row.words, seeds, *(number(row) for _, number in NUMBERS.values())))
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [
         "  ".join(cell.ljust(width[k]) if k < 2 else cell.rjust(width[k]) for k, cell in enumerate(line)).rstrip()
@@ -138,21 +137,25 @@ def text(rows: Sequence[CellRow]) -> list[str]:
     ]
 
 
+def parameter_columns(rows: Sequence[CellRow]) -> dict[str, list[str]]:
+    """Heads of the columns of parameters, and of each the value in every row; those of several cases share a column."""
+    paths: dict[str, list[str]] = {}
+    most_first = sorted(rows, key=lambda row: -len(row.parameters))  # in the order of the axes
+    for path in dict.fromkeys(path for row in most_first for path in row.parameters):
+        paths.setdefault(short(path), []).append(path)
+    columns: dict[str, list[str]] = {}
+    for head, mine in paths.items():
+        alone = all(len(row.parameters.keys() & set(mine)) < 2 for row in rows)
+        columns |= {head: mine} if alone else {path: [path] for path in mine}
+    return {
+        head: [next((words_of(row.parameters[path]) for path in mine if path in row.parameters), NONE) for row in rows]
+        for head, mine in columns.items()
+    }
+
+
 def short(path: str) -> str:
     """The last part of a path."""
     return path.rpartition(".")[2]
-
-
-def figure(value: float | None, digits: int = 3) -> str:
-    """A number as people read it."""
-    return NONE if value is None else f"{value:.{digits}g}"
-
-
-def with_interval(value: Spread) -> str:
-    """A ratio and its interval, to four places: a per mille of error is what triggers differ by."""
-    if value.mean is None:
-        return NONE
-    return f"{value.mean:.3f}" + ("" if value.ci95 is None else f" ± {value.ci95:.3f}")
 
 
 def words_of(value: object) -> str:

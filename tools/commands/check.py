@@ -264,7 +264,7 @@ def _formatted(of: Figures) -> dict[str, str]:
         "formation acquired after": number(of.acquired_s, ".1f", " s"),
         "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
         "all end inside the arena": "yes" if of.end_inside else "no",
-        "poses sent, estimated": number(of.messages_hz, ".1f", " per second"),
+        "poses sent by all, estimated": number(of.messages_hz, ".1f", " per second"),
     }
 
 
@@ -310,6 +310,10 @@ def explain(
     print(*(f"  {name:8} {text}" for name, text in rows.items() if text), sep="\n")
     print(textwrap.indent(f"\n{found[0].example}", "    "))
     rest = [entry for entry in found if entry not in alike]
+    told = {(entry.key.removeprefix(alike[0].key), entry.text) for entry in rest if entry.key.startswith(alike[0].key)}
+    for other in alike[1:]:  # a plug-in in another place has the same parameters
+        again = f"{other.key}."
+        rest = [e for e in rest if not e.key.startswith(again) or (e.key.removeprefix(other.key), e.text) not in told]
     if rest:
         print()
     _print_entries(rest)
@@ -319,7 +323,7 @@ def explain(
 def _print_entries(entries: Sequence[Entry]) -> None:
     """Lines of a table, one for each entry: cut at a terminal, in full for a file or a pipe."""
     for entry in entries:
-        text = f"{entry.key}  {entry.text}"
+        text = f"{entry.key}  {entry.text}" + (f" [default: {entry.default}]" if entry.default else "")
         print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -15,6 +16,7 @@ from tools.commands.options import AsJson, example, print_json
 
 if TYPE_CHECKING:
     from experiments.recording.run_folder import PastRun
+    from experiments.report.page import Table
     from experiments.run import Run
 
 app: Final = typer.Typer()
@@ -37,6 +39,9 @@ def report(
     label: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Of each run of a comparison, in order. [A, B, ...]")
     ] = None,
+    pool: Annotated[
+        bool, typer.Option("--pool", help="Runs that differ in their seed alone as one: means and intervals.")
+    ] = False,
     width: Annotated[
         float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
@@ -52,29 +57,34 @@ def report(
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
+    from experiments.report.tables import SUMMARY
     from experiments.run import reopen_seeds
 
-    chosen = _chosen(metrics)
-    if chosen and not (as_latex or as_markdown):
-        raise refusal("--metrics", "chooses rows of a printed table", "add --latex or --markdown")
+    if metrics and not (as_latex or as_markdown):
+        raise refusal("--metrics", "chooses numbers of a printed table", "add --latex or --markdown")
     if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
-        return _report_sweep(Path(runs[0]), out, width, as_latex=as_latex, as_markdown=as_markdown, as_json=as_json)
+        form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
+        return _report_sweep(Path(runs[0]), out, width, metrics, form, as_json=as_json)
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
     _refuse_labels(labels, runs)
     read = [reopen_seeds(folder) for folder in runs]
     for folder, seeds in zip(runs, read, strict=True):
         if not seeds[0].traces:
             raise RecordingError(f"{folder}: no case had begun; there is nothing to report")
+    own = runs[0]
+    if pool and len(runs) > 1:
+        read, labels, own = [_pooled(runs, read)], labels[:1], f"{Path(own)}-pooled"
     named = [
         (name, [case for each in seeds for case in each.metrics.values()])
         for name, seeds in zip(labels, read, strict=True)
     ]
     if as_latex or as_markdown:
         cases = pages.labelled(named) if len(read) > 1 else named[0][1]
-        tables = pages.result_tables(cases, chosen)
+        names = {name.removesuffix("_hz"): name for name, _ in SUMMARY}
+        tables = pages.result_tables(cases, [names[name] for name in _chosen(metrics, [*names])])
         _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
         return 0
-    target = Path(out or "comparison.html") if len(read) > 1 else Path(out or runs[0])
+    target = Path(out or "comparison.html") if len(read) > 1 else Path(out or own)
     try:
         if len(read) == 1:
             write_figures_of_merit(read[0], target)
@@ -93,15 +103,13 @@ def report(
     return 0
 
 
-def _chosen(metrics: str | None) -> list[str]:
-    """Indices by the names that people give them; `f` is the rate of transmissions."""
+def _chosen(metrics: str | None, known: Sequence[str]) -> list[str]:
+    """Names of numbers behind `--metrics`, each of them `known`."""
     from experiments.file.problems import refusal
-    from experiments.report.tables import SUMMARY
 
-    known = [name for name, _ in SUMMARY]
-    given = ["f_hz" if name.strip() == "f" else name.strip() for name in (metrics or "").split(",") if name.strip()]
+    given = [name.strip() for name in (metrics or "").split(",") if name.strip()]
     if wrong := [name for name in given if name not in known]:
-        raise refusal("--metrics", f"no {wrong[0]!r} among the metrics", f"known: f, {', '.join(known[1:])}")
+        raise refusal("--metrics", f"no {wrong[0]!r} among the metrics", f"known: {', '.join(known)}")
     return given
 
 
@@ -124,11 +132,16 @@ SWEEP: Final = "sweep.json"
 
 
 def _report_sweep(
-    folder: Path, out: str | None, width: float, *, as_latex: bool, as_markdown: bool, as_json: bool
+    folder: Path,
+    out: str | None,
+    width: float,
+    metrics: str | None,
+    form: Callable[[Sequence[Table]], str] | None,
+    *,
+    as_json: bool,
 ) -> int:
-    """The table of a sweep for a paper, or its figures anew, so wide [in]."""
+    """The table of a sweep for a paper in some form, or its figures anew, so wide [in]."""
     from experiments.recording.reader import RecordingError
-    from experiments.report import typeset
     from experiments.sweep import page as pages
     from experiments.sweep import table
 
@@ -136,9 +149,9 @@ def _report_sweep(
         document, rows = table.read_json(folder / SWEEP)
     except ValueError as error:
         raise RecordingError(f"{folder / SWEEP}: cannot be read: {error}; make the sweep again") from None
-    if as_latex or as_markdown:
-        tables = [pages.paper_table(str(document.get("experiment", folder.name)), rows)]
-        _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
+    if form is not None:
+        chosen = _chosen(metrics, [*table.NUMBERS])
+        _put(form([pages.table(rows, str(document.get("experiment", folder.name)), chosen)]), out)
         return 0
     if "tuning" in document:
         raise RecordingError(f"{folder}: a search: its figures show all that was tried; --latex prints its result")
@@ -158,6 +171,48 @@ def _refuse_labels(labels: Sequence[str], runs: Sequence[str]) -> None:
     if len(labels) != len(runs):
         message = f"{len(labels)} labels for {len(runs)} runs"
         raise refusal("--label", message, "give one for each run, in their order")
+
+
+def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
+    """Seeds of several runs as those of one, with the cases that all of them have.
+
+    Raises:
+        DocumentError: If experiments, clocks or bodies differ, or a seed is there twice.
+    """
+    from dataclasses import replace
+
+    import msgspec
+
+    from experiments.file.problems import refusal
+
+    every = [run for seeds in read for run in seeds]
+    cases = [case for case in every[0].metrics if all(case in run.metrics for run in every)]
+    first = {case: read[0][0].traces[case] for case in cases}
+    for folder, (run, *_) in zip(folders, read, strict=True):
+        for case, trace in first.items():
+            mine = run.traces[case]
+            if msgspec.structs.replace(mine.experiment, seed=0) != msgspec.structs.replace(trace.experiment, seed=0):
+                hint = f"compare them without --pool: `./zenpark compare {folders[0]} {folder}`"
+                raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
+            if mine.clock != trace.clock:
+                raise refusal(folder, f"is of {mine.clock} time, {folders[0]} of {trace.clock} time", "pool them apart")
+    seeds = [run.seed for run in every]
+    if twice := sorted({seed for seed in seeds if seeds.count(seed) > 1}):
+        raise refusal("--pool", f"seed {twice[0]} is there twice", "give each run a --seed of its own")
+    if not cases:
+        raise refusal("--pool", "no case is in all of these runs", "run the same cases")
+    left = dict.fromkeys(case for run in every for case in run.metrics if case not in cases)
+    notes = [f"Of {len(folders)} runs together: {', '.join(folders)}."]
+    notes += [f"Left out, because it is not in all of them: {', '.join(left)}."] if left else []
+    for _, folder, found in _differences(folders, folders):
+        notes += [f"{folder}: {each}" for each in found if each.startswith("made with")]
+
+    def alone(run: Run) -> Run:
+        kept = {case: run.traces[case] for case in cases if case in run.traces}
+        return replace(run, traces=kept, metrics={case: run.metrics[case] for case in cases}, folder=None)
+
+    runs = [alone(run) for run in every]
+    return [replace(runs[0], notes=(*notes, *runs[0].notes)), *runs[1:]]
 
 
 def _differences(labels: Sequence[str], folders: Sequence[str]) -> list[tuple[str, str, list[str]]]:
@@ -184,6 +239,7 @@ def compare(
     """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
     from experiments.recording.reader import RecordingError
     from experiments.recording.run_folder import differences, past_runs
+    from experiments.report.tables import over_seeds
     from tools.progress import columns
 
     # in the given order: the first one is the reference
@@ -196,7 +252,7 @@ def compare(
     first = found[0]
     differ = {run.folder: differences(first, run) for run in found[1:]}
     if as_json:
-        print_json({"reference": first.folder, "runs": found, "differences": differ})
+        print_json({"reference": first.folder, "runs": [_as_json(run) for run in found], "differences": differ})
     else:
         print(f"reference: {first.folder}")
         for folder, each in differ.items():
@@ -205,17 +261,38 @@ def compare(
         rows = []
         for run in found:
             for case, figures in run.cases.items():
-                cells = [f"{figure(figures[name])}{_ratio(figures[name], reference.get(name))}" for name in figures]
+                cells = [_against(values, reference.get(name, {})) for name, values in figures.items()]
                 rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
         head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s")
         print()
         print("\n".join(columns([head, *rows])))
+        if seeds := max((len(run.seeds) for run in found if len(run.seeds) > 1), default=0):
+            print(over_seeds(seeds))
     return report([run.folder for run in found], out) if out is not None else 0
 
 
-def _ratio(value: float | None, reference: float | None) -> str:
-    """A figure as a multiple of the reference's, behind it; empty if one is not known."""
-    return f" ({value / reference:.3g}×)" if value is not None and reference else ""
+def _against(values: Mapping[int, float | None], reference: Mapping[int, float | None]) -> str:
+    """A figure over seeds, and behind it as a multiple of the reference's, unless it is that or one is not known."""
+    from experiments.metrics.statistics import ratios_by_seed, spread
+    from experiments.report.page import interval
+    from experiments.report.tables import ratio_words
+
+    share = spread(ratios_by_seed(values, reference))
+    behind = "" if share.mean is None or values is reference else f" (× {ratio_words(share)})"
+    return interval(spread([*values.values()])) + behind
+
+
+def _as_json(run: PastRun) -> dict[str, Any]:
+    """A run for scripts, its figures as statistics over the seeds."""
+    import msgspec
+
+    from experiments.metrics.statistics import spread
+
+    cases = {
+        case: {name: spread([*values.values()]) for name, values in figures.items()}
+        for case, figures in run.cases.items()
+    }
+    return msgspec.structs.asdict(run) | {"cases": cases}
 
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
@@ -353,10 +430,6 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     )
 
 
-def figure(value: float | None) -> str:
-    return "?" if value is None else f"{value:.3g}"
-
-
 Words = Annotated[
     list[str] | None, typer.Argument(metavar="[WORD...]", help="Runs with all of these as tag, or in name and title.")
 ]
@@ -406,16 +479,18 @@ def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
 
 
 def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
+    from experiments.metrics.statistics import spread
     from experiments.recording.run_folder import day_of
+    from experiments.report.page import NONE, interval
     from tools.progress import columns
 
     found = _past_runs(words, below)
-    if as_json:
-        print_json(found)
-        return
     places = [Path(each) for each in below or ["runs"]]
     sweeps = sorted({file.parent for place in places for file in (*place.glob(SWEEP), *place.glob(f"*/{SWEEP}"))})
     sweeps = [folder for folder in sweeps if all(word.lower() in folder.name.lower() for word in words)]
+    if as_json:
+        print_json({"runs": [_as_json(run) for run in found], "sweeps": [_sweep_as_json(folder) for folder in sweeps]})
+        return
     if not found and not sweeps:
         print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
         return
@@ -425,7 +500,7 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
         clock = " (virtual)" * run.origin.virtual
         first = [day_of(run), f"{run.folder}{clock}"]
         for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
-            values = ["-" if value is None else f"{value:.3g}" for value in figures.values()] or ["-"] * 4
+            values = [interval(spread([*by_seed.values()])) for by_seed in figures.values()] or [NONE] * 4
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
     print("\n".join(columns([head, *rows])) if rows else "no run")
@@ -433,6 +508,18 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
         day = time.strftime("%Y-%m-%d %H:%M", time.gmtime((folder / SWEEP).stat().st_mtime))
         print(f"{day}  {folder}  a sweep: `./zenpark report {folder}`")
     print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB; sweeps: {len(sweeps)}")
+
+
+def _sweep_as_json(folder: Path) -> dict[str, Any]:
+    """A sweep for scripts: its table is in its folder."""
+    import msgspec
+
+    try:
+        table = msgspec.json.decode((folder / SWEEP).read_bytes(), type=dict[str, Any])
+    except (OSError, ValueError, RecursionError):
+        table = {}
+    known = {name: table.get(name) for name in ("experiment", "reference", "seeds")}
+    return {"folder": folder, "made": (folder / SWEEP).stat().st_mtime, "cells": len(table.get("cells", [])), **known}
 
 
 @app.command(epilog=example("clean --older 30", "clean --older 30 --recordings --yes"))

@@ -30,7 +30,7 @@ from tools.commands.options import (
     print_json,
     warn,
 )
-from tools.commands.results import figure, summary, write_figures_of_merit, write_report
+from tools.commands.results import summary, write_figures_of_merit, write_report
 
 if TYPE_CHECKING:
     from experiments.file.document import Document
@@ -311,7 +311,8 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
     from experiments.file.problems import refusal
 
     if seeds > 1 and not virtual:
-        raise refusal("--seeds", "needs --virtual", "in real time, run once per --seed")
+        hint = "in real time, run once per --seed; `./zenpark report RUN RUN --pool` makes one of them"
+        raise refusal("--seeds", "needs --virtual", hint)
     check_bodies(options.bodies)
     for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
@@ -363,7 +364,10 @@ def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Non
         print(finding.text)
     for name in found["cases"]:
         print(_case_line(name, runs, found))
-    for finding in verdict.contacts([case for each in runs for case in each.metrics.values()]):
+    cases = [case for each in runs for case in each.metrics.values()]
+    if any(case.leaders for case in cases):
+        print(verdict.left_out(cases))
+    for finding in verdict.contacts(cases):
         if finding.mark == "bad":
             print(finding.text)
     if len(runs) > 1:
@@ -378,20 +382,22 @@ def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Non
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
-    from experiments.metrics.statistics import Spread
+    from experiments.metrics.statistics import Spread, spread
     from experiments.report.page import NONE, interval
+    from experiments.report.tables import ratio_words
 
     case = found["cases"][name]
-    mean, ratio = ({k: figure(v) for k, v in case[what].items()} for what in ("mean", "ratio"))
+    means, shares = ({k: spread([v]) for k, v in case[what].items()} for what in ("mean", "ratio"))
     if "across" in found:
-        means = found["across"]["cases"][name]
-        mean, ratio = ({k: interval(Spread(**v)) for k, v in means[what].items()} for what in ("mean", "ratio"))
+        across = found["across"]["cases"][name]
+        means, shares = ({k: Spread(**v) for k, v in across[what].items()} for what in ("mean", "ratio"))
+    mean, ratio = {k: interval(v) for k, v in means.items()}, {k: ratio_words(v) for k, v in shares.items()}
     measured = [each.metrics[name] for each in runs if name in each.metrics]
-    line = f"{name:>12}: {mean['f_hz']} messages/s"
+    line = f"{name:>12}: {mean['f_hz']} messages/s per robot"
     if case["mean"]["iae"] is None:
         line += ", no link was measured"
     else:
-        never = mean["acquired_s"] in {"?", NONE}
+        never = mean["acquired_s"] == NONE
         line += f", IAE {mean['iae']}, RMSE {mean['rmse']} m"
         line += f", acquired {'never' if never else mean['acquired_s'] + ' s'} (mean)"
     line += f", lost {sum(each.lost for each in measured)}"

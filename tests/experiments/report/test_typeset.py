@@ -38,6 +38,29 @@ def test_a_wide_table_fits_a_column():
     assert (wide.count(r"\begin{tabular}"), wide.count(r"\begin{table*}")) == (1, 1)
 
 
+def test_signs_of_users_and_heads_in_lines_are_safe_in_latex():
+    table = Table(
+        ("[m] a_b", "minimum_interval_s"), (Row(("50 % & #1_~^\\", "0.1")),), title="{σ} $λ → x", note="α ± β"
+    )
+    text = latex([table], width=1.0)
+    assert r"{}[m] a\_b & \shortstack[r]{minimum\_\\interval\_s} \\" in text.splitlines()
+    assert r"50 \% \& \#1\_\textasciitilde{}\textasciicircum{}\textbackslash{} & 0.1 \\" in text.splitlines()
+    assert r"\caption{{}[m] a\_bs, \{$\sigma$\} \$$\lambda$ $\to$ x. $\alpha$ $\pm$ $\beta$}" in text.splitlines()
+    units = latex([Table(("Robot", "Acquired [s]"), (Row(("K1", "6.22")),))], width=0.5)
+    assert r"\shortstack[r]{Acquired\\{}[s]}" in units  # a bracket behind a break would be a length
+    assert units.isascii()
+
+
+def test_a_high_table_goes_over_several_floats_and_repeats_the_names_of_its_rows():
+    rows = tuple(Row(("event", f"{k}", "0.0491 ± 0.0003", "1.104 ± 0.006", "1.40 ± 0.01")) for k in range(40))
+    head = ("Case", "threshold", "messages ratio", "IAE ratio", "ITAE ratio")
+    text = latex([Table(head, rows, title="T", keys=2)], width=2.0)
+    assert text.count(r"\begin{table}") == text.count(r"\begin{tabular}") == 3
+    assert text.count("event & 7 & ") == 3
+    assert (text.count(r"\label{tab:cases-t}"), text.count(r"\label{tab:cases-t-2}")) == (1, 1)
+    assert text.count(", continued.") == 2
+
+
 def test_markdown_is_a_pipe_table():
     assert markdown([TABLE]).splitlines() == [
         "**a|b**",

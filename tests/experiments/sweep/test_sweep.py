@@ -18,6 +18,7 @@ from experiments.sweep import table as sweep_table
 from experiments.sweep.pareto import curves, front, pareto
 from experiments.sweep.runs import Stuck
 from experiments.sweep.sweep import side_by_side, sweep
+from experiments.sweep.table import parameter_columns
 from experiments.sweep.workers import SweepError, Work, workers
 from tools.commands import sweep as commands
 
@@ -193,11 +194,25 @@ def test_the_front_has_what_no_other_beats(done):
 def test_curves_go_along_the_first_parameter(tmp_path):
     found = swept(tmp_path, "trigger.threshold=0.005,0.02", "formation.gain=2,3", "seeds=1")
     drawn = curves([row for row in found.rows if not row.reference])
-    assert {name: len(rows) for name, rows in drawn.items()} == {"event, gain=2": 2, "event, gain=3": 2}
-    assert [row.parameters["trigger.threshold"] for row in drawn["event, gain=2"]] == [0.005, 0.02]
+    assert {name: len(rows) for name, rows in drawn.items()} == {("event", "gain = 2"): 2, ("event", "gain = 3"): 2}
+    assert [row.parameters["trigger.threshold"] for row in drawn["event", "gain = 2"]] == [0.005, 0.02]
     axes = pareto(found.rows).axes[0]
     assert axes.get_xlabel() == "messages relative to periodic"
-    assert [text.get_text() for text in axes.texts] == ["threshold = 0.005", "0.02"] * 2
+    assert [text.get_text() for text in axes.texts] == ["threshold = 0.005", "0.02"]
+    assert axes.get_legend_handles_labels()[1][1:] == ["event", "gain = 2", "gain = 3", "periodic (reference)"]
+    page = sweep_page.table(found.rows, "a title")
+    assert page.head[:3] == ("Case", "threshold", "gain")
+    assert page.keys == 3
+    assert "In all cells: " in page.note
+
+
+def test_cells_that_tie_are_all_on_the_front_and_share_a_column_of_parameters(done):
+    (row, *_) = [row for row in done.rows if not row.reference]
+    other = msgspec.structs.replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3})
+    assert front([row, other]) == [row, other]
+    assert parameter_columns([row, other]) == {"threshold": ["0.005", "0.3"]}
+    both = msgspec.structs.replace(row, parameters={**row.parameters, **other.parameters})
+    assert list(parameter_columns([row, both])) == ["trigger.threshold", "cases.other.trigger.threshold"]
 
 
 def test_a_figure_of_nothing_but_the_reference(done):

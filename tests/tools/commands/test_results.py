@@ -101,9 +101,49 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
     assert zenpark("report", str(folder), "--width", "7.16").strip() == str(folder / "figures")
     assert (folder / "figures" / "pareto_iae.svg").read_text() != narrow
     text = zenpark("report", str(folder), "--latex")
-    assert r"\caption{Cells, Two, for three seconds." in text
-    assert "threshold=0.05" in text
+    assert r"\caption{Cases, Two, for three seconds." in text
+    assert "event & 0.05 & " in text
+    chosen = zenpark("report", str(folder), "--latex", "--metrics", "messages,iae").splitlines()
+    assert r"Case & threshold & messages ratio & IAE ratio \\" in chosen
+    wrong = CliRunner().invoke(app, ["report", str(folder), "--latex", "--metrics", "speed"])
+    assert "no 'speed' among the metrics" in str(wrong.exception)
     assert f"a sweep: `./zenpark report {folder}`" in zenpark("runs", "--past", "--in", str(tmp_path))
+    (known,) = json.loads(zenpark("runs", "--past", "--in", str(tmp_path), "--json"))["sweeps"]
+    assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
+
+
+def test_runs_of_several_seeds_are_pooled_to_one(three: tuple[Path, str], tmp_path: Path) -> None:
+    file = three[0].parent / "short.toml"
+    runs = [str(tmp_path / f"seed{seed}") for seed in (1, 2, 3)]
+    for seed, run in enumerate(runs, start=1):
+        zenpark("run", str(file), "--virtual", "--seed", str(seed), "--no-report", "--out", run)
+    tables = zenpark("report", *runs, "--pool", "--latex", "--metrics", "f,iae")
+    assert tables == zenpark("report", str(three[0]), "--latex", "--metrics", "f,iae")
+    page = Path(zenpark("report", *runs, "--pool").strip())
+    assert page == tmp_path / "seed1-pooled" / "report.html"
+    assert f"Of 3 runs together: {', '.join(runs)}." in page.read_text()
+    assert "median and range of 3 seeds" in page.read_text()
+    twice = CliRunner().invoke(app, ["report", runs[0], runs[0], "--pool"])
+    assert "seed 1 is there twice" in str(twice.exception)
+    zenpark("run", str(file), "--virtual", "--no-report", "--out", str(tmp_path / "x"), "--set", "duration_s=2.5")
+    other = CliRunner().invoke(app, ["report", runs[1], str(tmp_path / "x"), "--pool"])
+    assert "differs from" in str(other.exception)
+
+
+def test_a_comparison_has_the_intervals_of_the_report(three: tuple[Path, str], tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(three[0], again)
+    lines = zenpark("compare", str(three[0]), str(again)).splitlines()
+    event = next(line for line in lines if re.match(rf"{re.escape(str(again))} +event", line))
+    (reported,) = [line for line in three[1].splitlines() if line.startswith("       event: ")]
+    rate, error = re.findall(r"(\d[\d.]* ± [\d.]+)", reported)[:2]
+    assert rate in event
+    assert error in event
+    assert re.search(r"\(× 0\.\d+ ± 0\.\d+\)", event)
+    assert "Means over 3 seeds ± half-width" in lines[-1]
+    figures = json.loads(zenpark("compare", str(three[0]), str(again), "--json"))["runs"][0]["cases"]["event"]["iae"]
+    assert figures["n"] == 3
+    assert figures["ci95"] > 0.0
 
 
 def test_a_ratio_has_the_digits_that_its_interval_bears() -> None:
