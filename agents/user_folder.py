@@ -18,7 +18,7 @@ def runtime_folder() -> Path:
     Raises:
         OSError: If it cannot be created, or others could write there.
     """
-    chosen, runtime = os.environ.get("ZENPARK_RUNS"), os.environ.get("XDG_RUNTIME_DIR")
+    chosen, runtime = os.environ.get("ZENPARK_RUNTIME_DIR"), os.environ.get("XDG_RUNTIME_DIR")
     if chosen:
         folder = Path(chosen)
     elif runtime and os.access(runtime, os.W_OK):

@@ -28,7 +28,7 @@ hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depend
 hypothesis_settings.register_profile("quick", deadline=None, max_examples=5)  # `./zenpark test --quick`
 hypothesis_settings.load_profile("zenpark")
 # no test may find the runs of whoever uses this machine, least of all to stop them
-os.environ["ZENPARK_RUNS"] = tempfile.mkdtemp(prefix="zenpark-tests-")
+os.environ["ZENPARK_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="zenpark-tests-")
 
 # each call builds all commands anew, 50 ms; a command keeps nothing of a call
 typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)

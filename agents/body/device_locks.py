@@ -51,7 +51,7 @@ class Claims:
             self.release()
             raise BodyError(
                 f"no lock on {address}, which keeps other processes off {name}: {error}; "
-                "set ZENPARK_RUNS to a folder that is yours alone (mode 0700)"
+                "set ZENPARK_RUNTIME_DIR to a folder that is yours alone (mode 0700)"
             ) from error
         except BodyError:
             self.release()

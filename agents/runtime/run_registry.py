@@ -1,6 +1,6 @@
 """Registry of the runs on this machine: one small file each, so that an emergency stop finds all of them.
 
-The files lie in a folder that belongs to the user alone: `$ZENPARK_RUNS`, else `$XDG_RUNTIME_DIR/zenpark`, else
+The files lie in a folder that belongs to the user alone: `$ZENPARK_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/zenpark`, else
 `zenpark-UID` in the folder for temporary files. Runs of other users are not listed.
 """
 

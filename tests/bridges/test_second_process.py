@@ -19,7 +19,7 @@ from tests.twins.loopback import request
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
 
 
 def crazyflie(port):

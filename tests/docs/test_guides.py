@@ -81,7 +81,7 @@ def test_a_guide_can_be_followed(
     guide: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     done = 0
     for step in steps(guide):
         if step.kind == "toml":

@@ -21,7 +21,7 @@ input()
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     return tmp_path / "runs"
 
 
@@ -63,7 +63,9 @@ def test_another_process_is_named_and_its_death_frees_the_device(folder: Path) -
 def test_without_a_folder_nothing_is_driven(folder: Path) -> None:
     folder.mkdir(0o755)
     folder.chmod(0o777)
-    with pytest.raises(BodyError, match=r"no lock on radio 80, .* set ZENPARK_RUNS to a folder that is yours alone"):
+    with pytest.raises(
+        BodyError, match=r"no lock on radio 80, .* set ZENPARK_RUNTIME_DIR to a folder that is yours alone"
+    ):
         Claims(["CF01"], ["radio 80"]).take()
 
 

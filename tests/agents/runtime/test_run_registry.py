@@ -16,7 +16,7 @@ from agents.runtime.run_registry import Run, born, own_entry, registered, runs
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
     return tmp_path / "runs"
 
 
@@ -105,7 +105,7 @@ def test_a_folder_that_others_can_write_to_is_not_believed(folder: Path) -> None
 
 
 def test_without_a_runtime_folder_it_is_one_of_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("ZENPARK_RUNS")
+    monkeypatch.delenv("ZENPARK_RUNTIME_DIR")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))
     with registered(own_entry("run", "two", nowhere())) as why:

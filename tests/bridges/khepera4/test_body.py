@@ -343,7 +343,7 @@ def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient, monke
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
     with opened(open_khepera4(reached(rows, twins.addresses))) as first:
-        monkeypatch.setenv("ZENPARK_RUNS", str(tmp_path))  # another user's, or another computer's
+        monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path))  # another user's, or another computer's
         with pytest.raises(BodyError, match=r"no answer to .*another program may hold it"):
             open_khepera4(reached(rows, twins.addresses)).open()
         drive = Drive(first)
