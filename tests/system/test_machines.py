@@ -18,7 +18,7 @@ import pytest
 from experiments.file import catalogue
 from experiments.recording import playback
 from experiments.recording.topics import CHUNK_BYTES
-from tests.system.lab import ROOT, typed, until
+from tests.system.lab import NEAR_TRIANGLE, ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
 
 LACKING = why_not()
@@ -138,26 +138,30 @@ def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: M
 
 @pytest.mark.mechanism("hosts: way out")
 def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone(lab: Machines, tmp_path: Path) -> None:
-    file, folder = triangle(lab, tmp_path, 40.0), tmp_path / "run"
-    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway")
+    file, folder = triangle(lab, tmp_path, 20.0), tmp_path / "run"
+    flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", *NEAR_TRIANGLE)
     logs, flying = folder / "logs", ("KH01", "KH02", "CF01")
-    until(lambda: all(f"{robot}: running" in said(logs, robot) for robot in flying), "all are in the experiment", 60.0)
-    recording = folder / "event.mcap"
+    until(
+        lambda: all(f"{robot}: running" in said(logs, robot, "periodic") for robot in flying),
+        "all are in the experiment",
+        60.0,
+    )
+    recording = folder / "periodic.mcap"
     begun = recording.stat().st_size
     until(lambda: recording.stat().st_size > begun + CHUNK_BYTES, "the experiment comes to the disk")
     os.kill(flight.pid, signal.SIGKILL)
     until(lambda: not busy(lab), "nobody is left")
     flight.communicate(timeout=30)
     for robot in flying:
-        assert said(logs, robot).splitlines()[-2:] == [
+        assert said(logs, robot, "periodic").splitlines()[-2:] == [
             f"{robot}: landing (the starter is gone)",
             f"{robot}: done (the starter is gone)",
         ]
     assert playback.read(recording).complete
 
 
-def said(logs: Path, robot: str) -> str:
-    file = logs / f"event-{robot}.log"
+def said(logs: Path, robot: str, case: str = "event") -> str:
+    file = logs / f"{case}-{robot}.log"
     return file.read_text() if file.exists() else ""
 
 

@@ -41,7 +41,7 @@ def virtual(duration_s: float) -> Trace:
 @pytest.mark.mechanism("modelled channel in real time")
 def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    changes = [part for change in (*BAD, "duration_s=3") for part in ("--set", change)]
+    changes = [part for change in (*BAD, "duration_s=3", "robots.CF01.hover=0.3") for part in ("--set", change)]
     flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
     code, out = flight.finish(60.0)
     assert code == 0, flight.said

@@ -21,7 +21,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
 from experiments.run import reopen
 from tests.conftest import RouterProcess
-from tests.system.lab import ENVIRONMENT, ROOT, Flight, Watcher, assert_held_in_time, until
+from tests.system.lab import ENVIRONMENT, NEAR_TRIANGLE, ROOT, Flight, Watcher, assert_held_in_time, until
 from tests.system.secured import FLOWN, Laboratory
 
 pytestmark = pytest.mark.system
@@ -131,12 +131,12 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
 
 @pytest.mark.mechanism("router frozen")
 def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: RouterProcess, tmp_path: Path) -> None:
-    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "duration_s=60", "--no-report")
-    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", *changes)
+    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "safety.link_silence_s=0.6")
+    flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "--no-report", *NEAR_TRIANGLE, *changes)
     flight.until_said("phase conductor: formation")
     with patient_router.frozen() as stopped:
         flight.until_said(r"router conductor: no router answers for \d+\.\d s")
-        until(lambda: time.time() > stopped + 3.0, "every robot has had the time to hold")
+        until(lambda: time.time() > stopped + 1.6, "every robot has had the time to hold")
     flight.until_said(r"router conductor: a router answers again, after \d+\.\d s")
     for name in ("CF01", "KH01", "KH02"):
         flight.until_said(rf"hazard {name}: over: no connection to a router")

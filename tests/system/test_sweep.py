@@ -14,9 +14,9 @@ from tests.system.lab import ENVIRONMENT, ROOT, until
 
 pytestmark = pytest.mark.system
 
-GIVEN = ["trigger.threshold=0.002:0.05:log9", "seeds=6"]
+GIVEN = ["trigger.threshold=0.002:0.05:log6", "seeds=6"]
 SETTINGS = ["duration_s=2.0"]
-RUNS = 10 * 6
+RUNS = 7 * 6
 
 
 @contextmanager
