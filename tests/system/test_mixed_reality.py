@@ -22,7 +22,7 @@ pytestmark = pytest.mark.system
 
 WORLD = """
 title = "{real} stands in the way of {twin}"
-duration_s = 40.0   # the test ends the run when the twin has arrived
+duration_s = 30.0   # the test ends the run when the twin has arrived
 positioning = "vicon-twin"
 [arena]
 size = [4.0, 4.0, 2.0]
@@ -35,7 +35,7 @@ hears = "{hears}"
 [[timeline]]
 at_s = 1.4
 robot = "{twin}"
-plan = {{ kind = "waypoints", points = [[0.4, 0.0]], speed = 0.23 }}
+plan = {{ kind = "waypoints", points = [[0.33, 0.0]], speed = 0.23 }}
 """
 ON_THE_FLOOR = """
 [robots.TB01]
@@ -46,7 +46,7 @@ start = [0.0, 0.0]
 [robots.KH01]
 kind = "khepera4"
 body = "world"
-start = [-0.35, 0.0]
+start = [-0.3, 0.0]
 """
 IN_THE_AIR = """
 [robots.CF01]
@@ -63,7 +63,7 @@ sensors = ["multiranger"]
 """
 
 
-GOAL, NEAR_M, STAYS_S = (0.4, 0.0), 0.08, 0.3
+GOAL, NEAR_M, STAYS_S = (0.33, 0.0), 0.08, 0.3
 
 
 class Way(NamedTuple):

@@ -20,7 +20,7 @@ title = "one that hops, one that is not there"
 duration_s = 30.0
 start = { deadline_s = 8.0 }
 [robots]
-CF01 = { kind = "crazyflie", start = [-0.3, 0.0], hover = 0.5 }
+CF01 = { kind = "crazyflie", start = [-0.3, 0.0], hover = 0.3 }
 KH01 = { kind = "khepera4", start = [0.3, 0.0], body = "BODY" }
 [formation.links]
 "CF01 - KH01" = 0.8

@@ -7,12 +7,13 @@ import math
 import os
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 import zenoh
 
 from agents.network import messages
-from experiments.file import document
+from experiments.file import catalogue, document
 from tests.conftest import RouterProcess
 from tests.experiments.traces import parse_links
 from tests.system.lab import RobotProcess, Watcher
@@ -26,6 +27,14 @@ def fly(stack: ExitStack, router: RouterProcess, file: str, *names: str) -> Robo
     robot = RobotProcess(router.endpoint, file, *names)
     stack.callback(lambda: robot.process.returncode is not None or robot.end())
     return robot
+
+
+@pytest.fixture
+def low(tmp_path: Path) -> str:
+    """The triangle, whose drone is soon up and soon down."""
+    file = tmp_path / "low.toml"
+    file.write_text(catalogue.path("triangle").read_text("utf-8").replace("hover = 0.6", "hover = 0.3"), "utf-8")
+    return str(file)
 
 
 def subscriptions(session: zenoh.Session) -> dict[str, set[str]]:
@@ -96,9 +105,9 @@ def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
 
 
 @pytest.mark.mechanism("orders")
-def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher) -> None:
+def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
-        fly(stack, router, "triangle", *TRIANGLE)
+        fly(stack, router, low, *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
         reply = watcher.order("CF01", messages.Order("start", at=time.time()))
         assert (reply.ok, reply.reason) == (False, "cannot start while ready")
@@ -178,9 +187,9 @@ def nonsense() -> list[tuple[bytes, str]]:
 
 
 @pytest.mark.mechanism("malformed messages")
-def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess, watcher: Watcher) -> None:
+def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
-        fly(stack, router, "triangle", *TRIANGLE)
+        fly(stack, router, low, *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
         for name in TRIANGLE:
             watcher.order(name, messages.Order("takeoff"))
@@ -200,14 +209,14 @@ def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess
         watcher.until(lambda: watcher.status["CF01"].malformed >= expected, f"{expected} are counted")
         assert {watcher.phase(name) for name in TRIANGLE} == {"airborne"}
         state = watcher.state["CF01"]
-        assert state.position[2] == pytest.approx(0.6, abs=0.05)
+        assert state.position[2] == pytest.approx(0.3, abs=0.05)
         assert math.dist(state.position[:2], state.goal[:2] if state.goal else (9.0, 9.0)) < 0.1
 
 
 @pytest.mark.mechanism("lifeline: a robot lands with its starter")
-def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher) -> None:
+def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
-        robot = RobotProcess(router.endpoint, "triangle", *TRIANGLE, lifeline=True)
+        robot = RobotProcess(router.endpoint, low, *TRIANGLE, lifeline=True)
         stack.callback(lambda: robot.process.returncode is not None or robot.end())
         stdin = robot.process.stdin
         assert stdin is not None

@@ -100,6 +100,7 @@ def test_loop_that_stops_commanding():
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
         assert supervised(twin) != State.LOCKED
         assert "no commands from" in process.tick().notes[0]
+        process.cut()
 
 
 FLYING = """
