@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Annotated, Final
 
 import typer
@@ -126,10 +127,23 @@ def _report(message: str, remedy: str = "", problems: Sequence[object] | None = 
         print_json({"ok": False, "error": message, "problems": problems or []})
 
 
+def part_for(words: Sequence[str]) -> typer.Typer:
+    """The part of the application that has the command of a call: the whole takes 50 ms to build."""
+    for group in app.registered_groups:
+        own = group.typer_instance.registered_commands if group.typer_instance else []
+        inside = [each.name or getattr(each.callback, "__name__", "") for each in own]
+        names = [group.name] if group.name else inside
+        if words and words[0] in names:
+            part = copy(app)
+            part.registered_groups, part.registered_commands = [group], []
+            return part
+    return app
+
+
 def main() -> None:
     """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
     try:
-        sys.exit(app(prog_name="zenpark", standalone_mode=False))
+        sys.exit(part_for(sys.argv[1:])(prog_name="zenpark", standalone_mode=False))
     except UsageError as error:
         words = [] if error.ctx is None else error.ctx.command_path.split()[1:]
         message = _plain(error.format_message())

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from agents.network.endpoints import EndpointError, free_endpoint
 from experiments.recording.version import SHOWN, digest, provenance
 from tools.commands.options import PANELS
-from tools.main import EXPLAINED, app, main
+from tools.main import EXPLAINED, LAUNCHER, app, main, part_for
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)
@@ -128,6 +128,15 @@ def test_help_shows_every_command_in_a_panel_with_its_whole_description():
     words = " ".join(said.split())
     for name in panels:
         assert " ".join(f"{name} {shown[name].help.partition(chr(10))[0]}".split()) in words
+
+
+def test_a_call_builds_the_commands_beside_its_own_at_most():
+    for name in COMMANDS:
+        built = typer.main.get_command(part_for([name])).commands
+        assert name in built
+        assert len(built) < 10 or name in LAUNCHER
+    for words in ([], ["--help"], ["rnu"]):
+        assert part_for(words) is app
 
 
 def test_what_the_launcher_does_is_named():
