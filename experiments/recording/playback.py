@@ -66,6 +66,7 @@ class AboutRun:
         try:
             announced = float(about["started"]) if "started" in about else None
             experiment = msgspec.json.decode(attached, type=Experiment)
+            _ = Plan(experiment).one_way_links  # names of robots are not in the types
             return cls(about["case"], int(about["seed"]), about["clock"], announced, experiment)
         except (KeyError, ValueError, RecursionError) as error:
             text = f"holds no experiment that this version of zenpark can read ({error})"

@@ -87,10 +87,13 @@ def turtlebot_bridge() -> Iterator[Target]:
     examples = [f"tb3_0/{topic}\0\0".encode() + good[kind] for topic, kind in topics.items()]
     examples += [ros2.dds_token("f00d", "MS", "/tb3_0/cmd_vel", ros2.TWIST_STAMPED).encode() + b"\0\0"]
 
+    bodies = [TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))]
+
     def make():
+        bodies.pop()._claims.release()  # `close` would wait until the robot stands
         net.forget()
         net.first["tb3_0/odom"] = Sample("tb3_0/odom", "", good[ros2.ODOMETRY])
-        body = TurtleBot3(request("turtlebot3", "ros2dds://tb3_0"))
+        bodies.append(body := TurtleBot3(request("turtlebot3", "ros2dds://tb3_0")))
         body.open()
         t = 0.0
 

@@ -138,7 +138,7 @@ class HotChanges:
     def _refusals(self, order: messages.RunOrder) -> Iterator[str]:
         """Reasons to refuse the whole order."""
         known = self._robots
-        if unknown := next((name for name in order.robots if name not in known), None):
+        if (unknown := next((name for name in order.robots if name not in known), None)) is not None:
             yield f"no robot '{unknown[:50]}' in this run; {did_you_mean(unknown[:50], known)}"
         if not order.robots:
             yield f"name one or more of {', '.join(known)}"

@@ -248,6 +248,7 @@ def test_what_lies_where_it_was_lost_counts_unless_it_was_a_twin(stage: Stage) -
 def test_whole_orders_that_are_refused(stage: Stage) -> None:
     for query, said in (
         (stage.ask("remove", "KH1"), "no robot 'KH1' in this run"),
+        (stage.ask("add", ""), "no robot '' in this run"),
         (stage.ask("remove"), "name one or more of KH01, KH02, CF01"),
         (stage.ask("restart", "KH01", body="twin"), "belong to replace"),
         (stage.ask("replace", "KH01", "KH02", body="twin"), "one robot at a time"),
