@@ -126,8 +126,13 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         remedy = f"lead more slowly, or raise {strength(analysis)} or the clamp"
         yield Claim("warning", "lags", message, remedy, ("timeline",))
     else:
-        message = f"the formation is not acquired in time: {left} {allowed}"
-        remedy = f"give a longer duration_s, start nearer to the shape, or raise {strength(analysis)}"
+        departure = min(analysis.departure, end)
+        formed = analysis.acquired(departure)
+        late = f"again after {departure:g} s" if formed is not None else "in time"
+        before = f", acquired after {formed:.1f} s," if formed is not None else ""
+        message = f"the formation{before} is not acquired {late}: {left} {allowed}"
+        other = "start nearer to the shape" if formed is None else "change or lead more slowly"
+        remedy = f"give a longer duration_s, {other}, or raise {strength(analysis)}"
         yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
 
 
@@ -194,7 +199,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
     name = "gain" if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else "stiffness"
     enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
     remedy, path = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance", ("formation", name)
-    if (own := strength(analysis)) != GAIN:
+    if (own := strength(analysis)) not in GAIN.values():
         remedy, path = f"raise {own}, or allow a larger tolerance", ("formation", "law")
     return Claim("warning", "wheels-stop", message, remedy, path)
 

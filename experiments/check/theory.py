@@ -20,7 +20,7 @@ from experiments.file.problems import Path
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 OFF: Final = 0.001  # [m] more than written digits explain
 FEW: Final = 6  # names that are listed
-GAIN: Final = "the gain"  # or the stiffness, of the file
+GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
@@ -255,13 +255,13 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
 
 
 def strength(analysis: Analysis) -> str:
-    """Parameters that make the law ask for more or less: `GAIN`, or its own if it goes by these alone."""
+    """Parameters that make the law ask for more or less: one of `GAIN`, or its own if it goes by these alone."""
     law, links = analysis.assignment.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
     single = law.offset(place, place[links.sender], links)
     double = law.offset(place, place[links.sender], msgspec.structs.replace(links, gain=2.0 * links.gain))
     if analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True):
-        return GAIN
+        return GAIN[getattr(law, "PULLS_BY", "gain")]
     plugin = registry.struct(registry.LAWS, registry.split(analysis.experiment.formation.law)[0])
     return f"the law's own parameters ({', '.join(plugin.__struct_fields__) or 'it has none yet'})"
 
@@ -285,7 +285,7 @@ def stability(analysis: Analysis) -> Iterator[Claim]:
     path, gain = ("formation", name), float(getattr(formation, name))
     took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
     calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"
-    if (own := strength(analysis)) != GAIN:
+    if (own := strength(analysis)) not in GAIN.values():
         took = f"one decision takes {loop.gain:.3g} of the stiffest error"
         calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
         path = ("formation", "law")

@@ -165,7 +165,8 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     body = registry.body_name(robot.body)
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
     if body not in bodies:
-        yield Fault((*path, "body"), f"no {body!r} among the bodies", did_you_mean(body, bodies))
+        hint = f"{did_you_mean(body, bodies)}; one of your own is a plug-in to install (docs/plugins.md)"
+        yield Fault((*path, "body"), f"no {body!r} among the bodies", hint)
     elif (driven := DRIVES.get(body, robot.kind)) != robot.kind and robot.kind in KINDS:
         own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
         hint = f"write kind = '{driven}', or a body of a {robot.kind}: twin, world, {own}"

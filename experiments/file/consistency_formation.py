@@ -79,7 +79,8 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
     if needs in can and kind not in can[needs]:
         message = f"the law '{name}' needs {words[needs]} of every link; this one asks for a {kind}"
         example = {"relative": "{ offset = [0.6, 0.0] }", "bearing": "{ bearing = [1.0, 0.0] }"}.get(needs, "0.6")
-        yield Fault(path, message, f'write "{text}" = {example}, or take law = "mixed", which goes by each link')
+        hint = f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {example}'
+        yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
         return
     if not isinstance(given, Target):
         return

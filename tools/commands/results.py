@@ -243,6 +243,8 @@ def compare(
     from tools.progress import columns
 
     # in the given order: the first one is the reference
+    if gone := [folder for folder in folders if not Path(folder).is_dir()]:
+        raise RecordingError(f"{', '.join(gone)}: no such folder; name those of runs (`./zenpark runs --past`)")
     found = [run for folder in folders for run in past_runs([Path(folder)])]
     found = list({run.folder: run for run in found}.values())
     if len(found) < 2:
@@ -263,7 +265,7 @@ def compare(
             for case, figures in run.cases.items():
                 cells = [_against(values, reference.get(name, {})) for name, values in figures.items()]
                 rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
-        head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s")
+        head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s (– never)")
         print()
         print("\n".join(columns([head, *rows])))
         if seeds := max((len(run.seeds) for run in found if len(run.seeds) > 1), default=0):
@@ -279,7 +281,8 @@ def _against(values: Mapping[int, float | None], reference: Mapping[int, float |
 
     share = spread(ratios_by_seed(values, reference))
     behind = "" if share.mean is None or values is reference else f" (× {ratio_words(share)})"
-    return interval(spread([*values.values()])) + behind
+    known = spread([*values.values()])
+    return interval(known) + (f" ({known.n} of {len(values)})" if 0 < known.n < len(values) else "") + behind
 
 
 def _as_json(run: PastRun) -> dict[str, Any]:

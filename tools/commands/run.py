@@ -383,7 +383,7 @@ def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Non
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
     from experiments.metrics.statistics import Spread, spread
-    from experiments.report.page import NONE, interval
+    from experiments.report.page import interval
     from experiments.report.tables import ratio_words
 
     case = found["cases"][name]
@@ -397,9 +397,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     if case["mean"]["iae"] is None:
         line += ", no link was measured"
     else:
-        never = mean["acquired_s"] == NONE
         line += f", IAE {mean['iae']}, RMSE {mean['rmse']} m"
-        line += f", acquired {'never' if never else mean['acquired_s'] + ' s'} (mean)"
+        line += f", acquired {_acquired(mean['acquired_s'], [each.mean['acquired_s'] for each in measured])}"
     line += f", lost {sum(each.lost for each in measured)}"
     for field, words in (("missed_deadlines", "deadlines missed"), ("dropped", "dropped by the modelled network")):
         if count := sum(getattr(each, field) for each in measured):
@@ -407,3 +406,10 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     if name != next(iter(found["cases"])):
         line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']})"
     return line
+
+
+def _acquired(mean: str, seeds: Sequence[float | None]) -> str:
+    """Time of acquisition in words, over the seeds: `mean` is over those that acquired."""
+    n = sum(each is not None for each in seeds)
+    of = "mean" if n == len(seeds) else f"mean of {n} of {len(seeds)} seeds, the others never"
+    return f"{mean} s ({of})" if n else "never (mean)"

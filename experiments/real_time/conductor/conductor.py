@@ -354,6 +354,6 @@ class Conductor:
             last = self._processes.last_line(name)
             lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))
         ended = all(self._robots[name].gone for name in names)
-        remedy = "mend that" if ended else "give them more time with start.deadline_s"
+        remedy = "mend that" if ended else "mend that, give them more time with start.deadline_s"
         lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")
         return "\n".join(lines)

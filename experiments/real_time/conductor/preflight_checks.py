@@ -16,8 +16,10 @@ from agents.arrays import Array
 from agents.body.interface import settings
 from agents.body.limits import Safety
 from agents.network import messages
+from agents.plugins import registry
 from agents.protocols import tello
 from agents.safety.detection import clock_off, clock_text
+from experiments.definition.bodies import DRIVES
 from experiments.definition.experiment import Robot
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 
@@ -136,7 +138,8 @@ def at_rest(observed: Mapping[str, Observed], safety: Safety, today: date) -> di
 
 
 def _address(each: Observed) -> Check:
-    remedy = CONNECT.get(each.robot.kind, "is it switched on, and its address right?")
+    ours = registry.body_name(each.robot.body) in DRIVES  # another body knows its robot better than we do
+    remedy = CONNECT.get(each.robot.kind if ours else "", "is it switched on, and its address right?")
     if each.status is None:
         return _bad("address", each.ended or "its process says nothing", remedy)
     silent = not len(each.positions()) and each.status.battery is None and each.last.firmware is None

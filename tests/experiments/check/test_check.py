@@ -597,3 +597,16 @@ def test_every_error_and_warning_has_a_remedy_and_a_place(made):
         assert each.message
         assert each.severity == "note" or (each.remedy and each.where)
     assert json.loads(msgspec.json.encode(numbers["default"]))["robots"] == len(made.robots)
+
+
+def test_a_formation_that_is_lost_again_was_acquired_and_names_the_stiffness(tmp_path):
+    (tmp_path / "lost.toml").write_text(
+        'title = "A leader goes"\nduration_s = 17.0\n'
+        '[robots.L]\nkind = "turtlebot3"\nstart = [0.0, 0.0]\n[robots.F]\nkind = "khepera4"\nstart = [-0.6, 0.0]\n'
+        '[formation]\nlaw = "displacement"\nstiffness = 0.15\n[formation.links]\n"L > F" = { offset = [-0.5, 0.0] }\n'
+        '[[timeline]]\nat_s = 8.0\nrobot = "L"\nplan = { kind = "line", move_by = [0.4, 0.0], speed = 0.08 }\n'
+    )
+    _, message, remedy, _ = bad(str(tmp_path / "lost.toml"))["not-acquired"]
+    assert message.startswith("the formation, acquired after ")
+    assert " s, is not acquired again after 8 s: L - F is " in message
+    assert remedy.endswith("or raise the stiffness")

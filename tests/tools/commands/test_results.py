@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
 from tests.experiments.recording.test_bundle import SHORT
+from tools.commands.run import _acquired
 from tools.main import app
 
 pytestmark = pytest.mark.slow  # whole runs and their reports
@@ -171,3 +172,15 @@ def test_an_interrupted_run_over_seeds_says_what_is_kept(
     assert done.exit_code != 0
     assert f"interrupted: {kept}" in done.stderr
     assert "`./zenpark sweep` keeps every seed" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("mean", "seeds", "words"),
+    [
+        ("5.45 ± 0.01", [5.4, 5.5], "5.45 ± 0.01 s (mean)"),
+        ("7.79", [7.79, None, None], "7.79 s (mean of 1 of 3 seeds, the others never)"),
+        ("?", [None], "never (mean)"),
+    ],
+)
+def test_seeds_that_never_acquire_are_counted(mean: str, seeds: list[float | None], words: str) -> None:
+    assert _acquired(mean, seeds) == words

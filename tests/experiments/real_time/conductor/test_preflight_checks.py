@@ -239,3 +239,10 @@ def test_sticks_that_could_not_be_measured():
     fast = checks.sticks(each, Tried(failure="came down by itself: it moves", states=pushed(0.5, 0.0)[:200]))
     assert "double stick_speed" in fast.remedy
     assert checks.sticks(each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
+
+
+def test_a_robot_behind_a_body_of_ones_own_has_no_remedy_of_another_device():
+    own = msgspec.structs.replace(DRONE, body="quad://127.0.0.1:6001")
+    silent = Observed(own, ended="CF01: no pose within 3 s")
+    (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]
+    assert (made.verdict, made.remedy) == ("bad", "is it switched on, and its address right?")
