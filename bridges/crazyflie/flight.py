@@ -106,9 +106,10 @@ class Flight:
         """Time for which a setpoint is held before the descent [s]."""
         return max(HOLD_S, PERIODS / self._stream_hz)
 
-    def slow_setpoints(self) -> None:
-        """Halve the rate of setpoints, down to `SLOWEST_HZ`, or to the rate chosen if that is lower."""
-        self._stream_hz = min(max(0.5 * self._stream_hz, SLOWEST_HZ), self._settings.stream_hz)
+    def scale_setpoints(self, share: float) -> None:
+        """Set the rate of setpoints to a share of that chosen; not below `SLOWEST_HZ`, unless that was chosen."""
+        chosen = self._settings.stream_hz
+        self._stream_hz = min(max(share * chosen, SLOWEST_HZ), chosen)
 
     # ------------------------------------------------------------------ orders
 

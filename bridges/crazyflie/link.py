@@ -132,6 +132,7 @@ class CrazyflieLink:
         self._error: str | None = None
         self._answered = self._unsafe = False
         self._blocks: dict[str, Any] = {}
+        self._periods: dict[str, int] = {}  # that were asked for, in units of 10 ms
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
         self._values: dict[str, float] = {}  # answers about parameters
         self.trajectories = Trajectories(self._send)
@@ -229,7 +230,7 @@ class CrazyflieLink:
             block.start()
         except AttributeError as error:  # block too large, too many blocks, or link lost meanwhile
             raise LinkError(f"log block {name}: {error}") from error
-        self._blocks[name] = block
+        self._blocks[name], self._periods[name] = block, block.period
 
     def stop_log(self, name: str) -> None:
         """End a log block."""
@@ -243,13 +244,12 @@ class CrazyflieLink:
             block.added = False
             block.start()
 
-    def slow_logs(self) -> bool:
-        """Halve the rate of all log blocks, down to 5 Hz; False if none is faster."""
-        fast = [block for block in list(self._blocks.values()) if block.period < SLOWEST]
-        for block in fast:
-            block.period = min(2 * block.period, SLOWEST)
+    def scale_logs(self, share: float) -> None:
+        """Set the rates of all log blocks to a share of those asked for; not below 5 Hz."""
+        for name, block in list(self._blocks.items()):
+            period = self._periods[name]
+            block.period = min(round(period / share), max(SLOWEST, period))
             block.start()
-        return bool(fast)
 
     def send_parameter(self, parameter: str, value: float | None) -> None:
         """Set a parameter, or ask for its value (None), without waiting for the answer; see `parameter_answer`.

@@ -26,6 +26,8 @@ STATUS_S: Final = 2.0  # deadline of the first status
 RETRY_S: Final = 0.5
 QUEUE_S: Final = 0.5  # poses that wait for longer, and not only for a moment, are too many: the rate of logs is halved
 LATE_S: Final = 1.0
+CALM_S: Final = 5.0  # without a queue on the ground, and the rates are those chosen again
+LEAST_SHARE: Final = 0.1
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
 EXTERNAL_AGE_S: Final = 0.5  # older external poses are not passed on
@@ -73,7 +75,8 @@ class CrazyfliePilot:
         self._closers: list[threading.Thread] = []
         self._stood_still = 0.0  # [s] a standstill of the process that was not acted on yet
         self._logs_at = -inf  # last creation of the log blocks [s]
-        self._late_since, self._slowed = inf, False  # begin of a queue before the radio [s]; logs were slowed down
+        self._late_since, self._late_until = inf, -inf  # begin and end of a queue before the radio [s]
+        self._share = 1.0  # of the rates of logs and setpoints that were chosen
         rate = max(settings.stream_hz, LOOP_HZ)
         if isinstance(settings.positioning, Outside):
             rate = max(rate, settings.positioning.rate_hz)
@@ -110,7 +113,7 @@ class CrazyfliePilot:
                 self._connection_note,
                 self._flight.trouble,
                 self._telemetry.status_text(),
-                "its radio carries less than was measured: fewer logs" if self._slowed else "",
+                "its radio carries less than was measured: fewer logs" if self._share < 1.0 else "",
             )
             if part
         )
@@ -245,7 +248,8 @@ class CrazyfliePilot:
         """
         settings, telemetry = self._settings, self._telemetry
         telemetry.reset_status()
-        self._slowed = False
+        self._share = 1.0
+        self._flight.scale_setpoints(1.0)
         link.define_trajectories()  # before answers wait behind logs
         ranges_hz = settings.ranges_hz if settings.multiranger else None
         telemetry.start_logging(link, log_hz=settings.log_hz, ranges_hz=ranges_hz)
@@ -360,13 +364,19 @@ class CrazyfliePilot:
         late = self._telemetry.pose_age - (now - self._telemetry.arrival)  # [s] time in queues
         if not late > QUEUE_S:
             self._late_since = inf
-        elif self._late_since == inf:
-            self._late_since = now
+        else:
+            self._late_since, self._late_until = min(self._late_since, now), now
         if now - self._late_since > LATE_S:
             self._late_since = now + SLOWING_S
-            self._slowed = link.slow_logs() or self._slowed
-            self._flight.slow_setpoints()
+            self._scale_rates(link, max(0.5 * self._share, LEAST_SHARE))
+        elif self._share < 1.0 and self._flight.phase is Phase.GROUND and now - self._late_until > CALM_S:
+            self._scale_rates(link, 1.0)  # it was this computer that was busy; in the air nothing is tried
         self._flight.land_after_gap(gap)
+
+    def _scale_rates(self, link: CrazyflieLink, share: float) -> None:
+        self._share = share
+        link.scale_logs(share)
+        self._flight.scale_setpoints(share)
 
     def _pause(self, seconds: float) -> None:
         """Wait in the middle of an order.

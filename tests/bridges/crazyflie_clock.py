@@ -158,6 +158,7 @@ class Fleet:
         asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
         self.settings = chosen("", device, external=False)
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
+        self.twin.flock.estimator.error[:] = 0.0  # set up
         self.board = Board(rows)
         self.board.settled[:] = True
         self.drones = [Drone(self, row) for row in range(rows)]

@@ -8,7 +8,7 @@ import pytest
 from cflib.drivers import crazyradio
 
 from agents.protocols.crtp import Port
-from bridges.crazyflie import body, link
+from bridges.crazyflie import body, link, pilot
 from bridges.crazyflie.body import open_crazyflie
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
@@ -268,8 +268,12 @@ def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
         assert descent.fastest.max() < SINKS
 
 
-def test_a_radio_that_becomes_slow_gets_fewer_logs():
-    """Fewer exchanges than logs: their rates are halved until poses are young again, and the drone flies on."""
+def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
+    """Fewer exchanges than logs: their rates are halved until poses are young again, and the drone flies on.
+
+    On the ground, over a radio that is fast again, they are restored.
+    """
+    monkeypatch.setattr(pilot, "CALM_S", 1.0)
     with flown(device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         hovering(process).run(0.2)
@@ -278,8 +282,12 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs():
         process.until(lambda: "fewer logs" in process.state.notes[0], "note")
         process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
         dongle._air = dongle._air._replace(hz=500.0)
+        assert "fewer logs" in process.state.notes[0]
         process.land()
         assert supervised(twin) != State.LOCKED
+        process.until(lambda: "fewer logs" not in process.state.notes[0], "the rates that were chosen")
+        blocks = process.body._pilots[0]._link._blocks
+        assert blocks["state"].period == 5
 
 
 def test_recovery_from_a_crash_is_asked_for():
@@ -298,46 +306,28 @@ def test_recovery_from_a_crash_is_asked_for():
             again.close()
 
 
-# rates that a radio of 500 exchanges/s carries; for 15 drones one of 1,000
-FLEETS = {
-    4: (500.0, {}),
-    8: (500.0, {"stream_hz": 5.0}),
-    15: (1000.0, {"stream_hz": 4.0}),
-}
-
-
-@pytest.mark.parametrize("rows", FLEETS)
 @pytest.mark.timeout(120)
-def test_fleets_on_one_radio(rows, monkeypatch, tmp_path):
-    """Connected from a cold cache, taken off, led and landed; no command is refused, poses are young all the time."""
+def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
+    """Connected from a cold cache, taken off, led and landed; no command is refused. `test_budget` has the ages."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(link, "_KNOWN_TABLES", {})
-    exchanges, rates = FLEETS[rows]
-    begin = time.monotonic()
-    with flown(rows=rows, device=RADIO | rates, exchanges_hz=exchanges) as (twin, process):
-        connected = time.monotonic() - begin
-        descent, ages, notes = Descent(twin, process), [], set()
+    rows = 8
+    with flown(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):
+        assert process.body._exchanges(list(range(rows))) < 60 * 250, "a minute of a slow radio"
+        descent, notes = Descent(twin, process), set()
         tick = process.tick
 
         def watched():
             state = tick()
-            ages.append(process.t - state.time)
             notes.update(state.notes)
             return state
 
         process.tick = watched
         process.takeoff(HEIGHT)
-        before, since = process.body._exchanges(list(range(rows))), process.t
         hovering(process, rows, x=0.2).run(4.0)
-        made = (process.body._exchanges(list(range(rows))) - before) / (process.t - since)
         assert np.abs(twin.truth()[0][:, 0] - 0.2).max() < 0.05
         process.land()
-        age = np.percentile(ages, 99)
-        print(f"{rows} drones connected in {connected:.1f} s; 99 % of poses below {1e3 * age:.0f} ms, {made:.0f}/s")
-        assert connected < 60.0
         assert not any("refused" in note or "landed" in note for note in notes), notes
-        if made > 1.3 * process.body._loads[0]:  # else this computer is too busy for the radio that was measured
-            assert age < 0.2
         assert descent.fastest.max() < SINKS
 
 

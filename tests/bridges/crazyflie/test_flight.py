@@ -113,8 +113,7 @@ def test_a_setpoint_that_changes_by_less_than_is_sent_does_not_change(air):
 
 
 def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
-    for _ in range(4):
-        air.flight.slow_setpoints()
+    air.flight.scale_setpoints(0.1)
     places = iter(np.linspace(0.2, 0.8, 1000))
     setpoint = air.flight.set_target
     air.flight.set_target = lambda now, _: setpoint(now, (0.1, next(places), 0.5, 0.0))
