@@ -68,8 +68,8 @@ class FlightOrders:
         self._climb(rows, height, position)
 
     def land(self, rows: Index, position: Array) -> None:
-        """Descend from `position` (n, 3) [m]."""
-        rows = rows[self.flying[rows]]
+        """Descend from `position` (n, 3) [m]; rows that do already go on, however often the order is repeated."""
+        rows = rows[self.flying[rows] & ~self.landing[rows]]
         self.landing[rows] = True
         self._climb(rows, np.zeros(len(rows)), position)
 

@@ -126,6 +126,19 @@ def test_landing_ends_on_the_floor_with_motors_off(kind):
     assert touch.argmax() * 0.01 > 0.8 / CLIMB
 
 
+def test_a_landing_that_is_ordered_again_every_half_second_takes_no_longer():
+    once, again = flying(), flying()
+    for step in range(400):
+        if step == 0:
+            once.land(np.array([0]))
+        if step % 50 == 0:
+            again.land(np.array([0]))
+        once.advance()
+        again.advance()
+        np.testing.assert_array_equal(again.position, once.position)
+    assert not again.flying[0]
+
+
 def test_motors_off_is_a_fall():
     quadrotor = flying(height=1.5)
     quadrotor.stop(np.array([0]))
