@@ -315,10 +315,10 @@ def deserted(session: zenoh.Session) -> bool:
     return all(transport.whatami == zenoh.WhatAmI.ROUTER for transport in session.info.transports())
 
 
-def tokens_present(session: zenoh.Session, keyexpr: str, wait_s: float = ASK_S) -> set[str] | None:
-    """Keys of the liveliness tokens that match; None without a reply within `wait_s`."""
+def tokens_present(session: zenoh.Session, keyexpr: str) -> set[str] | None:
+    """Keys of the liveliness tokens that match; None without a reply in time."""
     found = set()
-    for reply in session.liveliness().get(keyexpr, timeout=wait_s):
+    for reply in session.liveliness().get(keyexpr, timeout=ASK_S):
         if reply.ok is None:
             return None
         found.add(str(reply.ok.key_expr))

@@ -177,12 +177,12 @@ def numbers(text: str) -> list[float]:
     return found
 
 
-def scanned(text: str, count: int = 3) -> list[float]:
-    """The first numbers behind a park command's letter, as C's `scanf` finds them: what is glued behind is lost.
+def scanned(text: str) -> list[float]:
+    """The first three numbers behind a park command's letter, as C's `scanf` finds them: what is glued behind is lost.
 
     No larger than a million: nothing that is meant is, and what is infinite cannot be computed with.
     """
-    return [max(-1e6, min(1e6, float(word))) for word in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)", text)[:count]]
+    return [max(-1e6, min(1e6, float(word))) for word in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)", text)[:3]]
 
 
 def sound_distance(centimetres: Array) -> Array:

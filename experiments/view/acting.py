@@ -66,8 +66,8 @@ def may_act(watched: Watched) -> bool:
 class Acting:
     """Buttons of an operator's page, and the orders that they give."""
 
-    def __init__(self, session: zenoh.Session, watched: Watched, clock: Clock | None = None) -> None:
-        self._session, self._watched, self._clock = session, watched, clock or Clock()
+    def __init__(self, session: zenoh.Session, watched: Watched) -> None:
+        self._session, self._watched, self._clock = session, watched, Clock()
         self._keys = keys = Keys(watched.realm)
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
         self._urgent = session.declare_publisher(

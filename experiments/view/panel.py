@@ -90,13 +90,13 @@ class History:
 class Panel:
     """The panel of one page."""
 
-    def __init__(self, server: viser.ViserServer, *, plots: bool = True) -> None:
-        self._gui, self._plots = server.gui, plots
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._gui = server.gui
         self._head = self._gui.add_html("", order=1.0)
         self._bar: Any = self._gui.add_progress_bar(0.0, color=(90, 130, 180), order=2.0)
         with self._gui.add_folder("Robots", order=10.0):
             self._table = self._gui.add_html("")
-        self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0, visible=plots)
+        self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0)
         self._error: Any = None
         self._rate: Any = None
         with self._gui.add_folder("Links", order=25.0, expand_by_default=False):
@@ -115,7 +115,7 @@ class Panel:
             if plot is not None:
                 plot.remove()
         self._error = self._rate = None
-        if not self._plots or not stage.names:
+        if not stage.names:
             return
         many = len(stage.names) > CURVES
         names = ("largest", "median", "smallest") if many else stage.names

@@ -51,11 +51,9 @@ def send_order(
     return replies
 
 
-def send_world_order(
-    session: zenoh.Session, keys: Keys, order: messages.WorldOrder, wait_s: float = REPLY_S
-) -> messages.WorldReply:
+def send_world_order(session: zenoh.Session, keys: Keys, order: messages.WorldOrder) -> messages.WorldReply:
     """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
-    asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
+    asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=REPLY_S)
     reply, why = _read(asked, messages.WorldReply)
     nobody = "no world answers: is `./zenpark world serve` running in this realm?"
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)

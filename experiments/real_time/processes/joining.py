@@ -131,14 +131,13 @@ def wait_for_experiment(session: zenoh.Session, keys: Keys, names: Sequence[str]
 
 
 class ConductorWatch:
-    """Ends this process, as SIGTERM does, when the conductor is gone: its robots land first.
+    """Ends this process, as SIGTERM does, when the conductor's token is gone for `SILENCE_S`: its robots land first.
 
     Without a router every token is gone, which proves nothing; the robots do what they do without a router.
     """
 
-    def __init__(self, session: zenoh.Session, keys: Keys, silence_s: float = SILENCE_S) -> None:
-        """Starts to watch; a conductor whose token is missing for `silence_s` [s] is gone."""
-        self._session, self._silence_s = session, silence_s
+    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session = session
         self._watch = pubsub.AliveWatch(session, keys.conductor)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch_token, name="conductor watch", daemon=True)
@@ -154,7 +153,7 @@ class ConductorWatch:
             for _, alive in self._watch.changes():
                 there = alive
             missing_s = 0.0 if there or not network.connected(self._session) else missing_s + LOOK_S
-            if missing_s > self._silence_s:
+            if missing_s > SILENCE_S:
                 print("the conductor is gone", flush=True)
                 os.kill(os.getpid(), signal.SIGTERM)
                 return

@@ -118,18 +118,18 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
     return Runtime(assignment, body, setup).run()
 
 
-def read_experiment(fd: int = 0, limit_s: float = EXPERIMENT_S) -> str:
-    """The first line of a file descriptor; the following ones belong to the lifeline.
+def read_experiment() -> str:
+    """The first line of standard input; the following ones belong to the lifeline.
 
     Raises:
         DocumentError: If none comes in time.
     """
-    deadline = time.monotonic() + limit_s
+    deadline = time.monotonic() + EXPERIMENT_S
     waiting = select.poll()
-    waiting.register(fd, select.POLLIN)
+    waiting.register(0, select.POLLIN)
     text = b""
     while waiting.poll(max(0.0, deadline - time.monotonic()) * 1e3):
-        data = os.read(fd, 65536)
+        data = os.read(0, 65536)
         line, end, _ = data.partition(b"\n")
         text += line
         if end:
@@ -137,7 +137,7 @@ def read_experiment(fd: int = 0, limit_s: float = EXPERIMENT_S) -> str:
         if not data:
             break
     hint = "a robot with FILE - reads the experiment there, as JSON in one line"
-    raise refusal("standard input", f"no experiment came within {limit_s:g} s", hint)
+    raise refusal("standard input", f"no experiment came within {EXPERIMENT_S:g} s", hint)
 
 
 def _ranging(robot: Robot) -> Ranging:
