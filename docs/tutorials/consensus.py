@@ -1,9 +1,8 @@
 # %% [markdown]
 # # Consensus and the Laplacian
 #
-# Six drones want to meet. Each hears some of the others, and flies a little toward those that it hears. Do they
-# meet, where, and how soon? One matrix answers, before anything moves: the Laplacian of the graph of who hears
-# whom.
+# Six drones are to meet. Each receives the poses of some of the others, and flies a little toward these neighbours.
+# Do they meet, where, and how soon? One matrix answers before anything moves: the Laplacian of the graph of links.
 #
 # The lesson computes the answer, has six simulated drones fly it, and compares. Every claim below stands beside an
 # `assert` of it. You need eigenvalues and first-order differential equations, and about an hour.
@@ -31,7 +30,7 @@ N = 6
 # %% [markdown]
 # ## 1. Graphs, and their Laplacian
 #
-# A graph is its edges. Here both ends of an edge hear each other, so the graph has no direction.
+# A graph is its edges. Here both ends of an edge receive from each other, so the graph has no direction.
 
 # %%
 Pairs = list[tuple[int, int]]
@@ -44,14 +43,14 @@ GRAPHS: dict[str, Pairs] = {
 
 
 def laplacian_of(pairs: Pairs) -> Array:
-    """L = D − A of the graph in which both ends of every pair hear each other."""
+    """L = D − A of the graph in which both ends of every pair receive from each other."""
     return laplacian(links([*pairs, *((j, i) for i, j in pairs)]), N)
 
 
 print(laplacian_of(GRAPHS["path"]))
 
 # %% [markdown]
-# On the diagonal is how many a robot hears; off it, −1 for each of them. So every row adds up to zero: L times a
+# On the diagonal is a robot's number of neighbours; off it, −1 for each. So every row adds up to zero: L times a
 # vector of equal numbers is zero, and 0 is always an eigenvalue, λ₁. Without directions L is symmetric, the
 # eigenvalues are real and none is negative. The next one, λ₂, is the *algebraic connectivity* (Fiedler, 1973): it
 # is zero if and only if the graph falls into parts. For some graphs the eigenvalues are known in closed form.
@@ -73,7 +72,7 @@ for name, pairs in GRAPHS.items():
     print(f"{name:>9}: {len(pairs):2d} edges, eigenvalues {np.round(eigenvalues, 3) + 0.0}")
 
 # %% [markdown]
-# Two triangles that know nothing of each other: the eigenvalue 0 comes twice, once for each part.
+# Two triangles without a link between them: the eigenvalue 0 comes twice, once for each part.
 
 # %%
 two_triangles: Pairs = [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)]
@@ -110,13 +109,13 @@ show(spectra(), OUT / "consensus-spectra")
 # %% [markdown]
 # ## 2. The experiment
 #
-# The law `displacement` moves the goal of robot i by uᵢ = −k Σⱼ (xᵢ − xⱼ − dᵢⱼ) over the robots j that it hears.
+# The law `displacement` moves the goal of robot i by uᵢ = −k Σⱼ (xᵢ − xⱼ − dᵢⱼ) over its neighbours j.
 # With all offsets dᵢⱼ = 0 that is −k times row i of L x: consensus. k is the `stiffness`, the share of a difference
 # that one decision takes; there are ten decisions in a second.
 #
 # All meet in one point of the plane, so each drone holds a height of its own, 0.4 m above the next. What happens
-# along z is no part of the law. The network is perfect, and nobody wobbles: what we see is the law and the drones'
-# own dynamics.
+# along z is no part of the law. The network is perfect, and no drone wobbles: the motion shows the law and the
+# drones' own dynamics.
 
 # %%
 START = [(-1.0, 0.6), (-0.4, -0.9), (0.9, -0.5), (0.2, 1.0), (1.1, 0.7), (-0.8, -0.2)]  # x, y [m]
@@ -150,7 +149,7 @@ experiments = {name: rendezvous(pairs, GAIN, DURATION_S) for name, pairs in GRAP
 print("\n".join(str(finding) for finding in check(experiments["ring"])))
 
 # %% [markdown]
-# `check` knows what we do: the network is whole and has no leader, the loop settles. It warns us that drones would
+# `check` finds: the network is whole and has no leader, the loop settles. It warns that drones would
 # land on each other, and it is right. Meeting is a law for a lesson and for particles; robots have a size and take
 # offsets that are not zero. Nothing below changes with them, see exercise 1.
 
@@ -185,7 +184,7 @@ show(motions(), OUT / "consensus-motions")
 # %% [markdown]
 # *Where* do they meet? L is symmetric, so 1ᵀ L = 0: the law moves the sum of all x by nothing, and the meeting
 # place can only be the mean of the starts, the dashed line, whatever the graph. (A message takes 20 ms at most
-# until it is heard; that costs less than a millimetre.)
+# until it is received; that costs less than a millimetre.)
 
 # %%
 for name, trace in runs.items():
@@ -197,7 +196,7 @@ for name, trace in runs.items():
 # %% [markdown]
 # ## 3. How fast: the rate predicted
 #
-# Write x in the eigenvectors of L: x = Σ zᵢ vᵢ. The modes do not hear of each other. *First prediction*, with
+# Write x in the eigenvectors of L: x = Σ zᵢ vᵢ. The modes do not act on each other. *First prediction*, with
 # robots that close a distance to their goal at the rate c (`response`, 2 per second for a Crazyflie): żᵢ = −c k λᵢ
 # zᵢ. Every mode decays at its own rate c k λᵢ; the slowest is that of λ₂, so **the algebraic connectivity is the
 # rate of convergence**.
@@ -373,8 +372,8 @@ show(step_sizes(), OUT / "consensus-steps")
 #
 # 1. Give the links the offsets of a hexagon of 0.6 m instead of zeros. Show that with y = x − (its corners) nothing
 #    in section 3 changes, and measure the rates again. Which warnings of `check` are gone?
-# 2. Let D0 hear nobody (`"D0 > D1"` instead of `"D0 - D1"`), in the path and in the star. L is not symmetric now:
-#    where do they meet, and why? Delete row and column of D0 from L: its smallest eigenvalue is the new rate.
-#    Predict it, then run.
+# 2. Let D0 receive from no robot (`"D0 > D1"` instead of `"D0 - D1"`), in the path and in the star. L is not
+#    symmetric now: where do they meet, and why? Delete row and column of D0 from L: its smallest eigenvalue is the
+#    new rate. Predict it, then run.
 # 3. You may place one more edge in the path of six. Which one makes λ₂ largest? Try all ten by eigenvalues, then
 #    fly the best and the worst.

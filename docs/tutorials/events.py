@@ -1,10 +1,9 @@
 # %% [markdown]
 # # Periodic or event-triggered?
 #
-# Robots tell their neighbours where they are. How often need they? The usual answer is: periodically, and often
-# enough. The other one is: when there is something to say. This lesson flies the reference experiment of *Robotic
-# Park* with both, works out by hand what the report says of them, and then asks whether the comparison is a fair
-# one.
+# Robots transmit their positions to their neighbours. How often is this needed? The usual answer is: periodically,
+# and often enough. The other one is: when there is news. This lesson flies the reference experiment of *Robotic
+# Park* with both, computes the figures of the report by hand, and then asks whether the comparison is a fair one.
 #
 # Every claim below stands beside an `assert` of it. You need integrals, and about an hour.
 
@@ -24,12 +23,12 @@ from experiments.sweep.sweep import sweep
 OUT = folder("docs/tutorials/out")
 
 # %% [markdown]
-# ## 1. Two ways to speak
+# ## 1. Two ways to transmit
 #
 # A TurtleBot leads three Kheperas and three Crazyflies, which keep twelve distances. The followers form up, at 21 s
 # the leader drives off. The experiment has two cases that differ in nothing but the trigger, the rule by which a
-# robot speaks: `periodic`, 50 times a second; and `send-on-delta`, when the position is more than δ = 1 cm from
-# what was said last.
+# robot transmits: `periodic`, 50 times a second; and `send-on-delta`, when the position is more than δ = 1 cm from
+# the one transmitted last.
 #
 # We add a third case and leave it for section 4. The noise of all cases is the same, drawn from the same seed.
 
@@ -45,7 +44,7 @@ for name, case in run.metrics.items():
 
 # %% [markdown]
 # These are means over the six followers. Two of the three figures are worth doing by hand. f is the number of
-# messages over the time. The error of a robot is the sum over the links on which it listens, eᵢ = Σⱼ |dᵢⱼ − ‖pᵢ −
+# messages over the time. The error of a robot is the sum over the links on which it receives, eᵢ = Σⱼ |dᵢⱼ − ‖pᵢ −
 # pⱼ‖|, on true positions; the IAE is its integral. (ITAE weighs it by time, and so asks for errors that do not
 # last.)
 
@@ -58,7 +57,7 @@ def by_hand(trace: Trace) -> tuple[float, float]:
     off = np.abs(net.distance - norm(position[:, net.receiver] - position[:, net.sender]))  # (T, E)
     rates, errors = [], []
     for row in range(len(trace.robots)):
-        if row in net.receiver:  # the leader is not: it listens to nobody
+        if row in net.receiver:  # the leader is not: it receives nothing
             rates.append(len(trace.sent_by(row)) / duration)
             error = off[:, net.receiver == row].sum(axis=1)
             errors.append(np.trapezoid(error, trace.time))
@@ -82,11 +81,11 @@ pictures = run.figures()
 show(pictures["events"], OUT / "events-raster")
 
 # %% [markdown]
-# ## 2. When do they speak?
+# ## 2. When do they transmit?
 #
-# The raster shows it at a glance: whoever moves speaks, whoever stands is silent. The leader proves it best. It
-# stands for 21 s, then drives 0.75 m at 0.15 m/s. It needs δ/v = 67 ms for a centimetre; the trigger is asked every
-# 20 ms, so it transmits every 80 ms, and 0.75/0.01 = 75 times at most.
+# The raster shows it at a glance: a robot that moves transmits, one that stands is silent. The leader shows it
+# best. It stands for 21 s, then drives 0.75 m at 0.15 m/s. It needs δ/v = 67 ms for a centimetre; the trigger is
+# evaluated every 20 ms, so it transmits every 80 ms, and 0.75/0.01 = 75 times at most.
 
 # %%
 ASKED_S = 0.02  # `pose_hz` is 50
@@ -100,16 +99,16 @@ def waits(trace: Trace, robot: str) -> Array:
 event = run.traces["event"]
 leader = event.sent.stamp[event.sent.link == event.robots.index("TB01")]
 first = waits(event, "TB01")
-print(f"the leader speaks {len(leader)} times, from {leader[0]:.1f} s on, {np.median(first):.2f} s apart")
+print(f"the leader transmits {len(leader)} times, from {leader[0]:.1f} s on, {np.median(first):.2f} s apart")
 assert leader[0] > 21.0
 assert 50 <= len(leader) <= 75
 assert abs(np.median(first) - np.ceil(DELTA / 0.15 / ASKED_S) * ASKED_S) < 1e-9
 
 # %% [markdown]
-# Could a robot speak without end, infinitely often in a finite time? In continuous time that is what must be
+# Could a robot transmit infinitely often in a finite time? In continuous time that is what must be
 # excluded for every trigger (*Zeno* behaviour). Here it cannot happen: a trigger is asked 50 times a second, and
-# that is the most it can say. More than that, a robot that drives with v at most cannot say anything sooner than
-# after δ/v, but for noise.
+# that is the highest rate. Moreover, a robot that drives with v at most transmits no sooner than after δ/v, but for
+# noise.
 
 # %%
 for robot in event.robots:
@@ -123,9 +122,9 @@ for robot in event.robots:
         assert wait.min() > DELTA / 0.2712 - 0.0003 * 4.0 / 0.2712  # top speed of a Khepera, and 4 σ of the noise
 
 # %% [markdown]
-# The Crazyflies speak most, and even 20 ms apart. They do not drive faster than the Kheperas; they wobble. Their
+# The Crazyflies transmit most, and even 20 ms apart. They do not drive faster than the Kheperas; they wobble. Their
 # hover jitter has σ = 1 cm, as much as the threshold. Without it they need less than half of the messages: **most
-# of what drones say is about gusts, not about the formation.**
+# of what drones transmit is about gusts, not about the formation.**
 
 # %%
 calm = simulate(load("robotic-park", "disturbance.crazyflie={}"), cases=["event"]).metrics["event"]
@@ -141,11 +140,11 @@ show(pictures["intervals"], OUT / "events-intervals")
 # %% [markdown]
 # ## 3. What do the neighbours believe?
 #
-# Between two messages a listener takes the speaker to be where it last said. How wrong is that? By δ at most, is
-# the promise of send-on-delta, at the moments when the trigger is asked. Between two of these, 20 ms apart, a robot
-# moves on, and a message takes a millisecond. For ground robots that is 5 mm at top speed; drones in a gust do
-# more. (At the leader's 0.15 m/s the belief is beyond δ from 67 ms to 80 ms after each message, a sixth of the
-# time.)
+# Between two messages a receiver takes the sender to be where its last message puts it. How wrong is that? By δ
+# at most, by the rule of send-on-delta, at the moments when the trigger is evaluated. Between two of these, 20 ms
+# apart, a robot moves on, and a message takes a millisecond. For ground robots that is 5 mm at top speed; drones
+# in a gust do more. (At the leader's 0.15 m/s the belief is beyond δ from 67 ms to 80 ms after each message, a
+# sixth of the time.)
 
 # %%
 net = event.plan.links
@@ -160,14 +159,14 @@ assert within[ground].min() > 0.9
 assert 0.8 < within[~ground].min() < within[~ground].max() < 0.9
 
 # %% [markdown]
-# Periodic messages promise nothing of that kind: what is believed is wrong by v T. That is the idea of events in
-# one line. Events bound the *error*, and let the *time* vary; periods bound the time, and let the error vary.
+# Periodic messages have no such bound: the believed position is wrong by v T. That is the idea of events in one
+# line. Events bound the *error*, and let the *time* vary; periods bound the time, and let the error vary.
 #
-# ## 4. Say less by predicting more
+# ## 4. Transmit less by predicting more
 #
-# A robot that drives straight on surprises nobody, and yet send-on-delta speaks at every centimetre. So let all
-# neighbours carry on a position with the velocity that came with it, and let the speaker, who knows what they
-# believe, speak only when *that* is off by more than δ: the trigger `predictive` (Suh, Sensors 2007). The leader's
+# The motion of a robot that drives straight on is no news, and yet send-on-delta transmits at every centimetre. So
+# let all neighbours extrapolate a position with the velocity that came with it, and let the sender, which computes
+# the same, transmit only when *that* is off by more than δ: the trigger `predictive` (Suh, Sensors 2007). The leader's
 # drive takes a few messages.
 
 # %%
@@ -185,7 +184,7 @@ assert by_hand(predictive)[1] < by_hand(event)[1]  # and the error is smaller, t
 #
 # ## 5. A fair comparison
 #
-# So far we compared one event trigger with 50 Hz. That is not fair: who says that 50 Hz are needed? Perhaps a
+# So far we compared one event trigger with 50 Hz. That is not fair: are 50 Hz needed? Perhaps a
 # *slower clock* saves as many messages and costs no more. A trigger is a curve, error over messages, with the
 # threshold or the period along it, and triggers are compared by curves. A sweep draws them: every case with every
 # value that it has, on six seeds, all relative to 50 Hz with the same seed. (30 s are enough: the leader has
@@ -251,6 +250,6 @@ show(found.pareto(), OUT / "events-pareto")
 # 1. Bad networks: `channel.loss=0.1` and `channel.delay_s=0.05` behind `load`. Which of the three cases suffers
 #    most, and why? `maximum_silence_s = 2.0` in its trigger is a remedy; what does it cost?
 # 2. Half of a drone's messages are about gusts. `smoothing_s = 0.4` in the predictive trigger takes them out of
-#    what is said. Add it as a case, sweep its threshold, and draw its curve beside the others.
+#    the transmitted positions. Add it as a case, sweep its threshold, and draw its curve beside the others.
 # 3. Ten decisions are made in a second, and 50 positions sent. Is that not too many from the start? Find the period
 #    from which on the IAE grows, with confidence intervals, and think about why it is not 0.1 s.

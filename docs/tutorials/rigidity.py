@@ -163,7 +163,7 @@ for lengths, what in ((SIDES, "sides"), (BRACED, "braced")):
 
 # %% [markdown]
 # With sides only the drones do all that is asked of them, and end as two different rhombi: the law closes the
-# errors and knows nothing of the rest. `check` says so before anything flies.
+# errors and ignores the rest. `check` reports it before anything flies.
 
 # %%
 said = {finding.code: str(finding) for finding in check(formation(STARTS["first"], [0.8] * 4, SIDES))}
@@ -289,7 +289,7 @@ for rise in RISES:
 # to a formation what λ₂ is to consensus. As the tent rises, its legs stand steeper, and there is less and less of
 # them in the plane. At the limit the three stand in one line, seen from above, and R has lost a rank: pushing the
 # top sideways changes no length to first order, and nothing pulls it back. (It is a motion of the whole: a tent
-# that stands upright in a vertical plane can tilt about a line in that plane, which to first order lifts nobody. So
+# that stands upright in a vertical plane can tilt about a line in that plane, which to first order lifts no corner. So
 # `rigidity` counts four such motions there, and asks for a rank of 2 only. Rank says yes or no; how firmly is a
 # question for the eigenvalue.)
 
