@@ -211,7 +211,7 @@ def errors(
         lowest = min(lowest, float(known.min(initial=np.inf)))
         highest = max(highest, float(np.nanmax(band.high, initial=0.0)))
         at = _acquisitions([case for case in cases if case.case == name])
-        size = max(2.5, 6.5 - 1.5 * k)  # those of several cases at one time are seen on each other
+        size = max(2.5, 7.5 - 2.5 * k)  # those of several cases at one time are seen on each other
         axes.plot(at, [tolerance] * len(at), "v", color=line["color"], ms=size, mec=PAPER, mew=0.5, zorder=4)
     axes.set_yscale("log")
     bottom = 10.0 ** math.floor(math.log10(min(max(lowest, LEAST_ERROR), 0.1 * tolerance)))

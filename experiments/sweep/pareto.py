@@ -148,11 +148,11 @@ def _draw_curve(
     joined = "linestyle" not in style
     axes.errorbar(
         x, y, dy, dx, color=style["color"], linewidth=0.8 if joined else 0.0, elinewidth=0.7 if joined else 0.4,
-        capsize=1.2, capthick=0.6, zorder=2,
+        capsize=1.2, capthick=0.6, zorder=2, alpha=1.0 if joined else 0.4,
     )  # fmt: skip
     for full, face in ((True, style["color"]), (False, PAPER)):
         some = np.array(best) == full
-        axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "label": None})
+        axes.plot(x[some], y[some], **{**marker, "linestyle": "", "markerfacecolor": face, "zorder": 3 + full})
     along = _varied_parameter(rows, rows[0].case) if joined and named else None
     if along is not None:
         _name_points(axes, rows, along, points[:, :2], style["color"])

@@ -141,6 +141,8 @@ def _report_sweep(
     as_json: bool,
 ) -> int:
     """The table of a sweep for a paper in some form, or its figures anew, so wide [in]."""
+    import msgspec
+
     from experiments.recording.reader import RecordingError
     from experiments.sweep import page as pages
     from experiments.sweep import table
@@ -153,10 +155,15 @@ def _report_sweep(
         chosen = _chosen(metrics, [*table.NUMBERS])
         _put(form([pages.table(rows, str(document.get("experiment", folder.name)), chosen)]), out)
         return 0
-    if "tuning" in document:
-        raise RecordingError(f"{folder}: a search: its figures show all that was tried; --latex prints its result")
+    searched = "tuning" in document  # its figures show all that was tried
+    if searched:
+        try:
+            tried = msgspec.convert(document.get("tried"), list[table.CellRow])
+        except ValueError:
+            raise RecordingError(f"{folder}: a search of another version; make it again") from None
+        rows = [*(row for row in rows if row.reference), *tried]
     target = Path(out or folder)
-    pages.pictures(target, rows, width=width)
+    pages.pictures(target, rows, joined=not searched, width=width)
     if as_json:
         print_json({"figures": target / "figures", "cells": len(rows)})
     else:

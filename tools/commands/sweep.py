@@ -117,6 +117,8 @@ def _sweep(file: str, given: Sequence[str], options: dict[str, Any]) -> Outcome:
 
 def _optimise(file: str, given: Sequence[str], wish: str, options: dict[str, Any]) -> Outcome:
     """Search; return as `_sweep`; raises KeyboardInterrupt on Ctrl-C."""
+    import msgspec
+
     from experiments.report.page import seeds_in_words
     from experiments.sweep import table as tables
     from experiments.sweep.optimise import tune
@@ -130,4 +132,5 @@ def _optimise(file: str, given: Sequence[str], wish: str, options: dict[str, Any
     kept = {row.label: found.wish.kept(row) for row in found.rows if not row.reference}
     limits = ", ".join(map(str, found.wish.limits))
     lines += [f"{label}: {'keeps' if well else 'DOES NOT KEEP'} {limits}" for label, well in kept.items()]
-    return found, {"tuning": list(found.tuning), "wish": wish}, lines, 0 if all(kept.values()) else 1
+    more = {"tuning": list(found.tuning), "wish": wish, "tried": [msgspec.to_builtins(row) for row in found.tried]}
+    return found, more, lines, 0 if all(kept.values()) else 1

@@ -11,6 +11,7 @@ from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.metrics.measure import measure
 from experiments.metrics.statistics import spread, student_95
+from experiments.recording.reader import RecordingError
 from experiments.run import simulate
 from experiments.sweep import page as sweep_page
 from experiments.sweep import sweep as sweeps
@@ -21,6 +22,7 @@ from experiments.sweep.sweep import side_by_side, sweep
 from experiments.sweep.table import parameter_columns
 from experiments.sweep.workers import SweepError, Work, workers
 from tools.commands import sweep as commands
+from tools.commands.results import report
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -213,6 +215,17 @@ def test_cells_that_tie_are_all_on_the_front_and_share_a_column_of_parameters(do
     assert parameter_columns([row, other]) == {"threshold": ["0.005", "0.3"]}
     both = msgspec.structs.replace(row, parameters={**row.parameters, **other.parameters})
     assert list(parameter_columns([row, both])) == ["trigger.threshold", "cases.other.trigger.threshold"]
+
+
+def test_figures_of_a_search_are_drawn_at_any_width(done, tmp_path):
+    tried = [msgspec.to_builtins(row) for row in done.rows if not row.reference]
+    file = tmp_path / "sweep.json"
+    sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7], tried=tried))
+    assert report([str(tmp_path)], width=7.16) == 0
+    assert 'width="515.52pt"' in (tmp_path / "figures" / "pareto_iae.svg").read_text()
+    sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7]))
+    with pytest.raises(RecordingError, match="a search of another version; make it again"):
+        report([str(tmp_path)])
 
 
 def test_a_figure_of_nothing_but_the_reference(done):
