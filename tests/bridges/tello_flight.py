@@ -106,7 +106,7 @@ def faults():
     good = Served(open_device, one)
     silent = Served(open_device, one, silent_from_s=4.0)
     killed = Served(open_device, one)
-    weak = Served(open_device, one, battery=0.16, drain=12.0)
+    weak = Served(open_device, one, battery=0.15, drain=12.0)
     empty = Served(open_device, one, battery=0.08)
     twins = [good, silent, killed, weak, empty]
     addresses = [served.addresses[0] for served in twins] + ["tello://127.0.0.99:18889"]

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 import signal
+import time
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+import zenoh
 
 from agents.body.kinds import KINDS
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
+from experiments.file.document import load
 from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import Flight, until
@@ -85,11 +88,27 @@ def ahead(scan: messages.Ranges) -> float:
     return min(readings, default=math.nan)
 
 
+def kill_positioning(flight: Flight, session: zenoh.Session, robot: str) -> None:
+    """Ends the processes of motion capture: one is started again, the end of the other is told."""
+    positions = pubsub.Inbox(pubsub.subscriber(session, Keys().position(robot)), messages.Position)
+    flight.children()["vicon"].kill()
+    flight.until_said(
+        r"vicon conductor: the vicon ended \(killed by SIGKILL\); started again: robots without a position"
+    )
+    again = time.time()
+    until(lambda: any(position.stamp > again for position in positions.read()), "it is measured again")
+    flight.children()["vicon-twin"].kill()
+    flight.until_said(r"device conductor: the vicon-twin ended \(killed by SIGKILL\); robots that need it hold")
+
+
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     "way",
     [
-        pytest.param(Way("neighbours", ON_THE_FLOOR, "KH01", "TB01"), marks=pytest.mark.mechanism("mixed reality")),
+        pytest.param(
+            Way("neighbours", ON_THE_FLOOR, "KH01", "TB01"),
+            marks=pytest.mark.mechanism("mixed reality", "motion capture: processes killed"),
+        ),
         Way("all", IN_THE_AIR, "CF02", "CF01"),
     ],
 )
@@ -122,6 +141,8 @@ def test_a_real_robot_that_stands_in_the_way_of_a_twin_is_seen_and_avoided(
             return False
 
         until(arrived, "the twin went around the robot and stays at its goal", 90.0)
+        if not KINDS[load(file).experiment.robots[real].kind].flies:  # a drone without a position lands
+            kill_positioning(flight, session, real)
         flight.signal(signal.SIGINT)
     code, output = flight.finish()
     assert code == 130, output

@@ -30,7 +30,6 @@ plan = { kind = "line", move_by = [0.8, 0.0], speed = 0.2 }
 """
 
 
-@pytest.mark.mechanism("motion capture and TurtleBot3 twin: processes killed")
 @pytest.mark.timeout(120)
 def test_positioning_is_started_again_and_the_end_of_a_device_is_told(tmp_path: Path) -> None:
     file, folder = tmp_path / "pair.toml", tmp_path / "run"
