@@ -233,6 +233,7 @@ def flown(barrier, place, goal, filters, *, seconds=8.0, kind=TELLO, speed=1.0):
     return least, place
 
 
+@pytest.mark.slow
 def test_with_both_halves_kept_the_margin_itself_is_kept_in_spite_of_the_lag():
     rng = np.random.default_rng(11)
     for _ in range(8):

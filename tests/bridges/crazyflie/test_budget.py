@@ -10,6 +10,7 @@ from tests.bridges.crazyflie_clock import HEIGHT, Fleet, flight_of
 SINKS = 0.5  # [m/s] a landing is slower
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "exchanges", "rates"),
     [
@@ -30,6 +31,7 @@ def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchang
     assert age < oldest_pose(settings, exchanges) <= YOUNG_S
 
 
+@pytest.mark.slow
 def test_a_take_off_with_a_yaw_leaves_poses_young(monkeypatch):
     """Seventeen parts of polynomials, one at a time: in a burst their answers made poses 0.2 s old."""
     with Fleet(monkeypatch, 8, 400.0, stream_hz=4.0) as fleet:

@@ -13,6 +13,8 @@ from experiments.report import replay, trajectories
 from experiments.run import simulate
 from tests.system.browser import CHROMIUM, needs_chromium
 
+pytestmark = pytest.mark.slow  # whole runs, drawn
+
 CASES = ["periodic", "event"]
 
 
@@ -26,7 +28,6 @@ def film_of(page):
     return json.loads(re.search(r'getElementById\("film"\), (\{.*\})\);', page)[1])
 
 
-@pytest.mark.slow
 def test_positions_are_those_of_the_run_within_a_millimetre(traces):
     page = replay.embedded(traces)
     film = film_of(page)

@@ -44,6 +44,7 @@ def test_positions_are_those_of_the_recording(flown):
     assert film.moment(between).position == pytest.approx(middle, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_transmissions_are_those_of_the_recording(flown):
     trace, file = flown
     read = tracks.read(file)
@@ -122,6 +123,7 @@ def test_the_table_has_what_the_recording_has_and_no_empty_columns(flown):
     assert ">80 %<" in text
 
 
+@pytest.mark.slow
 def test_a_robot_without_links_has_no_error(tmp_path):
     alone = load("robotic-park", "duration_s=1.0", "timeline=[]", "formation.links={}", "cases={}")
     simulate(alone, folder=tmp_path)

@@ -41,6 +41,7 @@ def test_who_comes_too_near_holds_in_every_repetition(tmp_path):
     assert all(0.0 < event.stamp <= 8.0 for event in read)  # the hold is unresolved at the end
 
 
+@pytest.mark.slow
 def test_a_drone_lands_when_its_battery_is_low_and_says_so():
     robots = {
         "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])

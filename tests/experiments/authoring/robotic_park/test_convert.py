@@ -417,6 +417,7 @@ def test_a_flat_file_of_2023_with_starts_from_an_index(tmp_path):
     assert "MADE UP" not in told
 
 
+@pytest.mark.slow
 def test_starts_that_nobody_tells_are_marked(tmp_path):
     made, notes = convert_text("".join(map(flat, OTHERS)), "AA.yaml", 20.0)
     assert made.count("# start made up") == 3
