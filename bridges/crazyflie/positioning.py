@@ -25,10 +25,10 @@ UPLOAD_S: Final = 8.0
 ANCHORS_S: Final = 5.0  # an anchor gets its position by radio, and confirms it once per second
 AGREE: Final = 1e-3  # [m]
 RESET_S: Final = 0.1  # duration of the estimator's reset
-VARIANCE_HZ: Final = 20.0
+VARIANCE_HZ: Final = 10.0  # beside poses, for which the budget of the radio is meant
 SETTLED_SPREAD: Final = 1e-3  # [m²] settled: the variances of half a second differ by less,
 SETTLED_BELOW: Final = 0.1  # [m²] and are below this
-SAMPLES: Final = 10
+SAMPLES: Final = 5
 VARIANCES: Final = {f"kalman.varP{axis}": "float" for axis in "XYZ"}
 
 GEOMETRY: Final = "geometry of the base stations"
