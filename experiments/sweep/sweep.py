@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 MOST_SEEDS: Final = 100  # of one cell side by side: more are hardly faster, and progress would come in larger steps
 SHARE: Final = 3  # each worker gets its part in at least so many pieces, so that all end at about the same time
 MOST_BYTES: Final = 2e8  # of positions that one process logs
+LONGEST: Final = 60  # letters of a folder's name that is made up here
 AROUND_S: Final = 15.0  # take-off and landing are logged, too
 
 Progress = Callable[[int, int], None]  # runs done, of how many
@@ -188,8 +189,9 @@ def side_by_side(experiment: Experiment) -> int:
 
 
 def folder_of(read: Document, axes: Sequence[Axis], what: str) -> Path:
-    """Default folder of the runs: the same for the same file and axes."""
-    return RUNS / "-".join([read.path.stem, what, *(axis.path.replace("/", "_") for axis in axes)])[:200]
+    """Default folder of the runs: the same for the same file and axes; a long name is cut, and ends with its digest."""
+    name = "-".join([read.path.stem, what, *(axis.path.replace("/", "_") for axis in axes)])
+    return RUNS / (name if len(name) <= LONGEST else f"{name[: LONGEST - 9]}-{_digest(name)[:8]}")
 
 
 def origin(read: Document, experiments: Iterable[Experiment]) -> StoreOrigin:

@@ -17,8 +17,9 @@ from experiments.sweep import page as sweep_page
 from experiments.sweep import sweep as sweeps
 from experiments.sweep import table as sweep_table
 from experiments.sweep.pareto import curves, front, pareto
+from experiments.sweep.plan import Axis
 from experiments.sweep.runs import Stuck
-from experiments.sweep.sweep import side_by_side, sweep
+from experiments.sweep.sweep import folder_of, side_by_side, sweep
 from experiments.sweep.table import parameter_columns
 from experiments.sweep.workers import SweepError, Work, workers
 from tools.commands import sweep as commands
@@ -226,6 +227,16 @@ def test_figures_of_a_search_are_drawn_at_any_width(done, tmp_path):
     sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7]))
     with pytest.raises(RecordingError, match="a search of another version; make it again"):
         report([str(tmp_path)])
+
+
+def test_a_long_name_of_a_folder_is_cut_and_stays_its_own():
+    read, paths = load("triangle"), ["trigger.threshold", "cases.event.trigger.minimum_interval_s"]
+    axes = [Axis(f"{path}=1", path, ("1",), None) for path in paths]
+    names = [folder_of(read, some, "sweep").name for some in (axes[:1], axes, axes[::-1])]
+    assert names[0] == "triangle-sweep-trigger.threshold"
+    assert names[1].startswith("triangle-sweep-trigger.threshold-cases.")
+    assert [len(name) for name in names[1:]] == [60, 60]
+    assert len({name[-8:] for name in names}) == 3
 
 
 def test_a_figure_of_nothing_but_the_reference(done):
