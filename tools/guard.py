@@ -61,12 +61,14 @@ def _become_station(words: list[str]) -> None:
 
 def main() -> None:
     """Check the packages, then hand over to the command line."""
-    root = Path(__file__).resolve().parent.parent
-    found = intruders(root)
-    if found:
-        print(explanation(found, root), file=sys.stderr)
-        sys.exit(2)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # the caller closed it
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
+        root = Path(__file__).resolve().parent.parent
+        if found := intruders(root):
+            print(explanation(found, root), file=sys.stderr)
+            sys.exit(2)
         _become_station(sys.argv[1:])
         from tools.main import main as command_line  # noqa: PLC0415 (not before the check)
 
@@ -76,7 +78,7 @@ def main() -> None:
     finally:
         try:
             sys.stdout.flush()
-        except BrokenPipeError:  # whoever read it, `head` say, has seen enough: nothing to complain of at the very end
+        except OSError:  # its reader, `head` say, has seen enough, or a full disk was reported already
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

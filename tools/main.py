@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -62,6 +63,7 @@ for _name, _help in LAUNCHER.items():
 
 # The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
 # so that nothing needs to be imported to recognise it.
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # a disk takes no more
 EXPLAINED: Final = (
     ("agents.network.endpoints", "EndpointError"),
     ("agents.network.lab", "LabError"),
@@ -158,6 +160,12 @@ def main() -> None:
         sys.exit(130)
     except _explained() as error:
         _report(str(error), problems=getattr(error, "problems", None))
+        sys.exit(2)
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        place = f"{error.filename}: " if error.filename else ""
+        _report(f"{place}cannot be written: {error.strerror}", "\n  make room there, or choose another place")
         sys.exit(2)
     except Exception as error:
         registry = sys.modules.get("agents.plugins.registry")  # not loaded: no plug-in is

@@ -32,6 +32,7 @@ POWER: Final = 200  # rounds of the power method: λ to a few percent
 HIGHEST: Final = 3.0  # gain of the reference experiment
 FREE: Final = 0.3  # share of the spacing that starts may be scattered by, on each axis
 PASSING: Final = 0.1  # [m] between robots on their way
+MOST: Final = 5000  # robots: five times as many as anything here was tried with
 TELEMETRY: Final = 5000.0  # samples in a second, of all robots
 WOBBLE: Final = "# hover_jitter = { sigma = 0.01, correlation_s = 0.5 }   # m, s: real drones wobble"
 
@@ -60,13 +61,20 @@ def layout(what: str, size: str, wanted: LayoutOptions) -> Layout:
         rows, by, columns = size.lower().replace("×", "x").partition("x")
         if not (by and rows.strip().isdecimal() and columns.strip().isdecimal()):
             raise LayoutError(f"a grid is given as ROWSxCOLUMNS, such as 5x8, not {size!r}")
+        _allow(int(rows) * int(columns))
         return layouts.grid(int(rows), int(columns), wanted.spacing)
     count = int(size)
+    _allow(count)
     if what == "polygon":
         return layouts.polygon(count, wanted.spacing)
     if not kind.flies:
         raise LayoutError(f"a hemisphere needs robots that fly, not a {kind.name}: choose --kind crazyflie")
     return layouts.hemisphere(count, wanted.spacing, 2.0 * kind.radius + PASSING)
+
+
+def _allow(count: int) -> None:
+    if count > MOST:
+        raise LayoutError(f"{count} robots are more than {MOST}: give fewer")
 
 
 def experiment_file(made: Layout, wanted: LayoutOptions) -> str:

@@ -348,3 +348,16 @@ def test_completion_is_right_and_light(tmp_path):
     assert not {"numpy", "zenoh", "experiments.file.json_schema"} & modules
     answers = [re.findall(r'"([^"]+?)(?:":".*?)?"', each) for each in said.split("\f\n")[:-1]]
     assert dict(zip(typed, answers, strict=True)) == dict(zip(typed, offered, strict=True))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a device that is always full")
+@pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), (">&-", 0)])
+def test_output_that_goes_nowhere_makes_no_traceback(output, code):
+    """A full disk is named; an output that the caller closed is none."""
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$0" -m tools.guard explain rates {output}', sys.executable],
+        cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert ("cannot be written: No space left on device" in done.stderr) == (code == 2)

@@ -101,6 +101,8 @@ COMMANDS = (
     ("new triangle triangle.toml", "triangle.toml: exists already", "choose another name"),
     ("new --polygon 2", "--polygon 2: ", "needs 3 robots or more"),
     ("new --grid 5", "--grid 5: ", "such as 5x8"),
+    ("new --grid 1000000x1000000", "robots are more than 5000", "give fewer"),
+    ("new --polygon 3 --spacing inf", "--spacing: ", "must be less than or equal to 1000"),
     ("new triangle nope/x.toml", "nope/x.toml: cannot be written", "choose a place that exists"),
     ("report nope", "nope: is no folder of a run", "`./zenpark run` prints the folder"),
     ("report full", "full: holds no recording", "name the folder of a run"),
