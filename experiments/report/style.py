@@ -182,7 +182,7 @@ def fitting(width: float, labels: Sequence[str], columns: int) -> int:
         rows = [len(part) for part in np.array_split(np.arange(len(labels)), count)]
         ends = np.cumsum(rows)
         if sum(max(wide[end - n : end]) for end, n in zip(ends, rows, strict=True)) <= 72.0 * width:
-            return count
+            return math.ceil(len(labels) / max(rows))  # as many as are full
     return 1
 
 

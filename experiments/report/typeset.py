@@ -11,7 +11,12 @@ from typing import Final
 from experiments.report.page import Cell, Row, Table
 
 LETTER: Final = 4.0  # [pt] width of a letter in eight-point type,
-LETTERS: Final = {"0123456789": 4.3, " .,:;'|()[]fijlt": 2.9, "mwMW": 6.8, "±×−–": 6.8}  # [pt] and of others
+LETTERS: Final = {  # [pt] and of others
+    " .,:;'|()[]fijlt": 2.9,
+    "0123456789_": 4.3,
+    "ABCDEFGHJKLNOPQRSTUVXYZ&$#^~": 6.2,
+    "mwMW±×−–%": 6.9,
+}
 WIDEST_COLUMN: Final = 300.0  # [pt] of a page in two columns; what is wider spans both
 MOST_LINES: Final = 54  # of a float, with its caption on a page
 SHORT: Final = 6  # letters of a head that is not broken

@@ -100,6 +100,7 @@ def test_an_error_axis_reaches_the_curves():
 
 def test_a_legend_has_the_columns_that_fit():
     assert style.fitting(3.5, ["periodic", "event", "within 5 cm", "acquired by all"], 4) == 4
+    assert style.fitting(3.5, ["periodic", "event", "relative", "within 5 cm", "acquired by all"], 6) == 3
     assert style.fitting(3.5, ["a name of thirty-two characters."] * 4, 4) == 1
 
 
