@@ -39,7 +39,10 @@ class Lines:
             if event.kind == OUTPUT:
                 print(f"{event.source}| {event.text}", file=sys.stderr)
             elif event.kind not in QUIET:
-                print(f"{progress.case}: {event.kind} {event.source}: {event.text}", file=sys.stderr)
+                when = ""
+                if event.kind in {"hazard", "lost"} and progress.elapsed is not None:
+                    when = f" (at {progress.elapsed - progress.clock.utc() + event.stamp:.1f} s)"
+                print(f"{progress.case}: {event.kind} {event.source}: {event.text}{when}", file=sys.stderr)
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S

@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from agents.network import messages
 from experiments.real_time.conductor.run_view import Progress, RobotView
 from tools.progress import Lines, Table
 
@@ -24,3 +25,17 @@ def test_errors_from_before_the_router_fell_silent_are_not_printed_as_news(
     said = capsys.readouterr().err
     assert "no router answers for 2.0 s" in said
     assert "error [m]" not in said
+
+
+def test_a_hazard_is_printed_with_the_time_at_which_it_began(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = Progress("event", "formation", 9.0, 15.0, {})
+    stamp = progress.clock.utc()
+    progress.events += [
+        messages.Event(stamp - 0.5, "hazard", "Q1", "hold: its own position is lost"),
+        messages.Event(stamp, "phase", "conductor", "formation"),
+    ]
+    with Lines() as show:
+        show(progress)
+    hazard, phase, *_ = capsys.readouterr().err.splitlines()
+    assert hazard == "event: hazard Q1: hold: its own position is lost (at 8.5 s)"
+    assert phase == "event: phase conductor: formation"
