@@ -6,6 +6,7 @@ import errno
 import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from copy import copy
 from typing import Annotated, Final
 
@@ -145,7 +146,11 @@ def part_for(words: Sequence[str]) -> typer.Typer:
 def main() -> None:
     """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
     try:
-        sys.exit(part_for(sys.argv[1:])(prog_name="zenpark", standalone_mode=False))
+        try:
+            sys.exit(part_for(sys.argv[1:])(prog_name="zenpark", standalone_mode=False))
+        finally:
+            with suppress(BrokenPipeError):
+                sys.stdout.flush()  # a full disk shows here at the latest
     except UsageError as error:
         words = [] if error.ctx is None else error.ctx.command_path.split()[1:]
         message = _plain(error.format_message())

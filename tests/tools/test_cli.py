@@ -351,12 +351,14 @@ def test_completion_is_right_and_light(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has a device that is always full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize(("output", "code"), [("> /dev/full", 2), (">&-", 0)])
-def test_output_that_goes_nowhere_makes_no_traceback(output, code):
+def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
     """A full disk is named; an output that the caller closed is none."""
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" -m tools.guard explain rates {output}', sys.executable],
         cwd=ROOT, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
     )  # fmt: skip
     assert done.returncode == code
     assert "Traceback" not in done.stderr
