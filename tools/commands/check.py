@@ -283,6 +283,7 @@ def explain(
     import difflib
 
     from experiments.file import json_schema, reference
+    from experiments.metrics.results import RobotMetrics
 
     found = reference.matching(key) if key else reference.tables()
     warn(json_schema.unusable())
@@ -291,6 +292,10 @@ def explain(
         near = difflib.get_close_matches(key, nearest, 1, 0.75 if about else 0.6)
         hint = f"did you mean {near[0]!r}?" if near else f"the nearest: {', '.join(nearest)}"
         listed = () if near else about
+        if key.lower() in {
+            field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])
+        }:
+            hint, listed = "a metric of a run: `./zenpark docs`, page 'Metrics and CSV columns'", ()
         warn([f"nothing in the experiment file is named {key!r}; {'keys about it:' if listed else hint}"])
         for entry in listed:
             print(textwrap.shorten(f"  {entry.key}  {entry.text}", WIDEST, placeholder=" ..."), file=sys.stderr)

@@ -108,6 +108,13 @@ def test_an_unknown_key_is_wrong_input():
     assert "did you mean 'safety'?" in said.output
 
 
+@pytest.mark.parametrize("metric", ["IAE", "acquired", "acquired_s", "rmse"])
+def test_a_metric_is_told_from_a_key_of_the_file(metric):
+    said = CliRunner().invoke(app, ["explain", metric])
+    assert said.exit_code == 2
+    assert "a metric of a run" in said.output
+
+
 @pytest.mark.parametrize(
     ("word", "key"),
     [
