@@ -70,7 +70,7 @@ class Thread:
 
 
 class Drone:
-    """One Crazyflie, its telemetry and flight control, and the packets that wait for the radio."""
+    """Crazyflie, its telemetry and flight control, and the packets that wait for the radio."""
 
     def __init__(self, fleet, row):
         self._fleet, self.row = fleet, row
