@@ -9,7 +9,7 @@ from agents.body.limits import Safety
 from agents.decision.lifecycle import IDLE, READY, RUNNING
 from experiments.definition.experiment import Robot
 from tests.agents.few import drone, pair
-from tests.agents.safety.test_hazards import leant, spoiled
+from tests.agents.safety.test_detection import leant, spoiled
 from tests.agents.swarm import Swarm
 
 FAILURES = {

@@ -7,7 +7,7 @@ from agents.body.limits import Safety
 from agents.safety.situation import SILENT_S
 from experiments.definition.experiment import Formation
 from tests.agents.few import pair
-from tests.agents.safety.test_hazards import happened
+from tests.agents.safety.test_detection import happened
 from tests.agents.swarm import Swarm
 
 
