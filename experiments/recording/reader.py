@@ -9,7 +9,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -26,9 +25,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from experiments.recording.topics import CHUNK_BYTES, TOPICS
 
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
-_HEADED: Final = struct.Struct("<BQH")  # the same, and the channel of a message
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-PAYLOAD: Final = _RECORD.size + _MESSAGE.size  # from the beginning of the record of a message to its data [bytes]
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
 
@@ -64,64 +61,15 @@ class Records:
         Raises:
             RecordingError: If the file cannot be read, or is no MCAP file.
         """
-        with self._opened() as (file, size):
-            yield from self._walk(file, size)
-
-    def chunks(self) -> Iterator[tuple[bytes, dict[int, list[int]]]]:
-        """Content of the file in pieces, each with the places in it where the records of messages begin, by channel.
-
-        Four times as fast as `messages`, and for those that need only some fields of many messages: checksums are not
-        compared, and of a damaged piece nothing is left.
-        """
-        with self._opened() as (file, size):
-            yield from self._pieces(file, size)
-
-    @contextmanager
-    def _opened(self) -> Iterator[tuple[BinaryIO, int]]:
-        """The file behind its first mark, and its size [bytes]."""
         try:
             with self.path.open("rb") as file:
                 if (magic := file.read(len(MCAP0_MAGIC))) != MCAP0_MAGIC:
                     raise RecordingError(_foreign_format(self.path, magic))
-                yield file, self.path.stat().st_size
+                yield from self._walk(file, self.path.stat().st_size)
         except OSError as error:
             raise RecordingError(
                 f"{self.path}: cannot be read: {error.strerror}; give the .mcap file of a run"
             ) from error
-
-    def _pieces(self, file: BinaryIO, size: int) -> Iterator[tuple[bytes, dict[int, list[int]]]]:
-        while len(head := file.read(_RECORD.size)) == _RECORD.size:
-            opcode, length = _RECORD.unpack(head)
-            if opcode in (0, Opcode.FOOTER) or length > size - file.tell():
-                self.complete = opcode == Opcode.FOOTER
-                return
-            if opcode == Opcode.MESSAGE_INDEX:
-                file.seek(length, 1)
-                continue
-            body = file.read(length)
-            with suppress(*_DAMAGE):
-                if opcode == Opcode.CHUNK:
-                    stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))))
-                    data = stream.read(length)
-                    yield data, self._places(data)
-                elif opcode != Opcode.MESSAGE:
-                    self._keep(opcode, body)
-
-    def _places(self, data: bytes) -> dict[int, list[int]]:
-        """Where the records of messages begin, by channel; other records are kept."""
-        found: dict[int, list[int]] = {}
-        at, end, unpack = 0, len(data), _HEADED.unpack_from
-        while at < end:
-            opcode, length, channel = unpack(data, at)
-            if opcode == Opcode.MESSAGE:
-                try:
-                    found[channel].append(at)
-                except KeyError:
-                    found[channel] = [at]
-            else:
-                self._keep(opcode, data[at + _RECORD.size : at + _RECORD.size + length])
-            at += _RECORD.size + length
-        return found
 
     def _walk(self, file: BinaryIO, size: int) -> Iterator[Message]:
         damaged = False

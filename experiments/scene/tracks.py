@@ -1,22 +1,17 @@
-"""Tracks of the robots of a recording, for replay: what is drawn, and nothing else. Read in a third of a trace's time.
-
-A trace decodes all that a metric needs. Here the few fields that move a picture are taken out of the messages of a
-robot all at once, by their places in the bytes.
-"""
+"""Tracks of the robots of a recording, for replay: what is drawn, and nothing else."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import inf, nan
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
@@ -24,23 +19,15 @@ from agents.network.messages import Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.recording.clocks import Correction
 from experiments.recording.playback import AboutRun
-from experiments.recording.reader import PAYLOAD, RecordingError, Records
+from experiments.recording.reader import RecordingError, Records
 from experiments.recording.ros2.cdr import Undecodable, codec
-from experiments.recording.topics import TOPICS, SentPose
+from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
 
-BATCH: Final = 200  # pieces of the file that are taken apart at once
 LOST_S: Final = 1.0  # without a sample for so long a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
-_NUMBER: Final = struct.Struct("<d")
-# fields of a state that are drawn, with their widths; those behind its lists count from the end of the message
-_FIELDS: Final = {
-    "stamp": 1, "position": 3, "yaw": 1, "goal": 3, "true_position": 3, "true_yaw": 1, "attitude": 4,
-    "shadow_position": 3, "shadow_yaw": 1,
-}  # fmt: skip
-_BEHIND: Final = ("attitude", "shadow_position", "shadow_yaw")
-
-Bytes = NDArray[np.uint8]
+NOWHERE: Final = (nan, nan, nan)
+COLUMNS: Final = np.cumsum([1, 1, 3, 1, 3, 4, 3, 1])  # ends of the columns of `_sample`
 
 
 @dataclass(frozen=True)
@@ -99,35 +86,52 @@ def read(path: Path) -> Tracks:
         RecordingError: If the file is no recording of zenpark, or of another version.
     """
     records = Records(path)
-    states: dict[str, list[dict[str, Array]]] = {}
-    sent: dict[str, list[Array]] = {}
+    samples: dict[str, array[float]] = {}
+    sent: dict[str, list[float]] = {}
     rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock)}
-    names = {codec(topic.recorded).name: topic.recorded for topic in TOPICS}
-    for data, found in _batches(records):
-        flat = np.frombuffer(data, dtype=np.uint8)
-        for channel, places in found.items():
-            about = records.channels.get(channel)
-            kind = names.get(records.schemas[about.schema_id].name) if about is not None else None
-            if about is None or kind is None:
-                continue
-            robot = about.topic.split("/")[1]
-            starts = np.array(places, dtype=np.intp)
-            if kind is State:
-                states.setdefault(robot, []).append(_states(flat, data, starts, robot))
-            elif kind is SentPose:
-                sent.setdefault(robot, []).append(_gathered(flat, starts + PAYLOAD + _stamp_of_pose(robot), 1)[:, 0])
-            elif kind in rare:
-                rare[kind] += [_decoded(path, kind, data, at) for at in places]
+    decoders = {codec(kind).name: codec(kind).decode for kind in (State, SentPose, *rare)}
+    for message in records.messages():
+        about = records.channels[message.channel]
+        decode = decoders.get(records.schemas[about.schema_id].name)
+        if decode is None:
+            continue
+        try:
+            found = decode(message.data)
+        except Undecodable as error:
+            raise RecordingError(f"{path}: a message of {about.topic} is damaged: {error}") from None
+        if isinstance(found, State):
+            samples.setdefault(found.robot, array("d")).extend(_sample(found))
+        elif isinstance(found, SentPose):
+            sent.setdefault(found.robot, []).append(found.stamp)
+        else:
+            rare[type(found)].append(found)
     run = AboutRun.of(records)
     experiment = run.experiment
     events, statuses = sorted(rare[Event], key=lambda event: event.stamp), rare[Status]
     start = run.start(events, statuses, path)
-    right = Correction(rare[HostClock]) if rare[HostClock] else None
+    right = Correction(rare[HostClock])
     robots = tuple(experiment.robots)
-    tracks = tuple(
-        _track(name, (states.get(name, []), sent.get(name, []), [s for s in statuses if s.robot == name]), start, right)
-        for name in robots
-    )
+
+    def since(robot: str, stamps: Array) -> Array:
+        return right.stamps(robot, stamps) - start
+
+    def track(name: str) -> Track:
+        table = np.array(samples.get(name, ())).reshape(-1, COLUMNS[-1])
+        time = since(name, table[:, 0])
+        _, order = np.unique(time, return_index=True)  # several states of one sample: the first has the pose
+        order = order[np.isfinite(time[order])]
+        _, phase, position, yaw, goal, attitude, shadow, shadow_yaw, _ = np.split(table[order], COLUMNS, axis=1)
+        poses = since(name, np.unique(sent.get(name, ())))
+        own = sorted((status for status in statuses if status.robot == name), key=lambda status: status.stamp)
+        return Track(
+            time[order], phase[:, 0].astype(np.intp), position, yaw[:, 0], goal, attitude, shadow, shadow_yaw[:, 0],
+            sent=poses[np.isfinite(poses)],
+            statuses=tuple(
+                msgspec.structs.replace(each, stamp=float(since(name, np.array(each.stamp)))) for each in own
+            ),
+        )  # fmt: skip
+
+    tracks = tuple(map(track, robots))
     said = [msgspec.structs.replace(event, stamp=event.stamp - start) for event in events]
     if not any(event.kind == "hazard" for event in said):
         said += _incidents(tracks)
@@ -140,123 +144,18 @@ def read(path: Path) -> Tracks:
     )  # fmt: skip
 
 
-def _batches(records: Records) -> Iterator[tuple[bytes, dict[int, list[int]]]]:
-    """Several pieces of the file as one."""
-    pieces: list[bytes] = []
-    places: dict[int, list[int]] = {}
-    size = 0
-    for data, found in records.chunks():
-        for channel, own in found.items():
-            places.setdefault(channel, []).extend([at + size for at in own])
-        pieces.append(data)
-        size += len(data)
-        if len(pieces) >= BATCH:
-            yield b"".join(pieces), places
-            pieces, places, size = [], {}, 0
-    yield b"".join(pieces), places
-
-
-def _decoded(path: Path, kind: type[msgspec.Struct], data: bytes, at: int) -> Any:  # noqa: ANN401 - by its kind
-    length = int.from_bytes(data[at + 1 : at + 9], "little")
-    try:
-        return codec(kind).decode(data[at + PAYLOAD : at + 9 + length])
-    except Undecodable as error:
-        raise RecordingError(f"{path}: a {kind.__name__} is damaged: {error}") from None
-
-
-def _gathered(flat: Bytes, starts: Index, width: int) -> Array:
-    """`width` numbers (K, width) at each of some places (K,) in bytes."""
-    taken = flat[starts[:, None] + np.arange(8 * width)]
-    return np.ascontiguousarray(taken).view("<f8").astype(float)
-
-
-def _states(flat: Bytes, data: bytes, starts: Index, robot: str) -> dict[str, Array]:
-    """The drawn fields of states, as arrays (K, width)."""
-    body = starts + PAYLOAD
-    lengths = np.ascontiguousarray(flat[starts[:, None] + np.arange(1, 9)]).view("<u8")[:, 0].astype(np.intp)
-    ends = starts + 9 + lengths
-    where = 4 + -(-(5 + len(robot.encode())) // 8) * 8 + 16  # behind the name, the number and the stamp: the phase
-    counts = np.ascontiguousarray(flat[(body + where)[:, None] + np.arange(4)]).view("<u4")[:, 0]
-    found = {name: np.full((len(starts), width), nan) for name, width in _FIELDS.items()}
-    found["phase"] = np.zeros((len(starts), 1))
-    plain = (flat[ends[:, None] - np.arange(1, 5)] == 0).all(axis=1)  # no goals of a centre at the end
-    for count in np.unique(counts).tolist():
-        rows = np.flatnonzero(counts == count)
-        layout = _layout(robot, count)
-        for name, width in _FIELDS.items():
-            if name in _BEHIND:
-                mine = rows[plain[rows]]
-                found[name][mine] = _gathered(flat, ends[mine] + layout[name], width)
-            else:
-                found[name][rows] = _gathered(flat, body[rows] + layout[name], width)
-        texts = flat[(body[rows] + where + 4)[:, None] + np.arange(count - 1)]
-        for word, number in WORDS.items():
-            if len(word) == count - 1:
-                found["phase"][rows[(texts == np.frombuffer(word.encode(), np.uint8)).all(axis=1)]] = number
-    for row in np.flatnonzero(~plain).tolist():
-        state: State = codec(State).decode(data[int(body[row]) : int(ends[row])])
-        for name in _BEHIND:
-            value = getattr(state, name)
-            found[name][row] = nan if value is None else value
-    return found
-
-
-@lru_cache(256)
-def _layout(robot: str, count: int) -> dict[str, int]:
-    """Places of the drawn fields in the bytes of a state [bytes], by a state of known numbers.
-
-    Args:
-        robot: Whose state it is.
-        count: Bytes of the text of its phase.
-    """
-    marks = {name: tuple(1e9 + 100.0 * k + j for j in range(width)) for k, (name, width) in enumerate(_FIELDS.items())}
-    values: dict[str, Any] = {name: mark if len(mark) > 1 else mark[0] for name, mark in marks.items()}
-    made = codec(State).encode(State(robot, 0, phase="x" * (count - 1), **values))
-    places = {name: made.index(_NUMBER.pack(mark[0])) for name, mark in marks.items()}
-    return {name: place - len(made) if name in _BEHIND else place for name, place in places.items()}
-
-
-@lru_cache(256)
-def _stamp_of_pose(robot: str) -> int:
-    """Place of the stamp in the bytes of a sent pose [bytes]."""
-    made = codec(SentPose).encode(SentPose(robot, 0, 1e9 + 7.0, (0.0, 0.0, 0.0), None, None, 0.0, 0))
-    return made.index(_NUMBER.pack(1e9 + 7.0))
-
-
-def _track(
-    name: str,
-    found: tuple[Sequence[dict[str, Array]], Sequence[Array], Sequence[Status]],
-    start: float,
-    right: Correction | None,
-) -> Track:
-    """The track of one robot, of its states, the stamps of its poses, and its statuses."""
-    states, sent, statuses = found
-
-    def since(stamps: Array) -> Array:
-        return np.asarray((stamps if right is None else right.stamps(name, stamps)) - start)
-
-    whole = {key: np.concatenate([np.zeros((0, width)), *(part[key] for part in states)])
-             for key, width in {**_FIELDS, "phase": 1}.items()}  # fmt: skip
-    time = since(whole["stamp"][:, 0])
-    _, order = np.unique(time, return_index=True)  # several states of one sample: the first has the pose
-    order = order[np.isfinite(time[order])]
-    got = {key: value[order] for key, value in whole.items()}
-    true, true_yaw = got["true_position"], got["true_yaw"][:, 0]
-    poses = since(np.unique(np.concatenate([np.zeros(0), *sent])))
-    return Track(
-        time=time[order],
-        phase=got["phase"][:, 0].astype(np.intp),
-        position=np.where(np.isfinite(true).all(axis=1, keepdims=True), true, got["position"]),
-        yaw=np.where(np.isfinite(true_yaw), true_yaw, got["yaw"][:, 0]),
-        goal=got["goal"],
-        attitude=got["attitude"],
-        shadow=got["shadow_position"],
-        shadow_yaw=got["shadow_yaw"][:, 0],
-        sent=poses[np.isfinite(poses)],
-        statuses=tuple(
-            msgspec.structs.replace(each, stamp=float(since(np.array(each.stamp))))
-            for each in sorted(statuses, key=lambda status: status.stamp)
-        ),
+def _sample(state: State) -> tuple[float, ...]:
+    """The row of a state: stamp, phase, position, yaw, goal, attitude, position and yaw of the shadow twin."""
+    yaw = state.yaw if state.true_yaw is None else state.true_yaw
+    return (
+        state.stamp,
+        WORDS.get(state.phase, 0),
+        *(state.true_position or state.position or NOWHERE),
+        nan if yaw is None else yaw,
+        *(state.goal or NOWHERE),
+        *(state.attitude or (*NOWHERE, nan)),
+        *(state.shadow_position or NOWHERE),
+        nan if state.shadow_yaw is None else state.shadow_yaw,
     )
 
 
