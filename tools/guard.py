@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Final
@@ -65,6 +66,7 @@ def main() -> None:
         if getattr(sys, name) is None:  # the caller closed it
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # `./zenpark` blocks it until here
         root = Path(__file__).resolve().parent.parent
         if found := intruders(root):
             print(explanation(found, root), file=sys.stderr)

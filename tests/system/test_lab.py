@@ -46,10 +46,10 @@ def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None
     denied = zenpark("estop", *reach, "--as", "observer")
     assert denied.returncode == 1
     assert "NOT known to have stopped: CF01, KH01, KH02" in denied.stderr
-    stopped = zenpark("estop", *reach, "--reason", "enough")
+    stopped = zenpark("estop", *reach)
     assert (stopped.returncode, stopped.stdout) == (0, "stopped: CF01, KH01, KH02\n")
     assert flight.finish()[0] == 1
-    assert flight.logs().count("done (emergency stop by operator: enough)") == 3
+    assert flight.logs().count("done (emergency stop by operator: zenpark estop)") == 3
 
 
 def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from agents.network.endpoints import EndpointError, free_endpoint
+from agents.plugins import registry
 from experiments.recording.version import SHOWN, digest, provenance
 from tools.commands.options import PANELS
 from tools.main import EXPLAINED, LAUNCHER, app, main, part_for
@@ -363,3 +364,10 @@ def test_output_that_goes_nowhere_makes_no_traceback(output, code, unbuffered):
     assert done.returncode == code
     assert "Traceback" not in done.stderr
     assert ("cannot be written: No space left on device" in done.stderr) == (code == 2)
+
+
+def test_help_of_twin_names_every_protocol_twin():
+    known = registry.names(registry.DEVICES)
+    shown = CliRunner().invoke(app, ["twin", "--help"]).stdout
+    assert known
+    assert all(name.removesuffix("-twin") in shown for name in known)

@@ -1,4 +1,5 @@
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -34,6 +35,28 @@ def test_passes_when_the_packages_are_ours(tmp_path):
     done = start(tmp_path, ROOT)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("zenpark ")
+
+
+def test_ctrl_c_while_python_starts_ends_it_without_a_traceback():
+    def interrupted():
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        os.kill(os.getpid(), signal.SIGINT)
+
+    done = subprocess.run([ROOT / "zenpark", "--version"], preexec_fn=interrupted, capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
+
+
+def test_ctrl_c_while_the_script_imports_ends_it_without_a_traceback():
+    program = (
+        "import runpy, sys\n"
+        "class Interrupted:\n"
+        "    def find_spec(name, *_):\n"
+        "        if name == 'ssl': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupted)\n"
+        "runpy.run_path('zenpark', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (130, b"")
 
 
 @pytest.mark.slow

@@ -50,7 +50,6 @@ def create(
     hosts: Sequence[str] = (),
     listening: Mapping[str, Sequence[str]] | None = None,
     days: float = DAYS,
-    authority_days: float = AUTHORITY_DAYS,
 ) -> Register:
     """Make a lab: its folder, its authority, and a certificate for each identity.
 
@@ -76,7 +75,7 @@ def create(
         raise LabError(f"{folder}: cannot be made: {error.strerror}") from None
     for host in hosts:
         _alternative(host)
-    authority = _found(folder, authority_days)
+    authority = _found(folder)
     wanted = {
         name: Identity(role, name, "", "", [*(hosts if role == "router" else ()), *(listening or {}).get(name, ())])
         for name, role in identities.items()
@@ -120,7 +119,7 @@ def renew(
         raise LabError("a new authority signs all certificates anew: give no name with --authority")
     if hosts and not names:
         raise LabError("only routers need --host: name them, as in `./zenpark cert renew LAB router --host ADDRESS`")
-    signing = _found(folder, AUTHORITY_DAYS) if authority else _opened(folder)
+    signing = _found(folder) if authority else _opened(folder)
     return _issued(signing, known, _named(known, names or list(known.identities)), hosts=hosts, days=days)
 
 
@@ -152,7 +151,7 @@ def _named(known: Register, names: Iterable[str]) -> dict[str, Identity]:
 # ---------------------------------------------------------------------- certificates
 
 
-def _found(folder: Path, days: float) -> Authority:
+def _found(folder: Path) -> Authority:
     """A new authority, written to the folder of its lab."""
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.now(UTC)
@@ -166,7 +165,7 @@ def _found(folder: Path, days: float) -> Authority:
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - CLOCKS)
-        .not_valid_after(now + timedelta(days=days))
+        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs=True), critical=True)
         .sign(key, hashes.SHA256())

@@ -35,7 +35,6 @@ def init(
     *,
     host: Hosts = None,
     days: Days = 90.0,
-    authority_days: Annotated[float, typer.Option(min=0.01, help="For which the lab itself is valid.")] = 1826.0,
     as_json: AsJson = False,
 ) -> None:
     """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
@@ -44,9 +43,7 @@ def init(
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
     identities |= _robots(given or [], set(SERVICES))
-    known = create(
-        place, identities, hosts=host or [], listening=_listening(given or []), days=days, authority_days=authority_days
-    )
+    known = create(place, identities, hosts=host or [], listening=_listening(given or []), days=days)
     _print(place, known, list(known.identities), as_json=as_json)
     _advise(
         as_json,

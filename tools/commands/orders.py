@@ -282,7 +282,6 @@ def estop(
         ),
     ] = None,
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
-    reason: Annotated[str, typer.Option(metavar="TEXT", help="Sent with the stop.")] = "zenpark estop",
     lab: Lab = None,
     identity: Annotated[
         str | None, typer.Option("--as", metavar="NAME", help="Whose certificate, in a lab. [the run's operator]")
@@ -295,7 +294,7 @@ def estop(
     from experiments.real_time.conductor.orders import EmergencyStop
 
     if given := routers(connect, lab):
-        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], reason, as_json=as_json)
+        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], as_json=as_json)
     up = run_registry.runs()
     stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
     known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
@@ -303,7 +302,7 @@ def estop(
         if others and known.isdisjoint(topology.bare(others)):
             stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
             known |= {*topology.bare(others)}
-    return _stop_all(stops, reason, as_json=as_json)
+    return _stop_all(stops, as_json=as_json)
 
 
 def _of_environment(lab: str | None) -> list[str]:
@@ -320,13 +319,13 @@ def _of_environment(lab: str | None) -> list[str]:
         return []
 
 
-def _stop_all(stops: Sequence[EmergencyStop], reason: str, *, as_json: bool) -> int:
+def _stop_all(stops: Sequence[EmergencyStop], *, as_json: bool) -> int:
     """Send all stops at the same time and print their results.
 
     Returns:
         The exit code: 0, or 1 if a robot has not stopped in time, or if no robot was seen.
     """
-    threads = [threading.Thread(target=stop.send, args=(reason,), daemon=True) for stop in stops]
+    threads = [threading.Thread(target=stop.send, args=("zenpark estop",), daemon=True) for stop in stops]
     for thread in threads:
         thread.start()
     for thread in threads:
