@@ -342,7 +342,7 @@ class Agent:
         )
         for incident in self.hazards.update(now.t, self._detector.detect(now, rows), active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land
-            end(incident.row, self.hazards.words(incident.cause))
+            end(incident.row, incident.cause.rule.words)
 
     def _decide(self, t: float, state: BodyState) -> None:
         """New goals for running rows that decide for themselves; the others may have to stay."""

@@ -1,7 +1,7 @@
 """Hazards of a robot: causes, outcomes, and the state machine between them.
 
 Pure and row-wise: the causes present on a tick go in (`agents.safety.detection`), and out come the rows that must
-hold, land or have their motors cut. The table `rules` is the whole definition of a cause.
+hold, land or have their motors cut. `Cause` is the whole definition of each.
 
 An outcome only becomes harder while its cause lasts: warn -> hold -> land -> cut. A hold ends when its cause has
 ended; landing and cutting never end.
@@ -35,39 +35,6 @@ class Outcome(IntEnum):
     CUT = 4  # motors off at once
 
 
-class Cause(IntEnum):
-    """Cause of a hazard; the numbers are the rows of the state machine."""
-
-    ORDERED = 0
-    POSITION = 1
-    MARGIN = 2
-    OUTSIDE = 3
-    FAR_OUTSIDE = 4
-    SEPARATION = 5
-    TOUCHING = 6
-    OVERSPEED = 7
-    TILT = 8
-    NEIGHBOUR = 9
-    ALONE = 10
-    CENTRE = 11
-    BATTERY = 12
-    ROUTER = 13
-    CONDUCTOR = 14
-    FALLEN = 15
-    SETPOINT = 16
-    LATE = 17
-    LANDING = 18
-    BELOW = 19
-    SINKING = 20
-    CLOCK = 21
-    BEHIND = 22
-    STANDSTILL = 23
-    STILL = 24
-    STRAYING = 25
-    UNREACHABLE = 26
-    HOVERING = 27
-
-
 @dataclass(frozen=True)
 class Rule:
     """Response to a cause."""
@@ -84,6 +51,52 @@ class Rule:
     grounded: Outcome | None = None  # `then` of robots that do not fly, where different
 
 
+class Cause(IntEnum):
+    """Cause of a hazard with its rule; the numbers, in this order, are the rows of the state machine."""
+
+    rule: Rule
+
+    def __new__(cls, rule: Rule) -> Cause:
+        cause = int.__new__(cls, len(cls.__members__))
+        cause._value_, cause.rule = len(cls.__members__), rule
+        return cause
+
+    ORDERED = Rule("ordered to hold", Outcome.HOLD)
+    POSITION = Rule("its own position is lost", Outcome.HOLD, then=Outcome.LAND, place=False, grounded=Outcome.HOLD)
+    MARGIN = Rule("it is beyond a wall of the arena", Outcome.WARN)
+    OUTSIDE = Rule("it left the arena", Outcome.LAND)
+    # one wrong measurement must not drop a drone; while it lands it may still be flying away
+    FAR_OUTSIDE = Rule("it flies away", Outcome.CUT, after_s=0.1, landing=True)
+    SEPARATION = Rule("minimum separation", Outcome.HOLD, clears_s=0.5)
+    TOUCHING = Rule("far too near to another robot", Outcome.LAND)
+    OVERSPEED = Rule(
+        "it moves faster than it can", Outcome.HOLD, after_s=0.2, then=Outcome.LAND, then_s=1.0, clears_s=0.5
+    )
+    TILT = Rule("it has tipped over", Outcome.CUT, after_s=0.1, landing=True)
+    NEIGHBOUR = Rule("a neighbour is lost", Outcome.WARN)
+    ALONE = Rule("all its neighbours are lost", Outcome.HOLD)
+    CENTRE = Rule("nobody guides it", Outcome.HOLD)
+    BATTERY = Rule("its battery is low", Outcome.LAND, after_s=1.0)  # its voltage sags under a short load
+    ROUTER = Rule("no connection to a router", Outcome.HOLD, then=Outcome.LAND)
+    CONDUCTOR = Rule("the conductor is gone", Outcome.WARN, after_s=2.0)  # offline robots see it first again
+    FALLEN = Rule("it came down by itself", Outcome.LAND)
+    SETPOINT = Rule(
+        "what it wants is not a setpoint", Outcome.HOLD, then=Outcome.LAND, then_s=0.5, repeats=True, place=False
+    )
+    LATE = Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5)
+    LANDING = Rule("its landing takes too long", Outcome.CUT, landing=True)
+    BELOW = Rule("a robot is below it", Outcome.WARN, landing=True)
+    # its device lands it, or its battery is empty: neighbours must not follow
+    SINKING = Rule("it comes down by itself", Outcome.LAND, after_s=0.1)
+    CLOCK = Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5)  # not one late sample
+    BEHIND = Rule("a neighbour's clock is behind", Outcome.WARN)
+    STANDSTILL = Rule("its process stood still", Outcome.HOLD)
+    STILL = Rule("it is told to move and does not", Outcome.WARN)
+    STRAYING = Rule("it moves and is not told to", Outcome.LAND)
+    UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
+    HOVERING = Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True)
+
+
 _LOST: Final[Mapping[str, Outcome]] = {
     "drop": Outcome.WARN,
     "finish": Outcome.WARN,
@@ -91,48 +104,9 @@ _LOST: Final[Mapping[str, Outcome]] = {
     "land": Outcome.LAND,
 }
 
-RULES: Final[Mapping[Cause, Rule]] = {
-    Cause.ORDERED: Rule("ordered to hold", Outcome.HOLD),
-    Cause.POSITION: Rule(
-        "its own position is lost", Outcome.HOLD, then=Outcome.LAND, place=False, grounded=Outcome.HOLD
-    ),
-    Cause.MARGIN: Rule("it is beyond a wall of the arena", Outcome.WARN),
-    Cause.OUTSIDE: Rule("it left the arena", Outcome.LAND),
-    # one wrong measurement must not drop a drone; while it lands it may still be flying away
-    Cause.FAR_OUTSIDE: Rule("it flies away", Outcome.CUT, after_s=0.1, landing=True),
-    Cause.SEPARATION: Rule("minimum separation", Outcome.HOLD, clears_s=0.5),
-    Cause.TOUCHING: Rule("far too near to another robot", Outcome.LAND),
-    Cause.OVERSPEED: Rule(
-        "it moves faster than it can", Outcome.HOLD, after_s=0.2, then=Outcome.LAND, then_s=1.0, clears_s=0.5
-    ),
-    Cause.TILT: Rule("it has tipped over", Outcome.CUT, after_s=0.1, landing=True),
-    Cause.NEIGHBOUR: Rule("a neighbour is lost", Outcome.WARN),
-    Cause.BEHIND: Rule("a neighbour's clock is behind", Outcome.WARN),
-    Cause.ALONE: Rule("all its neighbours are lost", Outcome.HOLD),
-    Cause.CENTRE: Rule("nobody guides it", Outcome.HOLD),
-    Cause.BATTERY: Rule("its battery is low", Outcome.LAND, after_s=1.0),  # its voltage sags under a short load
-    Cause.ROUTER: Rule("no connection to a router", Outcome.HOLD, then=Outcome.LAND),
-    Cause.CONDUCTOR: Rule("the conductor is gone", Outcome.WARN, after_s=2.0),  # offline robots see it first again
-    Cause.FALLEN: Rule("it came down by itself", Outcome.LAND),
-    Cause.SETPOINT: Rule(
-        "what it wants is not a setpoint", Outcome.HOLD, then=Outcome.LAND, then_s=0.5, repeats=True, place=False
-    ),
-    Cause.LATE: Rule("its control loop misses its ticks", Outcome.HOLD, then=Outcome.LAND, then_s=5.0, clears_s=0.5),
-    Cause.LANDING: Rule("its landing takes too long", Outcome.CUT, landing=True),
-    Cause.HOVERING: Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True),
-    # its device lands it, or its battery is empty: neighbours must not follow
-    Cause.SINKING: Rule("it comes down by itself", Outcome.LAND, after_s=0.1),
-    Cause.BELOW: Rule("a robot is below it", Outcome.WARN, landing=True),
-    Cause.STANDSTILL: Rule("its process stood still", Outcome.HOLD),
-    Cause.STILL: Rule("it is told to move and does not", Outcome.WARN),
-    Cause.STRAYING: Rule("it moves and is not told to", Outcome.LAND),
-    Cause.UNREACHABLE: Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True),
-    Cause.CLOCK: Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5),  # not one late sample
-}
 
-
-def rules(limits: Limits) -> dict[Cause, Rule]:
-    """The table, with the numbers and the choices of an experiment."""
+def rules(limits: Limits) -> list[Rule]:
+    """Rules of all causes, with the numbers and the choices of an experiment."""
     chosen = {
         Cause.POSITION: {"then_s": limits.blind_s if limits.hold_s is None else limits.hold_s},
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
@@ -140,7 +114,7 @@ def rules(limits: Limits) -> dict[Cause, Rule]:
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},
         Cause.LANDING: {"after_s": limits.landing_s},
     }
-    return {cause: replace(rule, **chosen.get(cause, {})) for cause, rule in RULES.items()}  # type: ignore[arg-type]
+    return [replace(cause.rule, **chosen.get(cause, {})) for cause in Cause]  # type: ignore[arg-type]
 
 
 def failed(text: str) -> bool:
@@ -150,14 +124,14 @@ def failed(text: str) -> bool:
     the end.
     """
     outcome, _, words = text.partition(": ")
-    severe = tuple(RULES[cause].words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
+    severe = tuple(cause.rule.words for cause in (Cause.STILL, Cause.UNREACHABLE, Cause.HOVERING))
     blind = outcome == UNRESOLVED and is_blind(text)
     return outcome in {"land", "cut"} or (outcome == "warn" and words.startswith(severe)) or blind
 
 
 def is_blind(text: str) -> bool:
     """Whether an incident's text is about a lost own position."""
-    return text.partition(": ")[2].startswith(RULES[Cause.POSITION].words)
+    return text.partition(": ")[2].startswith(Cause.POSITION.rule.words)
 
 
 class Observation(NamedTuple):
@@ -187,20 +161,18 @@ class Hazards:
     def __init__(self, flies: Mask, limits: Limits) -> None:
         """Of rows that fly or not (N,)."""
         table, shape = rules(limits), (len(Cause), len(flies))
-        self._words = [table[cause].words for cause in Cause]
 
         def column(name: str) -> Array:
-            return np.stack([np.broadcast_to(np.asarray(getattr(table[c], name), float), shape[1:]) for c in Cause])
+            return np.stack([np.broadcast_to(np.asarray(getattr(rule, name), float), shape[1:]) for rule in table])
 
         def mask(name: str) -> Mask:
-            return np.array([[getattr(table[cause], name)] for cause in Cause], dtype=bool)
+            return np.array([[getattr(rule, name)] for rule in table], dtype=bool)
 
         self._after, self._then_s, self._clears = column("after_s"), column("then_s"), column("clears_s")
         self._first, then = column("first").astype(np.intp), column("then").astype(np.intp)
-        for cause in Cause:
-            grounded = table[cause].grounded
-            if grounded is not None:
-                then[cause] = np.where(flies, then[cause], grounded)
+        for row, rule in enumerate(table):
+            if rule.grounded is not None:
+                then[row] = np.where(flies, then[row], rule.grounded)
         self._then = then
         self._repeats, self._place, self._landing = mask("repeats"), mask("place"), mask("landing")
         self._since, self._begun, self._last = np.full((3, *shape), NEVER)
@@ -258,10 +230,10 @@ class Hazards:
         self, t: float, before: Index, lasted: Array, unresolved: Mask, found: Mapping[int, Observation]
     ) -> list[Incident]:
         """Record changes in words; returns landings and cuts, the hardest of each row last."""
-        news = []
-        for cause, row in np.argwhere(self._level != before).tolist():
-            outcome = Outcome(self._level[cause, row])
-            words = self._words[cause]
+        news, causes = [], list(Cause)
+        for number, row in np.argwhere(self._level != before).tolist():
+            cause, outcome = causes[number], Outcome(self._level[number, row])
+            words = cause.rule.words
             if outcome == Outcome.NONE:
                 end = f"{UNRESOLVED}: {words}, for" if unresolved[cause, row] else f"{OVER}: {words}, after"
                 text = f"{end} {lasted[cause, row]:.2f} s"
@@ -269,14 +241,10 @@ class Hazards:
             else:
                 text = f"{outcome.name.lower()}: {words}: {found[cause].detail(row)}"
                 self._texts[row][cause] = text
-            news.append(Incident(t, row, Cause(cause), outcome, text))
+            news.append(Incident(t, row, cause, outcome, text))
         news.sort(key=lambda incident: incident.outcome)
         self.incidents += news
         return [incident for incident in news if incident.outcome >= Outcome.LAND]
-
-    def words(self, cause: Cause) -> str:
-        """Words of a cause, as a robot gives its reason for landing."""
-        return self._words[cause]
 
     def worst(self, row: int) -> str:
         """Text of the worst hazard of a row, the outcome first; empty if it has none."""

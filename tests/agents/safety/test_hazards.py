@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.limits import Limits
-from agents.safety.hazards import RULES, Cause, Hazards, Observation, Outcome, rules
+from agents.safety.hazards import Cause, Hazards, Observation, Outcome, rules
 
 LIMITS = Limits(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5]))
 DT = 0.01
@@ -87,9 +87,9 @@ def lasting():
 def test_each_cause_has_its_outcomes_in_its_time(cause, lasting):
     found = [each for each in lasting.incidents if each.row == cause]
     assert [(round(each.time / DT), each.outcome.name) for each in found] == EXPECTED[cause]
-    assert found[0].text == f"{found[0].outcome.name.lower()}: {RULES[cause].words}: number {cause:d}"
+    assert found[0].text == f"{found[0].outcome.name.lower()}: {cause.rule.words}: number {cause:d}"
     assert lasting.outcome(cause).name == EXPECTED[cause][-1][1]
-    places = RULES[cause].place and EXPECTED[cause][-1][1] == "HOLD"
+    places = cause.rule.place and EXPECTED[cause][-1][1] == "HOLD"
     assert lasting.held[cause] == places
 
 
@@ -112,7 +112,7 @@ def test_a_hold_ends_after_its_time_and_is_over_after_a_quiet_second(cause):
     before = EXPECTED[cause][0][0] * DT
     bench = Bench().see(before + 0.1, cause)
     clears = rules(LIMITS)[cause].clears_s
-    if RULES[cause].place:
+    if cause.rule.place:
         for _ in range(round(clears / DT) - 1):
             bench.see(DT)
             assert bench.hazards.held.all()
@@ -120,7 +120,7 @@ def test_a_hold_ends_after_its_time_and_is_over_after_a_quiet_second(cause):
     assert not bench.hazards.held.any()
     assert bench.hazards.worst(0).startswith("hold: ")
     bench.see(1.1 - clears)
-    assert bench.hazards.incidents[-1].text.startswith(f"over: {RULES[cause].words}, after ")
+    assert bench.hazards.incidents[-1].text.startswith(f"over: {cause.rule.words}, after ")
     assert bench.hazards.worst(0) == ""
     assert bench.acts == []
 
