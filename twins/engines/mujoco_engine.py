@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, ClassVar, Final
 
 import msgspec
@@ -51,18 +52,15 @@ class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RigidBodyEngine(PointMassEngine):
     """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
 
+    quadrotor: Drones
+
     def __init__(self, stage: Stage, motor_lag: float) -> None:
         """`motor_lag` is the time constant of a motor's thrust [s].
 
         Raises:
             BodyError: For a kind without a twin, or if MuJoCo is not installed.
         """
-
-        def drones(kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> Drones:
-            self._drones = Drones(kinds, start, yaw, dt, scene=stage.scene, motor_lag=motor_lag)
-            return self._drones
-
-        super().__init__(stage, drones)
+        super().__init__(stage, partial(Drones, scene=stage.scene, motor_lag=motor_lag))
         self._update_attitude()
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
@@ -75,18 +73,18 @@ class RigidBodyEngine(PointMassEngine):
 
     def _fly(self, wobble: Array) -> None:
         """Advance flying rows by one step; hover jitter is an error of the drones' own estimate, which they follow."""
-        self._drones.set_position_error(wobble[self.air])
-        self._drones.advance()
+        self.quadrotor.set_position_error(wobble[self.air])
+        self.quadrotor.advance()
         self._copy_flight_state()
 
     def _update_attitude(self) -> None:
         self.attitude = _upright_quaternions(self.yaw)
-        self.attitude[self.air] = self._drones.attitude
+        self.attitude[self.air] = self.quadrotor.attitude
         self.attitude[self._mirrored] = _upright_quaternions(self.yaw[self._mirrored])
 
 
 class Drones(OnboardFlight):
-    """N rigid quadrotors; implements `twins.engines.point_mass.Flight`.
+    """N rigid quadrotors.
 
     Heights are those of the centre of mass relative to standing on the floor [m]; yaw has no jumps.
     """
@@ -109,12 +107,12 @@ class Drones(OnboardFlight):
         super().__init__(kinds, start, yaw, dt)
         rows = len(kinds)
         self._ticks = max(1, math.ceil(dt * RATE_HZ - 1e-6))
-        self._dt = dt / self._ticks
+        self._period = dt / self._ticks
         if unknown := sorted({kind.name for kind in kinds} - AIRFRAMES.keys()):
             remedy = "add it to AIRFRAMES in twins/engines/mujoco_model.py (docs/plugins.md), or choose another engine"
             raise BodyError(f"the engine mujoco has no airframe of {', '.join(map(repr, unknown))}; {remedy}")
         frames = [AIRFRAMES[kind.name] for kind in kinds]
-        step = self._dt / SUBSTEPS
+        step = self._period / SUBSTEPS
         models = {frame: mujoco.MjModel.from_xml_string(mjcf(frame, scene, step, motor_lag)) for frame in frames}
         self._models = [models[frame] for frame in frames]
         self._data = [mujoco.MjData(model) for model in list(models.values())[:1]]
@@ -123,7 +121,7 @@ class Drones(OnboardFlight):
         self._hover = np.array([0.25 * GRAVITY * frame.mass for frame in frames])
         self._speed = np.array([kind.speed for kind in kinds])[:, None]
         self._control = int(mujoco.mjtState.mjSTATE_CTRL.value)
-        self._firmware = Firmware(rows, self._dt)
+        self._firmware = Firmware(rows, self._period)
         self._state = np.zeros((rows, FULL_STATE))
         self._quiet = np.zeros(rows)  # for how long each has been still [s]
         self._wobble, self._drift = np.zeros((rows, 2)), np.zeros((rows, 2))
@@ -148,12 +146,12 @@ class Drones(OnboardFlight):
         fresh = rows[~self.flying[rows]]
         self._firmware.reset(fresh)
         self._heading[fresh] = self.yaw[fresh]
-        self._orders.yaw_setpoint[fresh] = self.yaw[fresh]
+        self._yaw_setpoint[fresh] = self.yaw[fresh]
         self._quiet[rows] = 0.0
         super().takeoff(rows, height)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        self._orders.place(rows, position, yaw, flying)
+        super().place(rows, position, yaw, flying)
         self._firmware.reset(rows)
         aloft = rows[flying]
         self._firmware.preset_hover(aloft, self._hover[aloft] / self._full[aloft, 0])
@@ -161,26 +159,24 @@ class Drones(OnboardFlight):
 
     def set_position_error(self, wobble: Array) -> None:
         """Set the error of the drones' position estimates until the next step: (n, 2) [m]."""
-        self._drift = (wobble - self._wobble) / (self._dt * self._ticks)
+        self._drift = (wobble - self._wobble) / (self._period * self._ticks)
         self._wobble = wobble
 
     def advance(self) -> None:
-        """Advance one step of dt."""
-        orders, state = self._orders, self._state
-        climbing = orders.climbing
+        state, climbing = self._state, self._climbing()
         if some(climbing):
-            orders.advance(climbing)
+            self._advance_climb(climbing)
         awake = np.flatnonzero(self.flying | (self._quiet < QUIET_S))
         if not len(awake):
             return
         alone = len(awake) < len(state)
         models = [self._models[row] for row in awake] if alone else self._models
         any_flies = some(self.flying)
-        by_velocity = orders.by_velocity & ~climbing
-        target = orders.target.copy()
+        by_velocity = self._by_velocity & ~climbing
+        target = self._target.copy()
         target[:, :2] += self._wobble / TRACKED_SHARE
-        wanted = clamp(orders.velocity_setpoint, -self._speed, self._speed)
-        if orders.any_by_velocity:
+        wanted = clamp(self._velocity_setpoint, -self._speed, self._speed)
+        if self._any_by_velocity:
             wanted[:, :2] += self._drift
         force = np.zeros((len(state), 4))
         for _ in range(self._ticks):
@@ -199,8 +195,8 @@ class Drones(OnboardFlight):
 
     def _motor_forces(self, target: Array, wanted: Array, by_velocity: Mask) -> Array:
         """Thrust setpoints of the motors, by the firmware's cascade: (n, 4) [N]."""
-        state, orders, firmware = self._state, self._orders, self._firmware
-        self._heading = np.where(by_velocity, self._heading + self._dt * orders.yaw_rate, orders.yaw_setpoint)
+        state, firmware = self._state, self._firmware
+        self._heading = np.where(by_velocity, self._heading + self._period * self._yaw_rate, self._yaw_setpoint)
         firmware.advance_outer_loops(target - state[:, PLACE], state[:, SPEED], wanted, by_velocity, self.yaw)
         share = firmware.advance_inner_loops(self._angles, state[:, SPIN], self._heading)
         return np.where(self.flying[:, None], self._full * share, 0.0)
@@ -217,14 +213,14 @@ class Drones(OnboardFlight):
         """End completed landings and bring drones on the ground to rest."""
         state = self._state
         self.position, self.velocity = state[:, PLACE].copy(), state[:, SPEED].copy()
-        self._orders.touch_down(self.position[:, 2])
+        self._touch_down()
         if some(self.flying):
             # the firmware's supervisor switches the motors off when the drone is upside down
             over = np.flatnonzero(self.flying & (self._tilt_cosine(slice(None)) < 0.0))
             if len(over):
-                self._orders.stop(over)
+                self.stop(over)
         moving = self.flying | (norm(state[:, SPEED]) > AT_REST) | (norm(state[:, SPIN]) > 10.0 * AT_REST)
-        self._quiet = np.where(moving, 0.0, self._quiet + self._dt * self._ticks)
+        self._quiet = np.where(moving, 0.0, self._quiet + self._period * self._ticks)
         if some(rests := self._quiet >= QUIET_S):
             state[rests, SPEED] = state[rests, SPIN] = 0.0
             self.velocity[rests] = 0.0

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
@@ -12,9 +12,9 @@ from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask, span
 from agents.body.interface import BodyError
-from agents.body.kinds import Kind
 from twins.engines.engine import Stage, Touch
 from twins.models.differential import DRIVES, Differential
+from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import RESPONSES, Quadrotor
 
 
@@ -34,29 +34,11 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
 
 
-class Flight(Protocol):
-    """Motion model of flying rows; methods as in `twins.models.quadrotor.Quadrotor`."""
-
-    position: Array
-    velocity: Array
-    yaw: Array
-    flying: Mask
-
-    def command(self, setpoint: Array) -> None: ...
-    def takeoff(self, rows: Index, height: Array) -> None: ...
-    def land(self, rows: Index) -> None: ...
-    def stop(self, rows: Index) -> None: ...
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None: ...
-    def advance(self) -> None: ...
-
-
-Flights = Callable[[Sequence[Kind], Array, Array, float], Flight]  # kinds, start, yaw, dt
-
-
 class Models:
     """Motion models of rows of any kinds: quadrotors for flying rows (`air`), differential drives for the `floor`."""
 
-    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
+    def __init__(self, stage: Stage, flights: Callable[..., OnboardFlight] = Quadrotor) -> None:
+        """`flights` makes the model of flying rows, with the arguments of `Quadrotor`."""
         kinds = stage.kinds
         unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
         if unknown:
@@ -66,8 +48,13 @@ class Models:
         air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
         self.in_air, self.on_floor = air, floor
         self.air, self.floor = span(air), span(floor)
-        self.quadrotor: Flight = flights([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
+        self.quadrotor = flights([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
         self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
+        self.position, self.yaw = np.array(stage.start, dtype=float), np.array(stage.yaw, dtype=float)
+        self.velocity, self.flying = np.zeros_like(self.position), np.zeros(len(kinds), dtype=bool)
+        self._mirrored = np.flatnonzero(stage.mirrored)
+        count = len(self._mirrored)
+        self._mirrored_state = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
 
     def command(self, setpoint: Array) -> None:
         if len(self.in_air):
@@ -92,6 +79,12 @@ class Models:
             which = np.isin(rows, part)
             at = np.searchsorted(part, rows[which])
             model.place(at, position[which], yaw[which], flying[which])
+        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
+
+    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
+        at = np.searchsorted(self._mirrored, rows)
+        for state, values in zip(self._mirrored_state, (position, velocity, yaw), strict=True):
+            state[at] = values
 
     def push(self, rows: Index, velocity: Array) -> None:
         """Set velocities (len(rows), 3) [m/s]; of ground robots the component along their heading."""
@@ -110,21 +103,11 @@ class PointMassEngine(Models):
 
     attitude: Array | None = None
 
-    def __init__(self, stage: Stage, flights: Flights = Quadrotor) -> None:
-        """Raises BodyError for a kind without a twin."""
+    def __init__(self, stage: Stage, flights: Callable[..., OnboardFlight] = Quadrotor) -> None:
         super().__init__(stage, flights)
-        rows = len(stage.kinds)
-        self._scene, self._copies = stage.scene, int(stage.copy.max(initial=0)) + 1
-        self._moves = len(stage.scene.moving) > 0
-        self._mirrored = np.flatnonzero(stage.mirrored)
-        count = len(self._mirrored)
-        self._mirrored_state = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
-        self.position = np.array(stage.start, dtype=float)
-        self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
-        self.flying = np.zeros(rows, dtype=bool)
-        self.obstacles = np.tile(stage.scene.pose, (self._copies, 1, 1))
-        if len(self._mirrored):
-            self.position[self._mirrored] = np.nan
+        self.position[self._mirrored] = np.nan
+        self._scene, self._moves = stage.scene, len(stage.scene.moving) > 0
+        self.obstacles = np.tile(stage.scene.pose, (int(stage.copy.max(initial=0)) + 1, 1, 1))
 
     def advance(self, t: float, wobble: Array) -> None:
         if len(self.on_floor):
@@ -138,7 +121,7 @@ class PointMassEngine(Models):
             rows = self._mirrored
             self.position[rows], self.velocity[rows], self.yaw[rows] = self._mirrored_state
         if self._moves:
-            self.obstacles = np.tile(self._scene.at(t), (self._copies, 1, 1))
+            self.obstacles = np.tile(self._scene.at(t), (len(self.obstacles), 1, 1))
 
     def _fly(self, wobble: Array) -> None:
         """Advance flying rows by one step; hover jitter is added to the position, not to the motion."""
@@ -151,14 +134,6 @@ class PointMassEngine(Models):
         flight, air = self.quadrotor, self.air
         self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
         self.flying[air] = flight.flying
-
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        super().place(rows, position, yaw, flying)
-        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
-
-    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        at = np.searchsorted(self._mirrored, rows)
-        self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 
     def touches(self) -> list[Touch]:
         """See `Engine.touches`: always empty."""

@@ -90,12 +90,6 @@ class PlanarEngine(Models):
         self._wobble = np.zeros((rows, 2))
         self._scene = stage.scene
         self._pose = stage.scene.pose.copy()
-        self._mirrored = np.flatnonzero(stage.mirrored)
-        seen = len(self._mirrored)
-        self._mirrored_state = np.full((seen, 3), np.nan), np.zeros((seen, 3)), np.zeros(seen)
-        self.position = np.array(stage.start, dtype=float)
-        self.velocity, self.yaw = np.zeros((rows, 3)), np.array(stage.yaw, dtype=float)
-        self.flying = np.zeros(rows, dtype=bool)
         self.obstacles = np.tile(stage.scene.pose, (len(self._copies), 1, 1))
         self.place(np.arange(rows), self.position, self.yaw, self.flying)
         self.position[self._mirrored] = np.nan
@@ -191,17 +185,12 @@ class PlanarEngine(Models):
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
         super().place(rows, position, yaw, flying)
-        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
         slots = self._slots[rows]
         self._state[slots, PLACE], self._state[slots, YAW] = position[:, :2], yaw
         self._state[slots, RATE] = 0.0
         self._wobble[rows] = 0.0
         for copy in self._copies:
             copy.contacts.reset_rows(rows.tolist())
-
-    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        at = np.searchsorted(self._mirrored, rows)
-        self._mirrored_state[0][at], self._mirrored_state[1][at], self._mirrored_state[2][at] = position, velocity, yaw
 
     def touches(self) -> list[Touch]:
         found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))

@@ -53,7 +53,6 @@ class Quadrotor(OnboardFlight):
         super().__init__(kinds, start, yaw, dt)
         responses = [(LEANING if leaning else RESPONSES)[kind.name] for kind in kinds]
         rows = len(responses)
-        self._dt = dt
         self._kp = np.array([r.position for r in responses])
         self._gain = dt * np.array([r.velocity for r in responses])  # of a step: k_v dt
         self._speed = np.array([r.speed for r in responses]).reshape(rows, 3)
@@ -65,21 +64,18 @@ class Quadrotor(OnboardFlight):
         self._turn = np.array(turns)
 
     def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Set positions (len(rows), 3) [m] and yaws [rad], at rest; flying rows hold them."""
-        self.position[rows], self.velocity[rows], self.yaw[rows] = position, 0.0, yaw
+        super().place(rows, position, yaw, flying)
         self._change[rows] = 0.0
-        self._orders.place(rows, position, yaw, flying)
 
     def advance(self) -> None:
         """Advance one step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting."""
-        orders = self._orders
-        if orders.any_climbing:
-            orders.advance(orders.climbing)
-        wanted = self._kp * (orders.target - self.position)
-        turn = self._turn * (orders.yaw_setpoint - self.yaw)
-        if orders.any_by_velocity:
-            wanted = np.where((orders.by_velocity & ~orders.climbing)[:, None], orders.velocity_setpoint, wanted)
-            turn = np.where(orders.by_velocity, orders.yaw_rate, turn)
+        if self._any_climbing:
+            self._advance_climb(self._climbing())
+        wanted = self._kp * (self._target - self.position)
+        turn = self._turn * (self._yaw_setpoint - self.yaw)
+        if self._any_by_velocity:
+            wanted = np.where((self._by_velocity & ~self._climbing())[:, None], self._velocity_setpoint, wanted)
+            turn = np.where(self._by_velocity, self._yaw_rate, turn)
         wanted = clamp(wanted, self._slowest, self._speed)
         change = self._gain * (wanted - self.velocity)
         if self._leaning:
@@ -92,7 +88,7 @@ class Quadrotor(OnboardFlight):
         self.velocity = velocity
         self.position += self._dt * velocity
         self.yaw = self.yaw + self._dt * turn  # in place, numpy adds one number as a sum: 7 µs more
-        if not aloft or some(orders.landing):
+        if not aloft or some(self._landing):
             self._touch_down()
 
     def _falling(self) -> Array:
@@ -100,7 +96,7 @@ class Quadrotor(OnboardFlight):
         return np.where((self.position[:, 2] > 0.0)[:, None], fall, 0.0)
 
     def _touch_down(self) -> None:
-        self._orders.touch_down(self.position[:, 2])
+        super()._touch_down()
         grounded = ~self.flying & (self.position[:, 2] <= TOUCHDOWN)
         self.position[grounded, 2] = 0.0
         self.velocity[grounded] = self._change[grounded] = 0.0

@@ -98,7 +98,7 @@ def linear_cascade(step, seconds, h=0.0005):
 def test_motors_carry_the_weight_and_the_drone_is_level(kind):
     engine = hovering(kind)
     weight = AIRFRAMES[kind.name].mass * GRAVITY
-    np.testing.assert_allclose(engine._drones.thrust.sum(axis=1), weight, rtol=2e-3)
+    np.testing.assert_allclose(engine.quadrotor.thrust.sum(axis=1), weight, rtol=2e-3)
     np.testing.assert_allclose(engine.attitude, [[1.0, 0.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(engine.position, [[0.0, 0.0, 1.0]], atol=2e-3)
 
@@ -210,7 +210,7 @@ def test_take_off_and_landing(kind):
     fly(engine, [[1.0, 1.0, 1.0, 1.0]], 0.5)
     np.testing.assert_allclose(engine.position, [[0.3, -0.2, 0.0]], atol=2e-4)  # setpoints on the ground do nothing
     engine.takeoff(np.array([0]), np.array([0.8]))
-    assert engine._drones.flying.tolist() == [True]
+    assert engine.quadrotor.flying.tolist() == [True]
     path = fly(engine, [[np.nan] * 4], 8.0)[:, 0]
     np.testing.assert_allclose(path[-1], [0.3, -0.2, 0.8, 0.0], atol=0.03)
     np.testing.assert_allclose(path[:, :2], np.tile([0.3, -0.2], (800, 1)), atol=2e-3)
@@ -247,7 +247,7 @@ def test_motors_off_is_a_fall_and_a_leaning_one_tumbles_and_stays_down():
 @pytest.mark.slow
 def test_what_is_on_its_back_is_switched_off_and_does_not_take_off():
     engine = hovering()
-    drones = engine._drones
+    drones = engine.quadrotor
     drones._state[0, 4:8] = [0.0, 1.0, 0.0, 0.0]
     fly(engine, [[0.0, 0.0, 1.0, 0.0]], 3.0)
     assert engine.flying.tolist() == [False]
