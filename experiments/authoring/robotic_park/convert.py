@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import Park, Robot, Threshold, read
+from experiments.authoring.robotic_park.file import Park, Robot, read
 from experiments.authoring.robotic_park.heights import Heights, find_heights
-from experiments.authoring.robotic_park.links import FormationLines, formation_lines, shorten_names
+from experiments.authoring.robotic_park.links import commonest, formation_table, shorten_names
 from experiments.authoring.robotic_park.starts import starts_from
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.problems import refusal
+from experiments.file.reference import written
 from experiments.file.text import content
 
 RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
@@ -32,14 +31,6 @@ ROOM: Final = 0.6  # [m] around starts and shape
 PARK: Final = (4.0, 4.0, 2.5)  # [m] the arena, if there is room in it
 WIDTH: Final = 110
 RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Rates of poses and decisions [Hz]."""
-
-    pose_hz: float
-    coordination_hz: float
 
 
 def convert(file: str, target: str | None, duration_s: float, poses: str | None = None) -> tuple[Path, list[str]]:
@@ -71,62 +62,53 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
         DocumentError: With the errors in theirs, by the path of the key.
     """
     notes: list[str] = []
-    park = read(label, text, {} if poses is None else starts_from(poses))
-    _tools(park, notes)
-    rates = _rates(park, notes)
-    trigger, update = _trigger(park, rates, notes), _update(park, notes)
+    park = read(label, text, {} if poses is None else starts_from(poses), notes)
+    _note_robots(park, notes)
+    pose_hz = _rate("local_pose.T", "poses", [robot.pose_s for robot in park.robots], notes)
+    coordination_hz = _rate(
+        "task.controller.period", "decisions", [task.period for _, task in park.tasks] or [0.1], notes
+    )
+    trigger: dict[str, Any] = {"kind": "periodic", "period_s": 1.0 / pose_hz}
+    chosen = commonest("communication", [robot.communication for robot in park.robots], notes)
+    if chosen is not None:
+        trigger = {"kind": "send-on-delta", "threshold": chosen[0]}
+        if chosen[1]:
+            notes.append(f"communication.threshold.ai = {chosen[1]:g}: the part of the threshold that grows")
     found = find_heights(park, notes)
-    formation = formation_lines(park, found, notes)
+    formation, links, anchors = formation_table(park, found, notes)
+    update = commonest("task.controller", [task.update for _, task in park.tasks] or [None], notes)
+    if update is not None:
+        formation["update"] = {"kind": "relative-control", "floor": update[0], "share": update[1]}
     notes = list(dict.fromkeys(notes))
-    return _written(park, label, duration_s, rates, (trigger, update), found, formation, notes), notes
-
-
-def _written(  # noqa: PLR0917 - everything that was found out
-    park: Park,
-    label: str,
-    duration_s: float,
-    rates: Rates,
-    triggers: tuple[str, str],
-    found: Heights,
-    formation: FormationLines,
-    notes: Sequence[str],
-) -> str:
-    trigger, update = triggers
-    size = _arena(park, found)
-    name = Path(label).stem
-    lines = [f"#:schema ./{index.SCHEMA}", f"# Imported from {_plain(Path(label).name)}."]
-    if notes:
-        lines.append("# Not carried over, or not as it was:")
-        for note in notes:
-            lines += textwrap.wrap(_plain(note), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
-    lines += [
-        f'title = "{_plain(name)}: {len(park.robots)} robots, {park.mode}"',
-        f'source = "an experiment file of Robotic-Park-Lab, {_plain(Path(label).name)}"',
-        f"duration_s = {duration_s:g}",
-        *(['architecture = "centralised"'] if park.architecture == "centralized" else []),
-        f"trigger = {trigger}",
-        *(['positioning = "vicon-twin"'] if any(robot.external for robot in park.robots) else []),
-        "",
-        "[arena]",
-        f"size = [{size[0]:g}, {size[1]:g}, {size[2]:g}]",
-        "",
-        "[rates]",
-        f"body_hz = {RATE_HZ:g}",
-        f"pose_hz = {rates.pose_hz:g}",
-        f"coordination_hz = {rates.coordination_hz:g}",
-        "",
-        "[formation]",
-        *formation.settings,
-        *([f"update = {update}"] if update else []),
-        "",
-        "[robots]",
-        *(_robot(robot, found, row) for row, robot in enumerate(park.robots)),
-        "",
-    ]
-    for table, rows in (("links", formation.links), ("anchors", formation.anchors)):
-        if rows:
-            lines += [f"[formation.{table}]", *rows, ""]
-    return "\n".join(lines)
+    name = Path(label)
+    tables: dict[str, dict[str, Any]] = {
+        "": {
+            "title": _plain(f"{name.stem}: {len(park.robots)} robots, {park.mode}"),
+            "source": f"an experiment file of Robotic-Park-Lab, {_plain(name.name)}",
+            "duration_s": duration_s,
+            **({"architecture": "centralised"} if park.central else {}),
+            "trigger": trigger,
+            **({"positioning": "vicon-twin"} if any(robot.external for robot in park.robots) else {}),
+        },
+        "arena": {"size": _arena(found)},
+        "rates": {"body_hz": RATE_HZ, "pose_hz": pose_hz, "coordination_hz": coordination_hz},
+        "formation": formation,
+        "robots": {robot.name: _robot(robot, found, row) for row, robot in enumerate(park.robots)},
+        "formation.links": links,
+        "formation.anchors": anchors,
+    }
+    lines = [f"#:schema ./{index.SCHEMA}", f"# Imported from {_plain(name.name)}."]
+    lines += ["# Not carried over, or not as it was:"] if notes else []
+    for note in notes:
+        lines += textwrap.wrap(_plain(note), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
+    made_up = {robot.name for robot in park.robots if robot.pose is None}
+    for header, table in tables.items():
+        lines += [f"[{header}]"] if header and table else []
+        for key, value in table.items():
+            remark = "  # start made up" if header == "robots" and key in made_up else ""
+            lines.append(f"{written(key) if ' ' in key else key} = {written(value)}{remark}")
+        lines += [""] if table else []
+    return "\n".join(lines), notes
 
 
 def _plain(text: str) -> str:
@@ -134,7 +116,7 @@ def _plain(text: str) -> str:
     return "".join(letter if letter.isprintable() and letter not in '"\\' else "?" for letter in text)
 
 
-def _arena(park: Park, found: Heights) -> list[float]:
+def _arena(found: Heights) -> list[float]:
     """Their park, or as much as starts and shape need, to the next half metre [m]."""
     places = np.concatenate([found.start, found.shape])
     reach = 2.0 * (np.abs(places[:, :2]).max(axis=0) + ROOM)
@@ -142,131 +124,67 @@ def _arena(park: Park, found: Heights) -> list[float]:
     return [max(size, float(np.ceil(2.0 * need) / 2.0)) for size, need in zip(PARK, needed, strict=True)]
 
 
-def _robot(robot: Robot, found: Heights, row: int) -> str:
-    body, process = _body(robot)
-    x, y = found.start[row, :2].tolist()
-    flies = KINDS[robot.kind].flies
-    yaw = 0.0 if flies or robot.pose is None else robot.pose[2]
-    parts = [f'kind = "{robot.kind}"', f"start = [{x:g}, {y:g}{f', {yaw:g}' if yaw else ''}]"]
+def _robot(robot: Robot, found: Heights, row: int) -> dict[str, Any]:
+    start, flies = found.start[row, :2].tolist(), KINDS[robot.kind].flies
+    if not flies and robot.pose is not None and robot.pose[2]:
+        start.append(robot.pose[2])
+    made: dict[str, Any] = {"kind": robot.kind, "start": start}
     if flies:
-        parts.append(f"hover = {found.hover[row]:g}")
-    if body:
-        parts.append(f'body = "{body}"')
-    if process:
-        parts.append(f'process = "{process}"')
+        made["hover"] = float(found.hover[row])
+    made |= _body(robot)
     if robot.external:
-        parts.append('position = "external"')
+        made["position"] = "external"
     if robot.place == "digital_twin":
-        parts.append("shadow = {}")
-    return f"{robot.name} = {{ {', '.join(parts)} }}{'  # start made up' if robot.pose is None else ''}"
+        made["shadow"] = {}
+    return made
 
 
-def _body(robot: Robot) -> tuple[str, str]:
-    """Address of a real robot and its process; empty for twins, and where there is no address."""
+def _body(robot: Robot) -> dict[str, str]:
+    """Address of a real robot and its process; nothing for twins, and where there is no address."""
     if robot.place == "virtual":
-        return "", ""
+        return {}
     radio = RADIO.fullmatch(robot.uri)
     if robot.kind == "crazyflie" and radio:
-        return robot.uri, f"radio{radio[1]}"
+        return {"body": robot.uri, "process": f"radio{radio[1]}"}
     if robot.kind in ("khepera4", "tello") and re.fullmatch(r"[\w.-]+(:\d+)?", robot.host):
-        return f"{robot.kind}://{robot.host}", ""
-    return "", ""
+        return {"body": f"{robot.kind}://{robot.host}"}
+    return {}
 
 
-def _tools(park: Park, notes: list[str]) -> None:
-    if park.tool and park.mode != "physical":
-        notes.append(
-            f"Operation: the simulator and its world ({park.tool}); twins are zenpark's own, in an empty arena"
-        )
-    if park.kind != "formation":
-        notes.append(f"Experience: type {park.kind}; only formations are known")
-    if park.architecture not in {"distributed", "centralized"}:
-        notes.append(f"Architecture: {park.architecture}; every robot decides for itself here")
-    if park.others:
-        notes.append(f"{', '.join(park.others)}: zenpark records, watches and reports by itself")
-    away = [robot.name for robot in park.robots if robot.place != "virtual" and not _body(robot)[0]]
-    if away:
-        verb = "is" if len(away) == 1 else "are"
-        notes.append(f"{shorten_names(away)} {verb} real, but without an address of a known kind: twins instead")
-    if len(away) < sum(robot.place != "virtual" for robot in park.robots):
-        notes.append("real robots keep their addresses; try the file with --virtual or --bodies twin first")
-    if any(robot.external for robot in park.robots):
-        notes.append(
-            "positioning Extern: the motion capture's address is not in their file; positioning is a twin of it"
-        )
-    gated = [robot.name for robot in park.robots if robot.gated]
-    if gated:
-        notes.append(f"{shorten_names(gated)}: position controllers that act on events; zenpark's run at every tick")
-    roles = Counter(task.role for _, task in park.tasks if task.role != "consensus")
-    if roles:
+def _note_robots(park: Park, notes: list[str]) -> None:
+    """What robots of theirs have and zenpark's do not."""
+
+    def those(what: Callable[[Robot], object], note: str) -> None:
+        if names := [robot.name for robot in park.robots if what(robot)]:
+            notes.append(note.format(shorten_names(names), "is" if len(names) == 1 else "are"))
+
+    those(
+        lambda robot: robot.place != "virtual" and not _body(robot),
+        "{} {} real, but without an address of a known kind: twins instead",
+    )
+    those(_body, "real robots ({}) keep their addresses; try the file with --virtual or --bodies twin first")
+    those(
+        lambda robot: robot.external,
+        "positioning Extern ({}): the motion capture's address is not in their file; positioning is a twin of it",
+    )
+    those(
+        lambda robot: robot.gated,
+        "{}: position controllers that act on events; zenpark's run at every tick",
+    )
+    if roles := dict.fromkeys(task.role for _, task in park.tasks if task.role != "consensus"):
         notes.append(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
-    idle = [robot for robot in park.robots if robot.idle]
-    if idle:
-        count = sum(robot.idle for robot in idle)
-        names = shorten_names([robot.name for robot in idle])
-        notes.append(
-            f"task.enable is False for {names}: {count} relations are left out, and these robots have no neighbours"
-        )
-    notes += park.remarks
+    count = sum(robot.idle for robot in park.robots)
+    those(
+        lambda robot: robot.idle,
+        f"task.enable is False for {{}}: {count} relations are left out, and these robots have no neighbours",
+    )
 
 
-def _rates(park: Park, notes: list[str]) -> Rates:
-    period = _most_common("task.controller.period", [task.period for _, task in park.tasks], 0.1, notes)
-    asked = _most_common("local_pose.T", [robot.pose_s for robot in park.robots], 0.02, notes)
-    return Rates(_divisor("poses", 1.0 / asked, notes), _divisor("decisions", 1.0 / period, notes))
-
-
-def _divisor(what: str, hz: float, notes: list[str]) -> float:
-    """The nearest rate that divides that of bodies."""
+def _rate(key: str, what: str, periods: Sequence[float], notes: list[str]) -> float:
+    """The rate [Hz] nearest to the commonest period [s] that divides the rate of bodies."""
+    hz = 1.0 / commonest(key, periods, notes)
     divisors = [RATE_HZ / times for times in range(1, 1001) if (1000 * RATE_HZ / times).is_integer()]
     nearest = min(divisors, key=lambda each: abs(np.log(each / hz)))
     if abs(nearest - hz) > 1e-6 * hz:
         notes.append(f"{what} at {hz:g} Hz become {nearest:g} Hz, which divides the {RATE_HZ:g} Hz of bodies")
     return nearest
-
-
-def _trigger(park: Park, rates: Rates, notes: list[str]) -> str:
-    """Trigger of poses, one for all robots."""
-    chosen = _most_thresholds("communication", [robot.communication for robot in park.robots], notes)
-    if not chosen.event:
-        return f'{{ kind = "periodic", period_s = {1.0 / rates.pose_hz:g} }}'
-    if chosen.relative:
-        notes.append(f"communication.threshold.ai = {chosen.relative:g}: the part of the threshold that grows")
-    return f'{{ kind = "send-on-delta", threshold = {chosen.constant:g} }}'
-
-
-def _update(park: Park, notes: list[str]) -> str:
-    """Control trigger; empty: the law is computed at every decision."""
-    given = [task.update for _, task in park.tasks]
-    update = _most_thresholds("task.controller", given, notes) if given else None
-    if update is None or not update.event:
-        return ""
-    return f'{{ kind = "relative-control", floor = {update.constant:g}, share = {update.relative:g} }}'
-
-
-def _most_thresholds(what: str, given: Sequence[Threshold], notes: list[str]) -> Threshold:
-    """The threshold that most robots have, whatever kind they call it."""
-    odd = Counter(each.kind for each in given if each.event and each.kind != "Constant")
-    if odd:
-        notes.append(f"{what}.threshold.type: {', '.join(odd)}; taken as a constant one with what ai adds")
-    plain = [
-        Threshold(True, each.constant, each.relative, "") if each.event else Threshold(False, 0.0, 0.0, "")
-        for each in given
-    ]
-    counted = Counter(plain)
-    if len(counted) > 1:
-        notes.append(f"{what}: {len(counted)} sorts among the robots; all get the commonest")
-    return counted.most_common(1)[0][0]
-
-
-def _most_common(what: str, given: Sequence[float], default: float, notes: list[str]) -> float:
-    """The value that most robots have."""
-    if not given:
-        return default
-    counted = Counter(given)
-    value = counted.most_common(1)[0][0]
-    if len(counted) > 1:
-        notes.append(
-            f"{what}: {', '.join(f'{each:g}' for each in sorted(counted))} s among the robots; all get {value:g}"
-        )
-    return value

@@ -25,16 +25,19 @@ from experiments.file.text import content
 
 T = TypeVar("T")
 Pose: TypeAlias = tuple[float, float, float]
+Threshold: TypeAlias = (
+    tuple[float, float] | None
+)  # c0 and a of an event trigger c0 + a·|·|; None: no event is waited for
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
-KINDS: Final = (  # their launcher knows robots by their names as well
-    ("dron", "crazyflie"),
-    ("crazyflie", "crazyflie"),
-    ("khepera", "khepera4"),
-    ("turtlebot", "turtlebot3"),
-    ("burger", "turtlebot3"),
-    ("tello", "tello"),
-)
+KINDS: Final = {  # their launcher knows robots by parts of their names as well
+    "dron": "crazyflie",
+    "crazyflie": "crazyflie",
+    "khepera": "khepera4",
+    "turtlebot": "turtlebot3",
+    "burger": "turtlebot3",
+    "tello": "tello",
+}
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
 NOTHING: Final = ("none", "null")  # a relationship without another end
@@ -42,19 +45,9 @@ SURFACES: Final = ("cone", "ellipsoid")
 PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 FORM: Final = "write name_d, name_x_y_z or origin_R, separated by commas"
-OLDER: Final = ("config_path", "communication", "task", "agent_ip", "control_mode")  # a table with one is a robot
+OLDER: Final = {"config_path", "communication", "task", "agent_ip", "control_mode"}  # a table with one is a robot
 OLDER_GAIN: Final = 0.25
 OLDER_CLAMP: Final = 0.08  # [m]
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """Event trigger of theirs, beyond c0 + a·|·|; always if `event` is false."""
-
-    event: bool
-    constant: float
-    relative: float
-    kind: str
 
 
 @dataclass(frozen=True)
@@ -95,7 +88,7 @@ class Robot:
     pose_s: float  # period of its pose [s]
     gated: bool  # its position controller acts on events
     task: Task | None  # None without one, or if it is switched off
-    idle: int = 0  # relations of a task that is switched off
+    idle: int  # relations of a task that is switched off
 
 
 @dataclass(frozen=True)
@@ -103,13 +96,9 @@ class Park:
     """Experiment of theirs."""
 
     mode: str  # physical, virtual or hybrid
-    tool: str  # of the simulation, with its world
-    kind: str  # of the experience
-    architecture: str  # centralized, distributed_ros2 or distributed
     robots: tuple[Robot, ...]
-    others: tuple[str, ...] = ()  # sections that are switched on and are about their own tools
+    central: bool = False  # decided by a central controller
     recent: bool = False  # for the drivers of 2024 on, which read `mars_data`
-    remarks: tuple[str, ...] = ()  # on the file itself, for its user
 
     @property
     def tasks(self) -> list[tuple[Robot, Task]]:
@@ -120,7 +109,7 @@ class _Threshold(Struct, frozen=True):
     type: str = "Constant"
     co: Number | None = None
     threshold: Number | None = None  # for `co`, in 2023
-    ai: Number | str = 0.0
+    ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
 
 class _Communication(Struct, frozen=True):
@@ -128,12 +117,9 @@ class _Communication(Struct, frozen=True):
     threshold: _Threshold = _Threshold()
 
 
-class _Control(Struct, frozen=True):
+class _Law(Struct, frozen=True):
     protocol: Literal["Continuous", "EventBased"] = "Continuous"
     threshold: _Threshold = _Threshold()
-
-
-class _Law(_Control, frozen=True):
     type: str = "gradient"
     period: Positive = 0.1
     gain: Positive = 0.1
@@ -149,13 +135,23 @@ class _Task(Struct, frozen=True):
     T: Positive = 100.0
 
 
+class _Switch(Struct, frozen=True):
+    enable: bool = False
+
+
 class _TaskHead(Struct, frozen=True):
+    """What counts of a task that is switched off, whatever else is in it."""
+
     enable: bool = True
     relationship: str = ""
 
 
-class _LocalPose(Struct, frozen=True):
+class _Timed(Struct, frozen=True):
     T: Positive = 20.0
+
+
+class _Protocol(Struct, frozen=True):
+    protocol: Literal["Continuous", "EventBased"] = "Continuous"
 
 
 class _Robot(Struct, frozen=True):
@@ -170,16 +166,12 @@ class _Robot(Struct, frozen=True):
     ip: str = ""
     port_number: str | int = ""
     positioning: Literal["Intern", "Extern", "MoCap"] = "Intern"
-    communication: Any = None
-    local_pose: _LocalPose = _LocalPose()
-    controller: _Control = _Control()
+    communication: _Communication | Literal["Continuous", "EventBased", "EvenBased"] = _Communication()
+    local_pose: _Timed = _Timed()
+    controller: _Protocol = _Protocol()
     controller_type: str = ""
     init_theta: Number = 0.0
     config_path: str = ""
-
-
-class _Switch(Struct, frozen=True):
-    enable: bool = False
 
 
 class _Operation(Struct, frozen=True):
@@ -274,8 +266,8 @@ def _without_empty(value: Any, done: dict[int, Any]) -> Any:  # noqa: ANN401 - w
     return done[id(value)]
 
 
-def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
-    """An experiment, in whichever of the formats.
+def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> Park:
+    """An experiment, in whichever of the formats; `notes` gets what is not carried over.
 
     Args:
         file: Its name: `config_path` is meant from its folder.
@@ -285,55 +277,91 @@ def read(file: str, text: str, poses: Mapping[str, Pose]) -> Park:
         DocumentError: With all errors in it and in the files that it names, by the paths of the keys.
     """
     root = load(file, text)
-    older = [] if root.has("Robots") else [each for each in root.tables() if any(map(each.has, OLDER))]
-    park = _read_older_format(file, older) if older else _sections(root)
-    robots = tuple(replace(robot, pose=poses.get(robot.name, robot.pose)) for robot in park.robots)
-    return replace(park, robots=robots)
+    older = [] if root.has("Robots") else [each for each in root.tables() if OLDER & each.value.keys()]
+    park = _older(file, older, notes) if older else _sections(root, notes)
+    return replace(park, robots=tuple(replace(each, pose=poses.get(each.name, each.pose)) for each in park.robots))
 
 
-def _sections(root: Entry) -> Park:
+def _sections(root: Entry, notes: list[str]) -> Park:
     """The format since December 2023."""
-    if not root.has("Robots"):
-        raise root.refused("'Robots' is missing", "an experiment of Robotic Park lists them as Robot01, Robot02, ...")
-    operation = root.get("Operation").typed(_Operation)
-    architecture = str(root.get("Architecture").value.get("mode", "distributed"))
-    central = architecture.lower() == CENTRAL
-    entries = root.get("Robots").tables()
-    if not entries:
-        raise root.get("Robots").refused("has none", "list them as Robot01, Robot02, ...")
-    robots = _robots_from(entries, lambda entry: _section_robot(entry, central=central))
-    _check_names(entries, robots)
-    others, remarks = _other_sections(root)
-    if central and architecture != CENTRAL:
-        remarks.append(f"Architecture: {architecture}; their launcher starts a centre for '{CENTRAL}' alone, and for"
-                       " this spelling no robot moves there; taken as centralized")  # fmt: skip
-    return Park(
-        mode=operation.mode,
-        tool=f"{operation.tool} {operation.world}".strip(),
-        kind=str(root.get("Experience").value.get("type", "formation")),
-        architecture=CENTRAL if central else architecture,
-        robots=tuple(robots),
-        others=tuple(others),
-        recent=any(entry.has("mars_data") for entry in entries),
-        remarks=tuple(remarks),
+    operation, architecture, listed = (root.get(key) for key in ("Operation", "Architecture", "Robots"))
+    if not root.has("Robots") or not listed.tables():
+        message = "has none" if root.has("Robots") else "'Robots' is missing"
+        hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
+        raise (listed if root.has("Robots") else root).refused(message, hint)
+    given, entries = operation.typed(_Operation), listed.tables()
+    if given.tool and given.mode != "physical":
+        tool = f"{given.tool} {given.world}".strip()
+        notes.append(f"Operation: the simulator and its world ({tool}); twins are zenpark's own, in an empty arena")
+    if (kind := root.get("Experience").value.get("type", "formation")) != "formation":
+        notes.append(f"Experience: type {kind}; only formations are known")
+    mode = str(architecture.value.get("mode", "distributed"))
+    central = mode.lower() == CENTRAL
+    if central and mode != CENTRAL:
+        notes.append(f"Architecture: {mode}; their launcher starts a centre for '{CENTRAL}' alone, and for this"
+                     " spelling no robot moves there; taken as centralized")  # fmt: skip
+    elif not central and mode != "distributed":
+        notes.append(f"Architecture: {mode}; every robot decides for itself here")
+    tools = [root.get(name) for name in ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")]
+    on = [each.key for each in (*tools, *root.get("Other").tables()) if each.typed(_Switch).enable]
+    if "Other.Reconfiguration" in on:
+        on.remove("Other.Reconfiguration")
+        notes.append("Other.Reconfiguration: the shape changes in flight there, by a program of theirs; the first"
+                     " shape is imported, and [[formation.changes]] can tell the others")  # fmt: skip
+    if on:
+        notes.append(f"{', '.join(on)}: zenpark records, watches and reports by itself")
+    robots = _robots(entries, lambda entry: _robot(entry, entry, notes, central=central))
+    return Park(given.mode, robots, central, any(entry.has("mars_data") for entry in entries))
+
+
+def _older(file: str, entries: Sequence[Entry], notes: list[str]) -> Park:
+    """The flat files and the indices of 2023."""
+    notes.append(
+        "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
     )
+    settings = {entry.key: _settings(entry, Path(file).parent) for entry in entries}
+    # entries that only let the drones' driver publish where another robot of the file is
+    marks = [
+        key
+        for key, own in settings.items()
+        if own.typed(_Robot).name in settings.keys() - {key} and not own.get("task").typed(_TaskHead).enable
+    ]
+    if marks:
+        notes.append(f"{', '.join(marks)}: the marker of a robot that stands in the file already")
+    entries = [entry for entry in entries if entry.key not in marks]
+    robots = _robots(entries, lambda entry: _robot(entry, settings[entry.key], notes, older=True), alone=True)
+    addresses = [f"{robot.name} {robot.host}" for robot in robots if robot.host]
+    if addresses and not any(entry.has("config_path") for entry in entries):
+        notes.append(
+            "the file does not say which robots are real: all are twins here; addresses in it: " + ", ".join(addresses)
+        )
+    kinds = {robot.place for robot in robots}
+    return Park(kinds.pop() if len(kinds) == 1 else "hybrid", robots)
 
 
-def _other_sections(root: Entry) -> tuple[list[str], list[str]]:
-    """Sections about their own tools that are switched on, and remarks on those that change the experiment."""
-    sections = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
-    found = [name for name in sections if root.get(name).typed(_Switch).enable]
-    on = [each.name for each in root.get("Other").tables() if each.typed(_Switch).enable]
-    remarks = []
-    if "Reconfiguration" in on:
-        remarks.append("Other.Reconfiguration: the shape changes in flight there, by a program of theirs; the first"
-                       " shape is imported, and [[formation.changes]] can tell the others")  # fmt: skip
-    return [*found, *(f"Other.{name}" for name in on if name != "Reconfiguration")], remarks
+def _settings(entry: Entry, folder: Path) -> Entry:
+    """The settings of a robot: its entry, or what the file that an index names for it holds."""
+    name = entry.typed(_Robot).config_path
+    if not name:
+        return entry
+    file = folder / name
+    try:
+        tables = load(str(file), content(file, str(file))).tables()
+    except OSError:
+        hint = "put the files of its robots beside the index"
+        raise entry.refused(f"there is no file '{name}' beside this one", hint) from None
+    if not tables:
+        raise refusal(str(file), "has no robot", f"write its settings under '{entry.name}:'")
+    return next((each for each in tables if each.name == entry.name), tables[0])
 
 
-def _robots_from(entries: Sequence[Entry], made: Callable[[Entry], Robot]) -> list[Robot]:
-    """A robot from each entry; the problems of all of them at once."""
-    robots, problems = [], []
+def _robots(entries: Sequence[Entry], made: Callable[[Entry], Robot], *, alone: bool = False) -> tuple[Robot, ...]:
+    """A robot from each entry; the problems of all of them at once.
+
+    Args:
+        alone: A file can hold one robot of an experiment, which says nothing without the others.
+    """
+    robots, problems = list[Robot](), []
     for entry in entries:
         try:
             robots.append(made(entry))
@@ -341,70 +369,67 @@ def _robots_from(entries: Sequence[Entry], made: Callable[[Entry], Robot]) -> li
             problems += error.problems
     if problems:
         raise DocumentError(problems)
-    return robots
+    names = [robot.name for robot in robots]
+    for entry, robot in zip(entries, robots, strict=True):
+        if names.count(robot.name) > 1:
+            raise entry.refused(f"two robots are called '{robot.name}'", "rename one of them")
+        for relation in robot.task.relations if robot.task else ():
+            if relation.name == robot.name:
+                raise entry.refused(f"'{robot.name}' cannot keep a distance to itself", "name another robot")
+            if alone and len(robots) == 1 and relation.name not in PLACES:
+                hint = "import the file that lists the robots of the experiment: an index names this one as config_path"
+                raise entry.refused(f"'{robot.name}' is one robot of an experiment", hint)
+            if relation.name not in (*names, *PLACES):
+                hint = did_you_mean(relation.name, [*names, "origin"])
+                raise entry.refused(f"no robot is called '{relation.name}'", hint)
+    return tuple(robots)
 
 
-def _section_robot(entry: Entry, *, central: bool) -> Robot:
-    missing = [key for key in ("name", "type", "pose") if not entry.has(key)]
-    if missing:
-        raise entry.refused(f"'{missing[0]}' is missing", "such as name: dron01, type: virtual, pose: 1.2, -0.5, 0.7")
-    given, task = entry.typed(_Robot), entry.get("task")
-    head = task.typed(_TaskHead)
-    # their central controller reads the relations of all robots, whatever `enable` says
-    on = entry.has("task") and (head.enable or (central and bool(_parts(head.relationship))))
-    if on and not (task.has("type") and task.has("relationship")):
-        raise task.refused("type or relationship is missing", f"write distance or pose; {FORM}")
-    return _robot(entry, given, entry, given, _task(task) if on else None)
-
-
-def _robot(entry: Entry, listed: _Robot, own: Entry, given: _Robot, task: Task | None) -> Robot:
-    """A robot; an index keeps what it lists apart from the robot's own settings."""
+def _robot(entry: Entry, own: Entry, notes: list[str], *, central: bool = False, older: bool = False) -> Robot:
+    """A robot; an index of 2023 keeps what it lists (`entry`) apart from the robot's own settings."""
+    for key in () if older else ("name", "type", "pose"):
+        if not entry.has(key):
+            raise entry.refused(f"'{key}' is missing", "such as name: dron01, type: virtual, pose: 1.2, -0.5, 0.7")
+    listed, given, task = entry.typed(_Robot), own.typed(_Robot), own.get("task")
     name = listed.name or listed.id or entry.name
-    host, port = given.agent_ip or given.ip, given.port_number
-    at = own.get("communication")
-    word = isinstance(given.communication, str)  # in 2023
-    given_trigger = replace(at, value={"type": at.value} if word else at.value).typed(_Communication)
-    relations = _parts(own.get("task").typed(_TaskHead).relationship)
+    kind = kind_of(name)
+    if not kind:
+        raise entry.refused(f"what kind of robot is '{name}'?", f"a name holds one of: {', '.join(KINDS)}")
+    if not NAME.fullmatch(name):
+        hint = "use letters, digits and _, beginning with a letter"
+        raise entry.refused(f"{name!r} cannot be the name of a robot", hint)
+    head = task.typed(_TaskHead)
+    relations = _parts(head.relationship)
+    # their central controller reads the relations of all robots, whatever `enable` says
+    on = own.has("task") and (head.enable or (central and bool(relations)))
+    if on and not older and not (task.has("type") and task.has("relationship")):
+        raise task.refused("type or relationship is missing", f"write distance or pose; {FORM}")
+    pose = listed.pose
+    if isinstance(pose, dict):
+        pose = [pose.get("x", 0.0), pose.get("y", 0.0)]
+    place = None if pose is None else pose_of(entry.get("pose"), pose)
+    host, speaks = given.agent_ip or given.ip, given.communication
+    if not isinstance(speaks, _Communication):
+        speaks = _Communication(speaks)  # a word, in 2023
     return Robot(
         name=name,
-        kind=_kind(entry, name),
+        kind=kind,
         place=listed.type,
-        pose=_pose(entry, listed, given),
+        pose=place and (*place[:2], place[2] or given.init_theta),  # Kheperas of 2023 have their yaw apart
         uri=listed.uri,
-        host=f"{host}:{port}" if host and port else host,
+        host=f"{host}:{given.port_number}" if host and given.port_number else host,
         external=given.positioning != "Intern",
-        communication=_threshold(at, given_trigger.threshold, event=given_trigger.type != "Continuous"),
+        communication=_threshold(own.get("communication"), speaks.threshold, notes, event=speaks.type != "Continuous"),
         pose_s=1e-3 * given.local_pose.T,
         gated=given.controller.protocol == "EventBased" or "EventBased" in given.controller_type,
-        task=task,
-        idle=0 if task else len(relations),
+        task=_task(task, notes, older=older) if on else None,
+        idle=0 if on else len(relations),
     )
 
 
 def kind_of(name: str) -> str:
     """Kind of a robot in zenpark by its name; empty for a name without a known kind."""
-    return next((kind for part, kind in KINDS if part in name.lower()), "")
-
-
-def _kind(entry: Entry, name: str) -> str:
-    kind = kind_of(name)
-    if not kind:
-        known = ", ".join(part for part, _ in KINDS)
-        raise entry.refused(f"what kind of robot is '{name}'?", f"a name holds one of: {known}")
-    if not NAME.fullmatch(name):
-        hint = "use letters, digits and _, beginning with a letter"
-        raise entry.refused(f"{name!r} cannot be the name of a robot", hint)
-    return kind
-
-
-def _pose(entry: Entry, listed: _Robot, given: _Robot) -> Pose | None:
-    """The start; Kheperas of 2023 have their yaw apart."""
-    if listed.pose is None:
-        return None
-    if isinstance(listed.pose, dict):
-        return listed.pose.get("x", 0.0), listed.pose.get("y", 0.0), given.init_theta
-    x, y, third = pose_of(entry.get("pose"), listed.pose)
-    return x, y, third or given.init_theta
+    return next((kind for part, kind in KINDS.items() if part in name.lower()), "")
 
 
 def pose_of(entry: Entry, pose: str | list[float]) -> Pose:
@@ -417,27 +442,30 @@ def pose_of(entry: Entry, pose: str | list[float]) -> Pose:
     return x, y, z
 
 
-def _threshold(entry: Entry, given: _Threshold, *, event: bool) -> Threshold:
+def _threshold(entry: Entry, given: _Threshold, notes: list[str], *, event: bool) -> Threshold:
+    if not event:
+        return None
     constant = next((each for each in (given.co, given.threshold) if each is not None), 0.01)
-    if event and constant <= 0.0:
+    if constant <= 0.0:
         raise entry.refused("a threshold of 0 or less is crossed always", "give metres, such as 0.01")
-    relative = 0.0 if str(given.ai).lower() in NOTHING else replace(entry, value=given.ai).typed(Number)
-    return Threshold(event, constant, relative, given.type)
+    if given.type != "Constant":
+        what = entry.name.replace("task", "task.controller")
+        notes.append(f"{what}.threshold.type: {given.type}; taken as a constant one with what ai adds")
+    return constant, 0.0 if isinstance(given.ai, str) else given.ai
 
 
-def _task(entry: Entry, *, older: bool = False) -> Task:
+def _task(entry: Entry, notes: list[str], *, older: bool) -> Task:
     given, law = entry.typed(_Task), entry.typed(_Task).controller
     kind = "distance" if given.type == "distance" else "pose"
     relations = tuple(_relation(entry, part, kind) for part in _parts(given.relationship))
     if older:
-        always = Threshold(False, 0.0, 0.0, "Constant")
-        return Task(kind, relations, "gradient", OLDER_GAIN, OLDER_CLAMP, 1e-3 * given.T, always, given.role)
+        return Task(kind, relations, "gradient", OLDER_GAIN, OLDER_CLAMP, 1e-3 * given.T, None, given.role)
     name, _, signal = law.type.partition("_")
     step = law.period if signal == "v" else 1.0  # their laws named _v give a velocity, the others a step
     clamp = min(law.upperLimit, -law.lowerLimit)
     if clamp <= 0.0:
         raise entry.refused("no step lies between lowerLimit and upperLimit", "such as -0.1 and 0.1")
-    update = _threshold(entry, law.threshold, event=law.protocol == "EventBased")
+    update = _threshold(entry, law.threshold, notes, event=law.protocol == "EventBased")
     return Task(kind, relations, name, step * law.gain, step * clamp, law.period, update, given.role)
 
 
@@ -464,75 +492,3 @@ def _relation(entry: Entry, part: str, kind: str) -> Relation:
     if len(values) == 1 and values[0] <= 0.0:
         raise entry.refused(f"'{part}' asks for a distance that is not positive", "give metres, such as 0.8")
     return Relation(name, values)
-
-
-def _check_names(entries: Sequence[Entry], robots: Sequence[Robot]) -> None:
-    """Refuses names that are given twice, and relations to robots that are not there."""
-    names = [robot.name for robot in robots]
-    for entry, robot in zip(entries, robots, strict=True):
-        if names.count(robot.name) > 1:
-            raise entry.refused(f"two robots are called '{robot.name}'", "rename one of them")
-        for relation in robot.task.relations if robot.task else ():
-            if relation.name == robot.name:
-                raise entry.refused(f"'{robot.name}' cannot keep a distance to itself", "name another robot")
-            if relation.name not in (*names, *PLACES):
-                hint = did_you_mean(relation.name, [*names, "origin"])
-                raise entry.refused(f"no robot is called '{relation.name}'", hint)
-
-
-def _read_older_format(file: str, entries: Sequence[Entry]) -> Park:
-    """The flat files and the indices of 2023."""
-    listed = [(entry, _settings(entry, Path(file).parent)) for entry in entries]
-    keys = [entry.name for entry in entries]
-    # entries that only let the drones' driver publish where another robot of the file is
-    marks = [
-        entry.name
-        for entry, own in listed
-        if own.typed(_Robot).name not in ("", entry.name)
-        and own.typed(_Robot).name in keys
-        and not own.get("task").typed(_TaskHead).enable
-    ]
-    settings = {entry.key: own for entry, own in listed if entry.name not in marks}
-    entries = [entry for entry in entries if entry.name not in marks]
-    robots = _robots_from(entries, lambda entry: _older_robot(entry, settings[entry.key]))
-    task = robots[0].task if len(robots) == 1 else None
-    if task and any(relation.name not in PLACES for relation in task.relations):
-        hint = "import the file that lists the robots of the experiment: an index names this one as config_path"
-        raise entries[0].refused(f"'{robots[0].name}' is one robot of an experiment", hint)
-    _check_names(entries, robots)
-    remarks = [
-        "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
-    ]
-    if marks:
-        remarks.append(f"{', '.join(marks)}: the marker of a robot that stands in the file already")
-    addresses = [f"{robot.name} {robot.host}" for robot in robots if robot.host]
-    if addresses and not any(entry.has("config_path") for entry in entries):
-        remarks.append(
-            "the file does not say which robots are real: all are twins here; addresses in it: " + ", ".join(addresses)
-        )
-    kinds = {robot.place for robot in robots}
-    mode = kinds.pop() if len(kinds) == 1 else "hybrid"
-    return Park(mode, "", "formation", "distributed", tuple(robots), remarks=tuple(remarks))
-
-
-def _settings(entry: Entry, folder: Path) -> Entry:
-    """The settings of a robot: its entry, or what the file that an index names for it holds."""
-    name = entry.typed(_Robot).config_path
-    if not name:
-        return entry
-    file = folder / name
-    try:
-        tables = load(str(file), content(file, str(file))).tables()
-    except OSError:
-        hint = "put the files of its robots beside the index"
-        raise entry.refused(f"there is no file '{name}' beside this one", hint) from None
-    own = next((each for each in tables if each.name == entry.name), None) or next(iter(tables), None)
-    if own is None:
-        raise refusal(str(file), "has no robot", f"write its settings under '{entry.name}:'")
-    return own
-
-
-def _older_robot(entry: Entry, own: Entry) -> Robot:
-    on = own.has("task") and own.get("task").typed(_TaskHead).enable
-    task = _task(own.get("task"), older=True) if on else None
-    return _robot(entry, entry.typed(_Robot), own, own.typed(_Robot), task)

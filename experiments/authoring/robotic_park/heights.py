@@ -12,7 +12,7 @@ from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchors
 from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links
-from experiments.authoring.robotic_park.file import CENTRAL, Park, Pose, Relation, Robot
+from experiments.authoring.robotic_park.file import Park, Pose, Relation, Robot
 from experiments.check.realisation import ENOUGH, Shape, fitted_shape
 
 MET: Final = 1e-3  # [m] and those with three: no further beginnings are drawn
@@ -141,7 +141,7 @@ def origin_of(park: Park, robot: Robot, relation: Relation) -> Pose | None:
     The file may give one. If not, the driver of real Crazyflies has one of its own (`REAL_ORIGIN`); those of Kheperas
     and in Webots, and the central controller, take that of the arena.
     """
-    own = robot.kind == "crazyflie" and robot.place != "virtual" and park.architecture != CENTRAL
+    own = robot.kind == "crazyflie" and robot.place != "virtual" and not park.central
     of_driver = REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
     return relation.centre or of_driver
 
@@ -164,29 +164,24 @@ def _starts(park: Park, notes: list[str]) -> Array:
 def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
     """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
-    pairs, distance, relative = [], [], []
-    anchored, point, radius = [], [], []
+    pairs: list[tuple[int, int, float, Pose]] = []
+    anchored: list[tuple[int, Pose, float]] = []
     for robot, task in park.tasks:
         i = row[robot.name]
         for relation in task.relations:
             if relation.name in row:
                 j = row[relation.name]
-                pairs.append((i, j))
-                distance.append(relation.values[0] if task.kind == "distance" else np.nan)
                 x, y, z = (*relation.values, 0.0, 0.0)[:3]
-                level = start[i, 2] - start[j, 2]
-                relative.append((x, y, z if flies[i] or flies[j] else level))
+                distance = x if task.kind == "distance" else np.nan
+                pairs.append((i, j, distance, (x, y, z if flies[i] or flies[j] else start[i, 2] - start[j, 2])))
             elif relation.name == "origin" and len(relation.values) == 1:
-                anchored.append(i)
-                point.append(origin_of(park, robot, relation) or (0.0, 0.0, 0.0))
-                radius.append(relation.values[0])
-    lengths, blank = np.array(distance, dtype=float), np.full((len(pairs), 3), np.nan)
-    ends = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+                anchored.append((i, origin_of(park, robot, relation) or (0.0, 0.0, 0.0), relation.values[0]))
+    ends = np.array([pair[:2] for pair in pairs], dtype=np.intp).reshape(-1, 2)
+    lengths, vectors = np.array([pair[2] for pair in pairs]), np.array([pair[3] for pair in pairs]).reshape(-1, 3)
     wants = np.where(np.isnan(lengths), BY_RELATIVE, BY_DISTANCE)
-    vectors = np.array(relative, dtype=float).reshape(-1, 3)
+    blank, one = np.full_like(vectors, np.nan), np.ones(len(anchored))
     asked = Links(ends[:, 0], ends[:, 1], lengths, np.ones(len(ends)), vectors, blank, wants)
-    count = len(anchored)
-    if not count:
+    if not anchored:
         return asked, None
-    one, zero, point_of = np.ones(count), np.zeros(count), np.array(point, dtype=float)
-    return asked, Anchors(np.array(anchored), point_of, np.zeros((count, 3)), one, zero, np.array(radius), one)
+    rows, points, radii = (np.array(each) for each in zip(*anchored, strict=True))
+    return asked, Anchors(rows, points, np.zeros_like(points), one, 0.0 * one, radii, one)

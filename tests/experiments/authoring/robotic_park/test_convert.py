@@ -145,9 +145,9 @@ def test_a_pid_pulls_as_the_square(tmp_path):
 @pytest.mark.parametrize(
     ("relation", "anchor", "note"),
     [
-        ("origin_0.462", "distance = 0.462, to = [0, 0, 0]", ""),
-        ("sphere_0.5-0.1-0.2-0.0", "distance = 0.5, to = [0.1, 0.2, 0]", ""),
-        ("line_0.0_0.1_0.0_1.0_0.0_0.0", "to = [0, 0.1, 0], along = [1, 0, 0]", ""),
+        ("origin_0.462", "distance = 0.462, to = [0.0, 0.0, 0.0]", ""),
+        ("sphere_0.5-0.1-0.2-0.0", "distance = 0.5, to = [0.1, 0.2, 0.0]", ""),
+        ("line_0.0_0.1_0.0_1.0_0.0_0.0", "to = [0.0, 0.1, 0.0], along = [1.0, 0.0, 0.0]", ""),
         ("cone_1.0-1.0-0.0-0.0-0.0", "", "cone"),
         ("ellipsoid_0-0-0_1-1-1", "", "ellipsoid"),
     ],
