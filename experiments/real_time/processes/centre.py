@@ -26,26 +26,23 @@ from agents.decision.centralised import Centre, CentreGoals
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, OwnershipCheck
+from agents.network.name_ownership import OwnershipCheck
 from agents.network.shutdown import end
 from agents.network.validation import reach_of
-from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.file.problems import DocumentError, refusal
-from experiments.real_time.processes.joining import Launch, joined
+from experiments.file.problems import refusal
+from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
 
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # queued poses of a robot
 ROUNDING_S: Final = 1e-5  # stamps are rounded
 PHASES: Final = {phase.word: int(phase) for phase in Phase}
-EXPLAINED: Final = (DocumentError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 class CentreProcess:
@@ -226,10 +223,5 @@ def serve(launch: Launch) -> int:
     return 0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
-    return command_line.run("zenpark centre", Launch, serve, EXPLAINED, arguments)
-
-
 if __name__ == "__main__":
-    end(main())
+    end(command_line.run("zenpark centre", Launch, serve, EXPLAINED))

@@ -11,17 +11,16 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Annotated, Final
+from typing import Annotated
 
 import msgspec
 import zenoh
 
-from agents.body.interface import BodyError
 from agents.body.kinds import KINDS
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end, held
 from agents.plugins import registry
@@ -31,18 +30,9 @@ from agents.runtime.lifeline import Lifeline
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import structure
-from experiments.file.problems import DocumentError, refusal
-from experiments.real_time.processes.joining import Launch
+from experiments.file.problems import refusal
+from experiments.real_time.processes.joining import EXPLAINED, Launch
 from twins.devices.device import Device, DeviceRequest, Faults
-
-EXPLAINED: Final = (
-    DocumentError,
-    BodyError,
-    registry.PluginError,
-    EndpointError,
-    network.Unreachable,
-    OSError,
-)
 
 
 class DeviceProcess:
@@ -193,10 +183,5 @@ def _faults(text: str) -> Faults:
     return msgspec.convert(structure.parse_object("--faults", text, Faults), Faults)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
-    return command_line.run("zenpark twin", TwinLaunch, stand_in, EXPLAINED, arguments)
-
-
 if __name__ == "__main__":
-    end(main())
+    end(command_line.run("zenpark twin", TwinLaunch, stand_in, (*EXPLAINED, OSError)))

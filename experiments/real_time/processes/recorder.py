@@ -19,19 +19,16 @@ import zenoh
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
-from experiments.file.problems import DocumentError
-from experiments.real_time.processes.joining import Launch, joined
+from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
 from experiments.recording.reader import RecordingError
 from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 
-EXPLAINED: Final = (DocumentError, RecordingError, EndpointError, network.Unreachable, OSError)
 POLL_S: Final = 0.02
 FLUSH_S: Final = 1.0
 FRESH_S: Final = 0.05  # largest time between a state and a true pose that belongs to it
@@ -205,10 +202,5 @@ def record(launch: RecorderLaunch) -> int:
     return 0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
-    return command_line.run("zenpark recorder", RecorderLaunch, record, EXPLAINED, arguments)
-
-
 if __name__ == "__main__":
-    end(main())
+    end(command_line.run("zenpark recorder", RecorderLaunch, record, (*EXPLAINED, RecordingError, OSError)))

@@ -23,15 +23,11 @@ from typing import Annotated, Final
 import msgspec
 
 from agents.body.fleet import assemble
-from agents.body.interface import BodyError
 from agents.body.shadow_twin import shadowed
 from agents.clock import Clock
 from agents.network import session as network
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.lab import LabError
-from agents.network.name_ownership import NameTaken
-from agents.network.session import Unreachable
 from agents.network.shutdown import end
 from agents.plugins import registry
 from agents.runtime import command_line
@@ -43,15 +39,14 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import chosen_case
-from experiments.file.problems import DocumentError, refusal
+from experiments.file.problems import refusal
 from experiments.real_time.processes import joining
-from experiments.real_time.processes.joining import Launch
+from experiments.real_time.processes.joining import EXPLAINED, Launch
 
 STDIN: Final = "-"
 JOIN: Final = "join"
 FAR: Final = ("external", "world")  # bodies in another process, with their range sensors
 EXPERIMENT_S: Final = 15.0  # how long an experiment may take to arrive on standard input
-EXPLAINED: Final = (DocumentError, BodyError, NameTaken, registry.PluginError, EndpointError, LabError, Unreachable)
 
 
 class RobotLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):

@@ -16,25 +16,21 @@ from typing import Annotated, Final
 import msgspec
 import zenoh
 
-from agents.body.interface import BodyError
 from agents.network import messages, pubsub
-from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
-from agents.network.name_ownership import NameTaken, OwnershipCheck
+from agents.network.name_ownership import OwnershipCheck
 from agents.network.shutdown import Farewell, end
 from agents.plugins import registry
 from agents.runtime import command_line
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
-from experiments.file.problems import DocumentError, refusal
-from experiments.real_time.processes.joining import Launch, joined
+from experiments.file.problems import refusal
+from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
 
 REPORT_S: Final = 1.0
 SLIP_S: Final = 0.05  # lateness that is caught up; the rest of the time is lost, which shows in the factor
-EXPLAINED: Final = (DocumentError, BodyError, registry.PluginError, EndpointError, NameTaken, network.Unreachable)
 
 
 @dataclass
@@ -246,10 +242,5 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
     return {name for name in found if name is not None}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the process."""
-    return command_line.run("zenpark world serve", WorldLaunch, serve, EXPLAINED, arguments)
-
-
 if __name__ == "__main__":
-    end(main())
+    end(command_line.run("zenpark world serve", WorldLaunch, serve, EXPLAINED))
