@@ -50,7 +50,6 @@ class CaseResult:
     """End of a case."""
 
     recording: Path
-    interrupted: bool
     start: float | None
     ready_s: float | None
     lost: tuple[str, ...]
@@ -108,10 +107,6 @@ class Conductor:
                 if start is not None:
                     self._drift.close()
                     self._view.report_drift(*self._drift.news())
-                    clocks, trouble = self._context.hosts.clocks()
-                    self._view.report_clocks(clocks)
-                    for each in trouble:
-                        self._view.report("clock", "conductor", each)
                 for name in self._processes.end_robots():
                     self._leave_behind(name, "its process hung after the landing, and was killed")
         except RunFailed as failure:
@@ -122,7 +117,7 @@ class Conductor:
         finally:
             self._processes.end()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        return CaseResult(self._context.recording, self._context.ended(), start, ready, lost)
+        return CaseResult(self._context.recording, start, ready, lost)
 
     def _adopt(self) -> None:
         """Adopt robots that were started by hand or at boot."""

@@ -1,47 +1,23 @@
-"""Clocks of other machines during a run: measured again and again, and corrected in the robots that run there.
+"""Clocks of other machines during a run: measured every second, and corrected in the robots that run there.
 
-A host that drifts by 50 ppm is 0.18 s off after an hour. Every so often each station is asked as before the run, and
-the robots' processes get their new correction on their lifelines (`agents.clock`): only the launcher holds these, and
-no network of the experiment is needed. A correction moves only as far as a measurement proves that it is off.
+A host that drifts by 50 ppm is 0.18 s off after an hour. Each station is asked as before the run, and the robots'
+processes get their new correction on their lifelines (`agents.clock`): only the launcher holds these, and no network of
+the experiment is needed. A correction moves only as far as a measurement proves that it is off.
 """
 
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 from agents.clock import STEP_S
 from agents.network.messages import HostClock
-from experiments.real_time.hosts.hosts import HostError
+from experiments.real_time.hosts.hosts import HostError, Station
 
 SAMPLES: Final = 8
-SOONEST_S: Final = 1.0
-LATEST_S: Final = 10.0
-ALLOWED_S: Final = 1e-3  # of drift from one measurement to the next
-
-
-class MeasuredHost(Protocol):
-    """A host whose clock is measured and corrected (`experiments.real_time.hosts.hosts.Station`)."""
-
-    name: str
-    clock: HostClock | None
-
-    def measure(self, robots: Sequence[str], samples: int) -> HostClock:
-        """Measure its clock."""
-
-    def correct(self, applied: float) -> HostClock:
-        """Send its robots the correction of their stamps [s]."""
-
-
-def due(before: HostClock, now: HostClock) -> float:
-    """Time to the next measurement [s], by the drift of the clock since the last one."""
-    proved = abs(now.offset - before.offset) - now.uncertainty - before.uncertainty
-    if proved <= 0.0:
-        return LATEST_S
-    return min(max(ALLOWED_S * (now.stamp - before.stamp) / proved, SOONEST_S), LATEST_S)
+PERIOD_S: Final = 1.0  # NTP slews a clock by at most 500 ppm: 0.5 ms
 
 
 def applied(now: HostClock, before: float) -> float:
@@ -52,7 +28,7 @@ def applied(now: HostClock, before: float) -> float:
 class Drift:
     """Measures and corrects the clocks of some hosts in a thread of its own, for an answer may take long."""
 
-    def __init__(self, hosts: Iterable[tuple[MeasuredHost, list[str]]]) -> None:
+    def __init__(self, hosts: Iterable[tuple[Station, list[str]]]) -> None:
         """`hosts` with the robots that run on each; measured once already."""
         self._hosts = list(hosts)
         self._over = threading.Event()
@@ -85,32 +61,28 @@ class Drift:
         return found
 
     def _run(self) -> None:
-        times = dict.fromkeys(range(len(self._hosts)), time.monotonic() + SOONEST_S)
-        while times and not self._over.wait(max(0.0, min(times.values()) - time.monotonic())):
-            number = min(times, key=lambda each: times[each])
-            host, robots = self._hosts[number]
-            try:
-                times[number] = time.monotonic() + self._measure(host, robots)
-            except HostError as error:
-                del times[number]
-                with self._lock:
-                    self._trouble.append(f"{error}; its clock is not corrected any more")
+        while self._hosts and not self._over.wait(PERIOD_S):
+            for host, robots in list(self._hosts):
+                try:
+                    self._measure(host, robots)
+                except HostError as error:
+                    self._hosts.remove((host, robots))
+                    with self._lock:
+                        self._trouble.append(f"{error}; its clock is not corrected any more")
 
-    def _measure(self, host: MeasuredHost, robots: list[str]) -> float:
-        """Measure one clock and correct its robots; return the time to the next measurement [s]."""
+    def _measure(self, host: Station, robots: list[str]) -> None:
+        """Measure one clock and correct its robots."""
         before = host.clock
         assert before is not None
         assert before.applied is not None
         now = host.measure(robots, SAMPLES)
-        wanted = applied(now, before.applied)
-        jumped = abs(wanted - before.applied) > STEP_S
-        if not jumped:
-            now = host.correct(wanted)
+        step, last = (applied(each, before.applied) - before.applied for each in (now, before))
+        if abs(step) <= STEP_S:
+            now = host.correct(before.applied + step)
         with self._lock:
             self._measured.append(now)
-            if jumped:
+            if abs(last) <= STEP_S < abs(step):
                 self._trouble.append(
-                    f"{host.name}: its clock jumped by {wanted - before.applied:+.3f} s, which is no drift and is not "
+                    f"{host.name}: its clock jumped by {step:+.3f} s, which is no drift and is not "
                     "corrected: was it suspended? Start the run again"
                 )
-        return LATEST_S if jumped else due(before, now)

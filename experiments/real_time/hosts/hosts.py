@@ -302,16 +302,6 @@ class Hosts:
     def station_of(self, robot: str) -> Station | None:
         return self._robots.get(robot)
 
-    def clocks(self) -> tuple[list[HostClock], list[str]]:
-        """Clocks of all hosts of the case now, and the reasons why others could not be read."""
-        measured, trouble = [], []
-        for station, robots in self.in_use():
-            try:
-                measured.append(station.measure(robots))
-            except HostError as error:
-                trouble.append(str(error))
-        return measured, trouble
-
     def sweep(self) -> list[str]:
         """Kill remaining processes of the run on every host, and name them."""
         killed = []

@@ -1,4 +1,4 @@
-"""Clocks that drift during a run: how often they are measured, and what is left in stamps when robots follow."""
+"""Clocks that drift during a run: what is left in stamps when robots follow."""
 
 import time
 
@@ -23,11 +23,11 @@ def simulated(ppm, seconds, *, follows):
     true = np.arange(round(seconds / DT)) * DT
     offset = 0.2 + ppm * 1e-6 * true
     before = HostClock("lab2", 0.0, 0.2, UNCERTAINTY_S, ["CF01"], 0.2)
-    clock, measured, left, due = Clock(-0.2), [before], [], clock_drift.SOONEST_S
+    clock, measured, left, due = Clock(-0.2), [before], [], clock_drift.PERIOD_S
     for t, lies in zip(true, offset, strict=True):
         if t >= due:
             now = HostClock("lab2", t, lies + rng.uniform(-1, 1) * UNCERTAINTY_S, UNCERTAINTY_S, ["CF01"])
-            due = t + clock_drift.due(measured[-1], now)
+            due = t + clock_drift.PERIOD_S
             wanted = clock_drift.applied(now, measured[-1].applied) if follows else 0.2
             clock.follow(correction_line(-wanted).strip())
             measured.append(HostClock("lab2", t, now.offset, UNCERTAINTY_S, ["CF01"], wanted))
@@ -79,8 +79,7 @@ class Host:
 
 
 def test_robots_are_told_drift_and_no_jump(monkeypatch):
-    monkeypatch.setattr(clock_drift, "SOONEST_S", 0.01)
-    monkeypatch.setattr(clock_drift, "LATEST_S", 0.01)
+    monkeypatch.setattr(clock_drift, "PERIOD_S", 0.01)
     host = Host([0.21, 0.21 + 2 * STEP_S, 0.22])
     measured, trouble = [], []
 
