@@ -13,11 +13,7 @@ OWN: Final = stat.S_IRWXU
 
 
 def runtime_folder() -> Path:
-    """The user's folder, created if missing.
-
-    Raises:
-        OSError: If it cannot be created, or others could write there.
-    """
+    """The user's folder, created if missing; raises OSError if it cannot be created, or others could write there."""
     chosen, runtime = os.environ.get("ZENPARK_RUNTIME_DIR"), os.environ.get("XDG_RUNTIME_DIR")
     if chosen:
         folder = Path(chosen)

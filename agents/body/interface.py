@@ -153,11 +153,7 @@ class Body(Protocol):
     """
 
     def open(self) -> None:
-        """Connects; returns when poses arrive.
-
-        Raises:
-            BodyError: If that fails, with the remedy.
-        """
+        """Connects, and returns when poses arrive; raises BodyError, with the remedy, if that fails."""
         ...
 
     def read(self, t: float) -> BodyState:
@@ -248,11 +244,7 @@ SettingsT = TypeVar("SettingsT", bound=msgspec.Struct)
 
 
 def settings(kind: type[SettingsT], robot: str, device: Mapping[str, Any]) -> SettingsT:
-    """The settings of a robot's device.
-
-    Raises:
-        BodyError: If a field is unknown or wrong, naming the robot, the field and the fields that there are.
-    """
+    """The settings of a robot's device; raises BodyError if a field is unknown or wrong, with the known fields."""
     try:
         return msgspec.convert(dict(device), kind)
     except msgspec.ValidationError as error:

@@ -159,11 +159,7 @@ class GoalComputer:
         return GoalDecision(due, goal, offset, goal_yaw)
 
     def law_offset(self, t: float, position: Array) -> Array:
-        """Offset of all rows (N, 3) [m].
-
-        Raises:
-            PluginError: If the law fails; the error names it.
-        """
+        """Offset of all rows (N, 3) [m]; raises PluginError, which names the law, if it fails."""
         law, neighbours, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
         try:
@@ -177,8 +173,7 @@ class GoalComputer:
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
         """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them.
 
-        Raises:
-            PluginError: If the law fails, or gives something else than one error for each link.
+        Raises PluginError if the law fails, or gives something else than one error for each link.
         """
         law, neighbours = self._assignment.law, self.neighbours
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)

@@ -54,11 +54,7 @@ class Rights(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     linked: bool = False  # routers forward to each other what they have let in; else a router may publish nothing
 
     def joined(self, other: Rights) -> Rights:
-        """The rights of two experiments that share a router.
-
-        Raises:
-            LabError: If their realms differ.
-        """
+        """The rights of two experiments that share a router; raises LabError if their realms differ."""
         if self.realm != other.realm:
             raise LabError(
                 f"cases in the realms {self.realm} and {other.realm} share no router: give them one network.realm"
@@ -103,10 +99,7 @@ def _cache_keys(keys: Iterable[str]) -> list[str]:
 def rules(rights: Rights, register: Register) -> dict[str, Any]:
     """The `access_control` of a router: default deny, one subject for each valid certificate.
 
-    Robots that are not in the register get no rights.
-
-    Raises:
-        LabError: If the name of a robot belongs to an identity of another role.
+    Robots that are not in the register get no rights. Raises LabError if another role has the name of a robot.
     """
     made: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []

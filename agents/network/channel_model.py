@@ -174,11 +174,9 @@ class Channel:
         Before the common start nothing is lost and no link is too slow: no run begins before all robots have received
         their neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
 
-        Args:
-            poses: On links of limited bandwidth with their sizes, `bytes`.
-            start: Common start [s] on the clock of the stamps, (M,) or for all; infinity or NaN while it is not known.
-            now: At the receiver of a real network, time of reception [s]: the time that it took counts towards the
-                delay.
+        `poses` have their sizes, `bytes`, on links of limited bandwidth; `start` [s] is on the clock of stamps, (M,) or
+        for all, infinity or NaN while it is not known. `now` is, at the receiver of a real network, the time of
+        reception [s]: the time that it took counts towards the delay.
         """
         link, stamp = poses.link, poses.stamp
         delay = self._delay if isinstance(self._delay, float) else self._delay[link]

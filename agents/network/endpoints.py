@@ -46,11 +46,7 @@ class Endpoint:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parses an endpoint.
-
-        Raises:
-            ValueError: If it is none; says how one is written.
-        """
+        """Parses an endpoint; raises ValueError, which says how one is written, if it is none."""
         protocol, _, whole = text.partition("/")
         if protocol and whole and (why := refusal(text)):
             raise ValueError(why)
@@ -71,13 +67,12 @@ class Endpoint:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine reaches it."""
         address = self._address
         return self.protocol == UNIX or self.host == "localhost" or (address is not None and address.is_loopback)
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it stands for every address of a machine: for listening only."""
+        """Whether it stands for every address of a machine, for listening only."""
         address = self._address
         return address is not None and address.is_unspecified
 

@@ -92,21 +92,8 @@ class Keys:
         before, _, session = token.rpartition("/")
         return session if before.endswith("/life") else None
 
-    def robot(self, key: str) -> str:
-        """The robot that a key of this realm belongs to.
-
-        Raises:
-            ValueError: If the key is not `<realm>/<robot>/<what>`.
-        """
+    def whose(self, key: str) -> str | None:
+        """The robot of `<realm>/<robot>/<what>`; None for any other key, as that of a PUT on many at once (`**`)."""
         realm, _, rest = key.partition("/")
         robot, _, what = rest.partition("/")
-        if realm != self.realm or not robot or not what:
-            raise ValueError(f"'{key}' is not a key of a robot in '{self.realm}'")
-        return robot
-
-    def whose(self, key: str) -> str | None:
-        """The robot that a key belongs to; None if there is none, as for a PUT on many keys at once (`**`)."""
-        try:
-            return self.robot(key)
-        except ValueError:
-            return None
+        return robot if realm == self.realm and robot and what else None

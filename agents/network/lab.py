@@ -60,11 +60,7 @@ class Files(NamedTuple):
 
 
 def register(folder: Path) -> Register:
-    """The register of a lab.
-
-    Raises:
-        LabError: If there is none, or it cannot be read.
-    """
+    """The register of a lab; raises LabError if there is none, or it cannot be read."""
     file = folder / REGISTER
     try:
         return msgspec.json.decode(file.read_bytes(), type=Register)
@@ -79,11 +75,7 @@ def register(folder: Path) -> Register:
 
 
 def files(folder: Path, name: str) -> Files:
-    """The files of an identity, checked: all exist, and only the user can read the key.
-
-    Raises:
-        LabError: If not.
-    """
+    """The files of an identity, checked: all exist, and only the user can read the key; raises LabError if not."""
     found = Files(folder / f"{AUTHORITY}.pem", folder / f"{name}.pem", folder / f"{name}.key")
     for file in found:
         try:
@@ -104,11 +96,7 @@ def files(folder: Path, name: str) -> Files:
 
 
 def require(folder: Path, names: Sequence[str]) -> None:
-    """Checks identities before anything is started.
-
-    Raises:
-        LabError: If some cannot be used here: the first, or all that are missing.
-    """
+    """Checks identities before anything is started; raises LabError for the first wrong one, or all missing ones."""
     missing = [name for name in names if not (folder / f"{name}.pem").exists()]
     if len(missing) > 1:
         remedy = f"`./zenpark cert issue {folder} {' '.join(missing)}`"
@@ -120,10 +108,8 @@ def require(folder: Path, names: Sequence[str]) -> None:
 def secured(endpoints: Sequence[str], lab: str | Path | None) -> list[str]:
     """The endpoints, each with the lab that it needs; as they are without a lab.
 
-    Without endpoints the usual one on this machine is meant. Those that name a lab already keep it.
-
-    Raises:
-        LabError: If one is neither tls/ nor quic/, so that certificates would not be asked for.
+    Without endpoints the usual one on this machine is meant. Those that name a lab already keep it. Raises LabError if
+    one is neither tls/ nor quic/, so that certificates would not be asked for.
     """
     if lab is None:
         return list(endpoints)
@@ -150,11 +136,7 @@ def options(endpoint: str) -> str:
 
 
 def lab_of(endpoints: Sequence[str]) -> Path | None:
-    """The lab of some endpoints.
-
-    Raises:
-        LabError: If they are of several labs, or only some are of one: a session has one identity.
-    """
+    """The lab of some endpoints; raises LabError if only some are of one, or of another: a session has one identity."""
     folders = {endpoint.partition(MARK)[2] for endpoint in endpoints}
     if len(folders) > 1:
         raise LabError(f"{', '.join(endpoints)}: a session belongs to one lab or to none; name routers of one only")
@@ -166,11 +148,7 @@ def lab_of(endpoints: Sequence[str]) -> Path | None:
 
 
 def settings(folder: Path, name: str, *, listens: bool) -> dict[str, object]:
-    """Zenoh settings with which an identity shows its certificate and asks for that of the other end.
-
-    Raises:
-        LabError: If its files are not there.
-    """
+    """Zenoh settings with which an identity shows its certificate and asks for that of the other end."""
     authority, certificate, key = (str(file) for file in files(folder, name))
     tls: dict[str, object] = {
         "root_ca_certificate": authority,

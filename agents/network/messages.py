@@ -416,11 +416,7 @@ def encode(message: Message, encoding: Encoding = "json") -> bytes:
 
 
 def decode(payload: bytes, mime: str, kind: type[M]) -> M:
-    """The message in a payload, by its MIME type.
-
-    Raises:
-        Malformed: If the payload is too large, or not a `kind`.
-    """
+    """The message in a payload, by its MIME type; raises Malformed if the payload is too large, or not a `kind`."""
     if len(payload) > MAX_PAYLOAD:
         raise Malformed(f"{len(payload)} bytes are more than a {kind.__name__} can have")
     packed = mime.startswith(MSGPACK)

@@ -114,9 +114,8 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
     to the claim of this process, for `OWNER_VANISH_S`. `pause` ends the wait when it is set. The tokens of the session
     are declared, and Zenoh declares them anew when it was cut off.
 
-    Raises:
-        NameTaken: If another process owns one of the names.
-        network.Unreachable: If `pause` was set before that was known; without a router the wait has no limit.
+    Raises NameTaken if another process owns one of the names, and network.Unreachable if `pause` was set before that
+    was known; without a router the wait has no limit.
     """
     mine = str(session.zid())
     free = taken = inf
@@ -164,11 +163,7 @@ class OwnershipCheck:
             self._asking.start()
 
     def over(self) -> bool:
-        """Whether no check runs; costs 0.1 µs then.
-
-        Raises:
-            NameTaken: If another process owns one of the names, each time.
-        """
+        """Whether no check runs (0.1 µs then); raises NameTaken, each time, if another process owns a name."""
         if self._asking is not None and not self._asking.is_alive():
             self._asking = None
             if self._anew and not self._taken:
@@ -185,10 +180,8 @@ class OwnershipCheck:
     def settle(self, session: zenoh.Session, ended: Callable[[], bool]) -> bool:
         """Wait while a check runs, or for one if the process stood still since the last call; returns whether it did.
 
-        For processes without a body, before they send anything: another process may send the same meanwhile.
-
-        Raises:
-            NameTaken: If another process owns one of the names.
+        For processes without a body, before they send anything: another process may send the same meanwhile. Raises
+        NameTaken as `over`.
         """
         if self.stood_still():
             self.begin(session)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from itertools import chain
-from typing import Final, Generic, Protocol, Self, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import zenoh
 from zenoh.ext import (
@@ -294,7 +294,7 @@ class LastValue:
         self._payload: bytes | None = None
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
         self.waiting = self._queries.waiting
-        self._queryable = session.declare_queryable(key, self._queries.callback)
+        self._queryable = session.declare_queryable(key, self._queries.callback)  # as long as it is referenced
 
     def hold(self, payload: bytes) -> None:
         """Stores the value to answer with."""
@@ -309,16 +309,6 @@ class LastValue:
                     query.reply(self.key, self._payload, encoding=self.mime)
             answered += 1
         return answered
-
-    def close(self) -> None:
-        """Answers no more queries."""
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 # ---------------------------------------------------------------------- liveliness

@@ -39,11 +39,7 @@ _INET: Final = (socket.AF_INET, socket.AF_INET6)
 def hang_up(session: zenoh.Session) -> int:
     """Ends the TCP connections of this process, those of its other sessions too, to the peers of a session.
 
-    Blocks nothing: the network is not waited for. Only TCP and TLS have connections that can be ended so; other links
-    stay.
-
-    Returns:
-        How many connections were ended.
+    Returns their number; the network is not waited for. Only TCP and TLS have connections that can be ended so.
     """
     own = {str(link.src).partition("/")[2] for link in session.info.links()}
     ended = 0
@@ -236,11 +232,7 @@ class RouterWatch:
     """
 
     def __init__(self, session: zenoh.Session, key: str, endpoints: Sequence[str] = ()) -> None:
-        """Begins with the first `silent_since`.
-
-        Args:
-            key: Of the query; in a lab, a liveliness key that this session may watch.
-        """
+        """Begins with the first `silent_since`; in a lab, `key` is a liveliness key that this session may watch."""
         self._session, self._key, self._others = session, key, len(endpoints) > 1
         self._waiting: deque[tuple[float, Polled[zenoh.Reply]]] = deque(maxlen=ASKED)
         # Times of a clock that stands between polls: a process that gets no processor cannot blame the router.
@@ -252,11 +244,10 @@ class RouterWatch:
         self._answers = 0  # since the silence began
 
     def silent_since(self, t: float, arrived: int = 0) -> float:
-        """Begin of the silence of the router, or of the loss of the last link; infinity while it answers.
+        """Begin [s] of the silence of the router, or of the loss of the last link; infinity while it answers.
 
-        Args:
-            t: Now, on any clock that does not go back [s]. Call it in each round of a loop, at 10 Hz or more.
-            arrived: Samples received by the router, ever. While they grow no query is needed.
+        Call it at 10 Hz or more, at times `t` [s] of any clock that does not go back. `arrived` is the number of
+        samples received by the router, ever: while it grows no query is needed.
         """
         self._now += max(0.0, min(t - self._looked, LOOK_S))
         self._looked = t

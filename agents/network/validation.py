@@ -1,7 +1,7 @@
 """Validation of received messages: numbers that no robot, clock or sensor can have are refused.
 
 Decoded values may still be NaN, or from the future. NaN fails each comparison here, because all of them ask whether a
-number lies inside.
+number lies inside. All `check_` functions raise `Malformed`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,7 @@ MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on 
 
 
 def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
-    """Largest |x|, |y|, |z| [m] of a valid position or goal.
-
-    Args:
-        low: Smallest x, y, z of the arena [m].
-        high: Largest.
-    """
+    """Largest |x|, |y|, |z| [m] of a valid position or goal in the arena from `low` to `high`, x, y, z [m]."""
     x, y, z = np.maximum(np.abs(low), np.abs(high)) + REACH_M
     return float(x), float(y), float(z)
 
@@ -44,16 +39,8 @@ def taken(stamp: float, now: float) -> float:
 
 
 def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
-    """Refuses an impossible pose.
-
-    Args:
-        reach: Largest |x|, |y|, |z| [m] that a robot of this experiment can have.
-
-    Raises:
-        Malformed: If a number is not finite, the stamp lies in the future, the position is out
-            of reach, or the velocity is no robot's.
-    """
-    if not (_counted(pose.seq) and _too_old(pose.stamp, now)):
+    """Refuses an impossible pose: stamp in the future, position beyond `reach` (`reach_of`), no robot's velocity."""
+    if not (_counted(pose.seq) and _possible(pose.stamp, now)):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, reach)
     _refuse_motion(pose.velocity, pose.yaw)
@@ -76,13 +63,8 @@ def check_position(measured: Position, *, now: float, reach: Vector) -> None:
 
 
 def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
-    """Refuses a goal that is impossible or too old.
-
-    Raises:
-        Malformed: If a number is not finite, the stamp is old or lies in the future, the pose is
-            younger than the goal that rests on it, or the position is out of reach.
-    """
-    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _too_old(goal.stamp, now)):
+    """Refuses a goal that is impossible or too old, or younger than the pose on which it rests."""
+    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _possible(goal.stamp, now)):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
@@ -92,29 +74,20 @@ def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> Non
 
 
 def check_ranges(ranges: Ranges, *, now: float) -> None:
-    """Refuses an impossible sweep of range sensors.
-
-    Raises:
-        Malformed: If the stamp is not finite or lies in the future, there is no ray or too many,
-            the lists differ in length, an angle or a distance is not finite, or a distance is no sensor's.
-    """
+    """Refuses an impossible sweep of range sensors."""
     _refuse_stamp(ranges.stamp, now)
     if not 1 <= len(ranges.distance) <= MAX_RAYS:
         raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")
     if not len(ranges.bearing) == len(ranges.elevation) == len(ranges.distance):
         raise Malformed("bearings, elevations and distances differ in number")
-    if not _all_within((*ranges.bearing, *ranges.elevation), 2.0 * math.pi):
+    if not all(abs(angle) <= math.tau for angle in (*ranges.bearing, *ranges.elevation)):
         raise Malformed("a bearing or an elevation is no angle in radians")
     if not all(value is None or 0.0 <= value <= MAX_RANGE for value in ranges.distance):
         raise Malformed(f"a distance is not between 0 and {MAX_RANGE:g} m")
 
 
 def check_command(command: Command) -> None:
-    """Refuses a command that no body can carry out.
-
-    Raises:
-        Malformed: If the sequence number is impossible, `drive` has no finite setpoint, or `takeoff` no height.
-    """
+    """Refuses a command that no body can carry out."""
     if not _counted(command.seq):
         raise Malformed(f"sequence number {command.seq} is impossible")
     if command.action == "drive":
@@ -127,14 +100,10 @@ def check_command(command: Command) -> None:
 
 
 def missed(last: int, seq: int, since: float, rate: float) -> int:
-    """Number of lost poses between two received ones, by their sequence numbers.
+    """Number of lost poses between two received ones, numbered `last` and `seq`, `since` [s] apart by their stamps.
 
-    Args:
-        last: Number of the first. A smaller `seq` is that of a new process, which began at 1.
-        seq: Number of the second.
-        since: Time between their stamps [s].
-        rate: Largest rate of poses [1/s]. It limits the result: one forged number must not become a hundred million
-            lost poses.
+    A smaller `seq` is that of a new process, which began at 1. The largest rate of poses [1/s] limits the result: one
+    forged number must not become a hundred million lost poses.
     """
     return min(seq - last - 1 if seq > last else seq - 1, most_poses(since, rate))
 
@@ -148,16 +117,12 @@ def _counted(seq: int) -> bool:
     return 0 < seq < 2**53  # what JSON carries exactly
 
 
-def _too_old(stamp: float, now: float) -> bool:
+def _possible(stamp: float, now: float) -> bool:
     return 0.0 < stamp < now + FUTURE_S
 
 
-def _all_within(values: Sequence[float], limit: float) -> bool:
-    return all(abs(value) <= limit for value in values)
-
-
 def _refuse_stamp(stamp: float, now: float) -> None:
-    if not _too_old(stamp, now):
+    if not _possible(stamp, now):
         raise Malformed(f"stamp {stamp} is impossible")
 
 

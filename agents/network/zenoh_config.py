@@ -28,11 +28,7 @@ _RUNTIME: Final = (
 
 
 def config(settings: Mapping[str, object]) -> zenoh.Config:
-    """The configuration of a session with these settings.
-
-    Raises:
-        EndpointError: If Zenoh does not accept an endpoint.
-    """
+    """The configuration of a session with these settings; raises EndpointError if Zenoh does not accept an endpoint."""
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     made = zenoh.Config()
     for key, value in settings.items():
@@ -129,11 +125,7 @@ def _check_form(endpoint: str) -> None:
 
 
 def check_loopback(endpoint: str) -> None:
-    """Refuses to listen beyond loopback: without a lab there is no authentication.
-
-    Raises:
-        EndpointError: If the endpoint is not of this machine alone.
-    """
+    """Refuses, by EndpointError, to listen beyond loopback: without a lab there is no authentication."""
     protocol, _, address = endpoint.partition("/")
     if protocol == UNIX:
         return

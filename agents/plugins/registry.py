@@ -126,11 +126,7 @@ def build(group: str, choice: str | Mapping[str, Any]) -> Any:  # noqa: ANN401 -
 
 
 def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """A choice as its name and its parameters.
-
-    Raises:
-        msgspec.ValidationError: If a table has no `kind`, or one that is no text.
-    """
+    """A choice as its name and parameters; raises msgspec.ValidationError without a `kind` that is a text."""
     if isinstance(choice, str):
         return choice, {}
     if "kind" not in choice:

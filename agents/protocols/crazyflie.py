@@ -115,11 +115,7 @@ class CrazyflieSettings(Part, frozen=True):
 
 
 def address(name: str, given: str) -> str:
-    """The address of the robot `name`, if cflib accepts it.
-
-    Raises:
-        BodyError: If not.
-    """
+    """The address of the robot `name`, if cflib accepts it; raises BodyError if not."""
     if not any(pattern.fullmatch(given) for pattern in ADDRESSES):
         raise BodyError(
             f"{name}: '{given}' is no Crazyflie's address; "
@@ -148,11 +144,7 @@ def dongle_of(address: str) -> str:
 
 
 def chosen(name: str, device: Mapping[str, Any], *, external: bool) -> CrazyflieSettings:
-    """The settings of the robot `name`; `external` if its position comes from outside.
-
-    Raises:
-        BodyError: If they make no sense.
-    """
+    """The settings of the robot `name`; raises BodyError if `external`, a position from outside, contradicts them."""
     read = settings(CrazyflieSettings, name, device)
     if isinstance(read.positioning, Outside) and not external:
         raise BodyError(f'{name}: positioning system "external" needs position = "external" in the robot\'s table')

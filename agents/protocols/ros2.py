@@ -48,11 +48,7 @@ class UnknownMessage(ValueError):
 
 
 class Types:
-    """The message types of one distribution: their classes, CDR and hashes.
-
-    Raises:
-        BodyError: If the extra `ros` is not installed.
-    """
+    """The message types of one distribution: classes, CDR and hashes; BodyError if the extra `ros` is missing."""
 
     def __init__(self, distro: Distro) -> None:
         try:
@@ -74,11 +70,7 @@ class Types:
         return bytes(self._store.serialize_cdr(message, kind, little_endian=True))
 
     def decode(self, payload: bytes, kind: str) -> Message:
-        """The message in a payload.
-
-        Raises:
-            UnknownMessage: If it is not a `kind`.
-        """
+        """The message in a payload; raises UnknownMessage if it is not a `kind`."""
         try:
             return self._store.deserialize_cdr(payload, kind)
         except self._malformed as error:
@@ -204,11 +196,7 @@ class Endpoint(NamedTuple):
 
 
 def announced(style: Style, token: str) -> Endpoint:
-    """The endpoint that a token announces.
-
-    Raises:
-        ValueError: If it announces none.
-    """
+    """The endpoint that a token announces; raises ValueError if it announces none."""
     chunks = token.split("/")
     if style == "ros2dds" and len(chunks) >= 6:
         return Endpoint("/" + chunks[4].replace("§", "/"), chunks[5].replace("§", "/"))
@@ -233,11 +221,7 @@ def attachment(sequence: int, stamp_ns: int, source: bytes) -> bytes:
 
 
 def attached(raw: bytes) -> tuple[int, int, bytes]:
-    """Running number, UTC [ns] and gid of an attachment.
-
-    Raises:
-        UnknownMessage: If it is none of rmw_zenoh's.
-    """
+    """Running number, UTC [ns] and gid of an attachment; raises UnknownMessage if it is none of rmw_zenoh's."""
     if len(raw) != _ATTACHMENT.size or raw[16] != 16:
         raise UnknownMessage(f"{len(raw)} bytes are no attachment of rmw_zenoh")
     sequence, stamp_ns, _, source = _ATTACHMENT.unpack(raw)

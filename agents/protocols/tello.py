@@ -50,11 +50,7 @@ class TelloSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 def endpoint(robot: str, address: str) -> tuple[str, int]:
-    """Host and port of `tello://HOST[:PORT]`.
-
-    Raises:
-        BodyError: If it is not of that form, or the host is no IPv4 address.
-    """
+    """Host and port of `tello://HOST[:PORT]`; raises BodyError for another form, or a host that is no IPv4 address."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or HOST, parts.port or CONTROL_PORT

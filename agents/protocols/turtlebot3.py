@@ -69,11 +69,7 @@ class Address:
 
 
 def address(name: str, text: str, chosen: TurtleBot3Settings) -> Address:
-    """The address of a robot.
-
-    Raises:
-        BodyError: If it is wrong, with robot and part.
-    """
+    """The address of a robot; raises BodyError if it is wrong, with robot and part."""
     style, _, rest = text.partition("://")
     path, _, query = rest.partition("?")
     namespace = path.strip("/")

@@ -131,11 +131,7 @@ class Framer:
         self._waiting = bytearray()
 
     def feed(self, received: bytes) -> list[bytes]:
-        """The bodies of the packets that are complete now, oldest first.
-
-        Raises:
-            Malformed: If these bytes cannot begin a packet.
-        """
+        """The bodies of the packets that are complete now, oldest first; raises Malformed for bytes that begin none."""
         waiting = self._waiting
         waiting += received
         bodies, at = [], 0
@@ -155,11 +151,7 @@ class Framer:
 
 
 def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
-    """Kind and payload of each block in the body of a packet.
-
-    Raises:
-        Malformed: If a block is longer than the rest of the packet.
-    """
+    """Kind and payload of each block in the body of a packet; raises Malformed if one is longer than its rest."""
     at = 0
     while at < len(body):
         kind, length = _unpack(_HEAD, body, at)
@@ -171,11 +163,7 @@ def blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def unpack_kinds(payload: bytes) -> set[int]:
-    """Kinds that `pack_kinds` packed.
-
-    Raises:
-        Malformed: If it is cut off; likewise the functions below.
-    """
+    """Kinds that `pack_kinds` packed; raises Malformed, as the functions below, if the block is cut off."""
     (count,) = _unpack(_WORD, payload, 0)
     if 4 * count > len(payload) - 4:
         raise Malformed(f"a list of {count} kinds in {len(payload)} bytes")

@@ -36,11 +36,7 @@ def on_termination(end: Callable[[], object]) -> Iterator[None]:
 
 
 def secured_endpoints(connect: Sequence[str], folder: str | None) -> list[str]:
-    """Endpoints, the usual one if there are none, each with its lab if there is one.
-
-    Raises:
-        EndpointError: If one asks for no certificates, and there is a lab.
-    """
+    """Endpoints, the usual one if there are none, each with its lab if there is one; raises EndpointError."""
     try:
         return secured(connect, folder) or [DEFAULT_ENDPOINT]
     except LabError as error:

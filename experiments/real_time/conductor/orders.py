@@ -133,9 +133,9 @@ class EmergencyStop:
             inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
             self.seen = {
-                keys.robot(str(reply.ok.key_expr))
+                robot
                 for reply in session.liveliness().get(keys.alive("*"), timeout=STOP_ANSWER_S)
-                if reply.ok is not None
+                if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
             }
             self.moving = set(self.seen)
             watch = pubsub.AliveWatch(session, keys.alive("*"))

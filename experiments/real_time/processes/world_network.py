@@ -240,9 +240,8 @@ class Exchange:
         return known
 
     def _reject_unknown(self, key: str) -> None:
-        try:
-            name = self._keys.robot(key)
-        except ValueError:
+        name = self._keys.whose(key)
+        if name is None:
             self.malformed += 1
             return
         self.refused += 1

@@ -361,20 +361,19 @@ def test_members_of_a_mesh_are_not_asked():
 def test_last_value_answers_a_plain_get(router, eventually):
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:
         asker = ui.declare_querier(POSE, timeout=5.0)  # a wildcard is never told that it matches
-        with LastValue(robot, POSE, JSON) as last:
-            eventually(lambda: asker.matching_status.matching)
-            empty = ui.get("park/*/pose", timeout=5.0)
-            eventually(last.answer)
-            assert list(empty) == []
-            last.hold(b"1")
-            last.hold(b"2")
-            asked = ui.get("park/*/pose", timeout=5.0)
-            eventually(last.answer)
-            replies = [reply.ok for reply in asked]
-            assert [(str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) for reply in replies] == [
-                (POSE, b"2", JSON)
-            ]
-        eventually(lambda: not asker.matching_status.matching)
+        last = LastValue(robot, POSE, JSON)
+        eventually(lambda: asker.matching_status.matching)
+        empty = ui.get("park/*/pose", timeout=5.0)
+        eventually(last.answer)
+        assert list(empty) == []
+        last.hold(b"1")
+        last.hold(b"2")
+        asked = ui.get("park/*/pose", timeout=5.0)
+        eventually(last.answer)
+        replies = [reply.ok for reply in asked]
+        assert [(str(reply.key_expr), reply.payload.to_bytes(), str(reply.encoding)) for reply in replies] == [
+            (POSE, b"2", JSON)
+        ]
 
 
 @pytest.mark.system
