@@ -1,0 +1,231 @@
+"""What `check` finds in the ideal run: acquisition, soft formations, encounters, walls and plans."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.body.interface import Disturbance, Jitter
+from experiments.check.check import check, figures
+from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions, undisturbed
+from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.file import document
+from experiments.sweep.runs import figures_of
+from experiments.virtual_time import conductor, simulation
+from tests.experiments.checked import GROUND, assert_found, bad, ground, of
+
+pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
+
+PARK, TRIANGLE = "robotic-park", "triangle"
+
+
+def robots_on_wheels(gain: float) -> Experiment:
+    """Three Kheperas that are to stand 1 m apart, and nearly do from the start."""
+    places = {"KH01": [0.0, 0.0], "KH02": [1.2, 0.0], "KH03": [0.6, 1.04]}
+    return Experiment(
+        title="Three",
+        robots={name: Robot(kind="khepera4", start=start) for name, start in places.items()},
+        arena=Arena(size=(6.0, 6.0, 2.0)),
+        formation=Formation(links={"KH01 - KH02": 1.0, "KH02 - KH03": 1.0, "KH01 - KH03": 1.0}, gain=gain, clamp=0.1),
+        duration_s=120.0,
+    )
+
+
+@pytest.mark.nightly
+def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in_a_run():
+    weak = robots_on_wheels(0.05)
+    claims = {each.code: each for each in check(of(weak))}
+    assert "acquired" not in claims
+    found = claims["wheels-stop"]
+    assert found.severity == "warning"
+    assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
+    numbers = figures(weak)
+    assert numbers.acquired_s is None
+    log = simulation.simulate(msgspec.structs.replace(weak, seed=7), [7], lean=True)
+    (run,) = figures_of(log, weak)
+    assert run.acquired_s is None
+    last = log.true_position[log.time <= weak.duration_s][-1]
+    off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
+    assert numbers.end_error_mm == pytest.approx(1e3 * off, rel=0.1)
+    assert 0.05 < off < 0.1
+    gain = float(found.remedy.split()[3])
+    assert 0.05 < gain < 0.15
+    strong = robots_on_wheels(gain)
+    assert "acquired" in {each.code for each in check(of(strong))}
+
+
+def test_what_is_expected_is_a_flight_on_the_virtual_clock_without_noise():
+    park = document.read(PARK).cases()["event"]
+    quiet = undisturbed(park)
+    assert quiet.duration_s == 45.0
+    flown = predict(quiet)
+    again = predict(undisturbed(msgspec.structs.replace(park, seed=8)))
+    np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
+    np.testing.assert_allclose(flown.time, np.arange(451) / 10.0, atol=1e-9)
+    assert not flown.incidents
+    assert not flown.stuck
+    many = msgspec.structs.replace(park, robots={f"R{k}": park.robots["KH01"] for k in range(1000)}, duration_s=600.0)
+    assert 40.0 < undisturbed(many).duration_s < 100.0  # of many robots the beginning
+
+
+def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
+    """Two flat triangles of drones that start in their shape, shaken by hover jitter."""
+    places = {f"CF{k}": (0.6 * k - 0.9, 0.2 * (k % 2)) for k in range(4)}
+    pairs = [("CF0", "CF1"), ("CF0", "CF2"), ("CF1", "CF2"), ("CF1", "CF3"), ("CF2", "CF3")]
+    links = {f"{i} - {j}": float(np.hypot(*np.subtract(places[i], places[j]))) for i, j in pairs}
+    return Experiment(
+        title="Strip",
+        robots={name: Robot(kind="crazyflie", start=list(place), hover=0.6) for name, place in places.items()},
+        arena=Arena(size=(8.0, 8.0, 2.0)),
+        formation=Formation(links=links, gain=gain),
+        disturbance={"all": Disturbance(hover_jitter=Jitter(jitter))},
+        duration_s=60.0,
+    )
+
+
+def late(experiment: Experiment, seeds: list[int]) -> int:
+    """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
+    runs = figures_of(simulation.simulate(experiment, seeds, lean=True), experiment)
+    return sum(run.acquired_s is None or run.acquired_s > 15.0 for run in runs)
+
+
+def test_hover_jitter_that_a_soft_formation_does_not_stand_is_told_as_it_is_in_runs():
+    soft = flat_strip(0.3)
+    claims = {each.code: each for each in check(of(soft))}
+    assert "after 0.0 s" in claims["acquired"].message  # without noise
+    found = claims["soft"]
+    assert (found.severity, found.where.startswith("made.json")) == ("warning", True)
+    assert "acquired after 0.0 s without noise" in found.message
+    assert "outside the tolerance of 50 mm later, in 5 of 5 flights (seeds 1 to 5)" in found.message
+    assert late(soft, [101, 102, 103, 104]) == 4
+    stiff = flat_strip(1.0)  # the remedy
+    assert "soft" not in {each.code for each in check(of(stiff))}
+    assert late(stiff, [101, 102, 103, 104]) <= 1
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        pytest.param(flat_strip(0.3, jitter=0.0), marks=pytest.mark.nightly),
+        flat_strip(0.3, jitter=0.0005),
+        robots_on_wheels(1.0),
+    ],
+)
+def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
+    codes = {each.code for each in check(of(made))}
+    assert "acquired" in codes
+    assert "soft" not in codes
+
+
+def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
+    monkeypatch.setattr("experiments.check.motion.fly_repeatedly", lambda *_: pytest.fail("flown again"))
+    codes = {each.code for each in check(of(document.read(PARK).cases()["event"]))}
+    assert "acquired" in codes
+
+
+def test_flights_with_noise_are_those_of_their_seeds():
+    bare = isolated(msgspec.structs.replace(flat_strip(0.3), duration_s=5.0, seed=7))
+    assert repetitions(bare) == REPETITIONS
+    first, second = fly_repeatedly(bare, 2)
+    (alone,) = fly_repeatedly(msgspec.structs.replace(bare, seed=8), 1)
+    np.testing.assert_array_equal(second.position, alone.position)
+    assert np.abs(first.position - second.position).max() > 1e-3
+    assert repetitions(msgspec.structs.replace(bare, robots={f"R{k}": bare.robots["CF0"] for k in range(1000)})) == 1
+
+
+def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
+    def stuck(*_, **__):
+        raise conductor.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
+
+    monkeypatch.setattr(simulation, "simulate", stuck)
+    found = {each.code: each for each in check(of(robots_on_wheels(1.0)))}
+    assert found["not-begun"].severity == "error"
+    assert "not ready after 60 s: KH01" in found["not-begun"].message
+    assert not {"acquired", "not-acquired", "wheels-stop"} & found.keys()
+
+
+def test_a_trigger_that_never_fires_is_named():
+    found = bad(TRIANGLE, "trigger={ kind = 'send-on-delta', threshold = 15 }", "duration_s=10")
+    assert "lags" not in found
+    assert "no robot transmits after its first pose: the trigger 'send-on-delta' fires at nothing" in found["silent"][1]
+    assert "metres" in found["silent"][2]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "expected", "message", "remedy"),
+    [
+        (
+            PARK,
+            "timeline.0.plan.move_by=[2.0, 0.0]",
+            ("error", "leaves-arena"),
+            "TB01 would leave the arena at 3",
+            "shorten",
+        ),
+        (PARK, "timeline.0.at_s=5", ("warning", "acquired-late"), "when the plans begin at 5 s", "begin later"),
+        (PARK, "duration_s=24", ("warning", "lags"), "lags behind its leader", "slowly"),
+        (TRIANGLE, "robots.CF01.start=[0.0,-0.5]", ("warning", "local-minimum"), "another shape", "order"),
+        (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
+    ],
+)
+def test_variants_that_do_not_work_in_flight(name, change, expected, message, remedy):
+    assert_found(name, change, expected, message, remedy)
+
+
+def test_paths_that_cross():
+    ways = {"A": [0.6, 0.6], "B": [-0.6, 0.6]}  # from (0, 0) and (1, 0): they meet in the middle
+    legs = [
+        Leg(at_s=1.0, robot=name, plan={"kind": "line", "move_by": way, "speed": 0.1}) for name, way in ways.items()
+    ]
+    assert ground({}, timeline=legs)["too-close"].startswith("A and B come within")
+
+
+def test_landing_beside_a_robot_that_is_heard():
+    robots = {"G": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="crazyflie", start=[0.5, 0.0], hover=0.8)}
+    formation = Formation(links={"G > F": 0.801})
+    made = Experiment(title="made", robots=robots, duration_s=30.0, tolerance=0.1, formation=formation)
+    found = {each.code: each for each in check(of(made))}
+    assert found["lands-beside"].message == "F ends above G, and goes aside before it lands"
+    assert found["lands-beside"].severity == "note"
+    assert "lands-on" not in found
+
+
+def test_landing_on_a_robot():
+    robots = {
+        "G": Robot(kind="khepera4", start=[0.0, 0.01]),
+        "H": Robot(kind="khepera4", start=[0.5, 0.5]),
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.8),
+    }
+    found = ground({"G - H": 0.7}, robots=robots, duration_s=30.0)
+    assert found["lands-on"] == "F ends above G, from which it receives no poses, and would land on it"
+
+
+def test_a_robot_at_the_wall_is_held_back():
+    plan = {"kind": "line", "move_by": [-2.97, 0.0], "speed": 0.1}
+    found = ground({}, timeline=[Leg(at_s=1.0, robot="A", plan=plan)])
+    assert found["near-wall"].startswith("A comes within the margin of 0.05 m of a wall at 32.")
+
+
+def test_a_plan_for_ever_is_not_cut_off():
+    plan = {"kind": "circle", "radius": 0.5, "period_s": 40.0}
+    assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}
+
+
+@pytest.mark.nightly
+def test_a_long_run_is_predicted_in_part():
+    made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
+    assert 200.0 < figures(made).predicted_s < 400.0
+    assert "predicted-in-part" in {each.code for each in check(of(made))}
+
+
+def test_a_formation_that_is_lost_again_was_acquired_and_names_the_stiffness(tmp_path):
+    (tmp_path / "lost.toml").write_text(
+        'title = "A leader goes"\nduration_s = 17.0\n'
+        '[robots.L]\nkind = "turtlebot3"\nstart = [0.0, 0.0]\n[robots.F]\nkind = "khepera4"\nstart = [-0.6, 0.0]\n'
+        '[formation]\nlaw = "displacement"\nstiffness = 0.15\n[formation.links]\n"L > F" = { offset = [-0.5, 0.0] }\n'
+        '[[timeline]]\nat_s = 8.0\nrobot = "L"\nplan = { kind = "line", move_by = [0.4, 0.0], speed = 0.08 }\n'
+    )
+    _, message, remedy, _ = bad(str(tmp_path / "lost.toml"))["not-acquired"]
+    assert message.startswith("the formation, acquired after ")
+    assert " s, is not acquired again after 8 s: L - F is " in message
+    assert remedy.endswith("or raise the stiffness")
