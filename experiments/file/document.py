@@ -109,9 +109,22 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
     try:
         content = parsed(text, label, json=is_json)
         source = Source(label, text, is_json, _overrides(flags, content))
-        return _Reading(file, source, content).document()
+        source.refuse(structure.number_faults(content))
+        documents, tables = _resolved(file, source, content)
+        nested = [
+            Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
+            for name, table in tables.items()
+            if "cases" in table
+        ]
+        shapes = {name: [*fill_from_shape(each), *structure.faults(each)] for name, each in documents.items()}
+        source.refuse([*nested, *_each_once(shapes, tables)])
+        experiments = {name: msgspec.convert(each, Experiment) for name, each in documents.items()}
+        source.refuse(_each_once({name: list(consistency.faults(each)) for name, each in experiments.items()}, tables))
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
+    experiment = experiments[None]
+    cases = {name: case for name, case in experiments.items() if name is not None} or {UNNAMED: experiment}
+    return Document(file, text, experiment, cases, source.arenas, source.overrides)
 
 
 def _overrides(flags: Sequence[str], content: _Table) -> list[Override]:
@@ -179,83 +192,49 @@ def write_json(experiment: Experiment) -> bytes:
     return msgspec.json.format(msgspec.json.encode(experiment), indent=2) + b"\n"
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """Reading of a parsed text."""
+def _resolved(file: Path, source: Source, content: _Table) -> tuple[dict[str | None, _Table], dict[str, _Table]]:
+    """The document of the file, under None, and of each case, all with `--set`; and the tables of the cases.
 
-    file: Path
-    source: Source  # its arena files are added while it is read
-    content: _Table
+    The keys of an arena file are put below those of the [arena] of the experiment, where `--set` finds them. Only a
+    change of which file that is must come first.
+    """
+    content, of_all = deepcopy(content), [each for each in source.overrides if each.case is None]
+    of_all = [each for each in of_all if each.path[0] != "cases"]  # the others make a case, or replace one
+    for override in source.overrides:
+        if override.case is not None:
+            assign(_tables(content).get(override.case, {}), override, part=True)
+        elif override not in of_all:
+            assign(content, override)
+    tables, documents = _tables(content), dict[str | None, _Table]()
+    unused = {override for override in of_all if override.path not in _ABOVE}
+    for name, table in ((None, {}), *tables.items()):
+        document = deepcopy(merged(_without_cases(content), _without_cases(table)))
+        mine = [*of_all, *(each for each in source.overrides if each.case is not None and each.case == name)]
+        for override in mine:
+            if override.path in _ABOVE:
+                assign(document, override)
+        documents[name] = document = _with_arena_file(file, source, document, name)
+        unused -= {override for override in mine if override.path not in _ABOVE and assign(document, override)}
+    if unused:
+        raise DocumentError([_unused(each, list(documents.values())) for each in of_all if each in unused])
+    if "cases" in content:
+        documents[None]["cases"] = content["cases"]
+    return documents, tables
 
-    def document(self) -> Document:
-        """Document of this text, see `read`."""
-        source = self.source
-        source.refuse(structure.number_faults(self.content))
-        base, tables, cases = self._changed(source.overrides)
-        nested = [
-            Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
-            for name, table in tables.items()
-            if "cases" in table
-        ]
-        first = [*fill_from_shape(base), *structure.faults(base)]
-        found = {name: [*fill_from_shape(case), *structure.faults(case)] for name, case in cases.items()}
-        source.refuse([*nested, *first, *_of_cases(tables, found, first)])
 
-        experiment = msgspec.convert(base, Experiment)
-        resolved = {name: msgspec.convert(case, Experiment) for name, case in cases.items()}
-        first = list(consistency.faults(experiment))
-        found = {name: list(consistency.faults(case)) for name, case in resolved.items()}
-        source.refuse([*first, *_of_cases(tables, found, first)])
-        cases_of = resolved or {UNNAMED: experiment}
-        return Document(self.file, source.text, experiment, cases_of, source.arenas, source.overrides)
-
-    def _changed(self, overrides: Sequence[Override]) -> tuple[_Table, dict[str, _Table], dict[str, _Table]]:
-        """The document with `--set`, the tables of its cases, and each case merged into the document.
-
-        The keys of an arena file are put below those of the [arena] of the experiment, where `--set` finds them. Only a
-        change of which file that is must come first.
-        """
-        plain = deepcopy(self.content)
-        of_all = [override for override in overrides if override.path[0] != "cases" and override.case is None]
-        above = [override for override in overrides if override.path in _ABOVE]
-        late = [each for each in of_all if each.path[0] == "arena" and each not in above]
-        unused = set(of_all)
-        for override in overrides:
-            table = plain if override.case is None else _tables(plain).get(override.case, {})
-            if override not in late and assign(table, override, part=override.case is not None):
-                unused.discard(override)
-        base = self._with_arena_file(plain, "")
-        tables, cases = _tables(plain), {}
-        for name, table in tables.items():
-            own = deepcopy(merged(_without_cases(plain), _without_cases(table)))
-            mine = [*of_all, *(each for each in overrides if each.case == name)]
-            for override in mine:
-                if override in above:
-                    assign(own, override)
-            cases[name] = self._with_arena_file(own, name)
-            for override in mine:
-                if override not in above and assign(cases[name], override):
-                    unused.discard(override)
-        for override in late:
-            if assign(base, override):
-                unused.discard(override)
-        if unused:
-            known = [base, *cases.values()]
-            raise DocumentError([_unused(override, known) for override in of_all if override in unused])
-        return base, tables, cases
-
-    def _with_arena_file(self, document: _Table, case: str) -> _Table:
-        """Merge the arena file of a document."""
-        name, files = arena_file.arena_file_name(document), self.source.arenas
-        if name is None:
-            return document
-        try:
-            known = (each for each in files.values() if each.name == name)
-            files[case] = next(known, None) or arena_file.load(name, self.file.parent)
-        except arena_file.Misnamed as error:
-            path = ("cases", case, *error.fault.path) if case else error.fault.path
-            self.source.refuse([replace(error.fault, path=path)])
-        return deepcopy(arena_file.with_arena_file(document, files[case]))
+def _with_arena_file(file: Path, source: Source, document: _Table, case: str | None) -> _Table:
+    """Merge the arena file of a document."""
+    name, files = arena_file.arena_file_name(document), source.arenas
+    if name is None:
+        return document
+    try:
+        known = (each for each in files.values() if each.name == name)
+        own = files[case or ""] = next(known, None) or arena_file.load(name, file.parent)
+    except arena_file.Misnamed as error:
+        path = error.fault.path if case is None else ("cases", case, *error.fault.path)
+        source.refuse([replace(error.fault, path=path)])
+        raise
+    return deepcopy(arena_file.with_arena_file(document, own))
 
 
 def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
@@ -267,15 +246,14 @@ def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Probl
     return override.refused(message, did_you_mean(parameter, known)).problems[0]
 
 
-def _of_cases(
-    tables: Mapping[str, _Table], found: Mapping[str, Sequence[Fault]], first: Sequence[Fault]
-) -> Iterator[Fault]:
-    """Faults that a case adds to those of the file, at the key of the case that causes them."""
-    for name, faults in found.items():
-        for fault in faults:
-            if fault in first:
+def _each_once(found: Mapping[str | None, Sequence[Fault]], tables: Mapping[str, _Table]) -> Iterator[Fault]:
+    """Faults of the file, and those that a case adds to them, at the key of the case that causes them."""
+    yield from found[None]
+    for name, table in tables.items():
+        for fault in found[name]:
+            if fault in found[None]:
                 continue
-            own = _beginning(tables[name], fault.path)
+            own = _beginning(table, fault.path)
             message = fault.message
             if own != fault.path:
                 message = f"in case '{name}', {'.'.join(map(str, fault.path))}: {message}"
