@@ -6,7 +6,7 @@ from math import inf, isfinite
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, every, span
+from agents.arrays import Array, Index, Mask, span
 from agents.body.external_pose import PATIENCE_S, External, velocity_after
 from agents.body.interface import BodyRequest, BodyState
 from agents.plugins import registry
@@ -18,7 +18,6 @@ from twins.scene import World
 from twins.sensing.range_sensors import RangeSensors
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
-FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
 
 
 def instants(since: float, until: float, step: float) -> list[float]:
@@ -136,11 +135,7 @@ class TwinBody:
             self._command = np.full_like(self._command, np.nan)  # a command acts once, so that silence has its effect
         before = engine.position[:, :2].copy() if self._drift.present else None
         if self._jitter.present:
-            self._jitter.advance()
-            displacement, height = self._jitter.displacement, engine.position[self._in_air, 2]
-            if not every(height >= FULL_WOBBLE):
-                displacement = np.minimum(height / FULL_WOBBLE, 1.0)[:, None] * displacement
-            self._wobble = displacement
+            displacement = self._wobble = self._jitter.advance(engine.position[self._in_air, 2])
             if not self._all_fly:
                 self._wobble = np.zeros((len(self._used), 2))  # a new array: engines may keep the last one
                 self._wobble[self._in_air] = displacement

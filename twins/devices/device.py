@@ -7,11 +7,14 @@ loopback sockets. `experiments.real_time.processes.protocol_twins` runs devices 
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from math import inf
+from typing import Generic, Protocol, TypeVar
 
 import msgspec
+import numpy as np
 
 from agents.arrays import Array
 from agents.body.interface import BodyRequest
@@ -48,6 +51,42 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 def _during(t: float, begin: float | None, duration: float) -> bool:
     return begin is not None and begin <= t < begin + duration
+
+
+Item = TypeVar("Item")
+
+
+class FaultyLink(Generic[Item]):
+    """Link of a device with its injected faults: outages, losses, and the delay of what the device sends."""
+
+    def __init__(self, faults: Faults, random: np.random.Generator | None = None) -> None:
+        """`random`: of the losses; not needed for a link that loses nothing, such as TCP."""
+        self.t = 0.0  # current time [s]; set by the device
+        self.faults, self._random = faults, random
+        self._outage = (inf, -inf)  # begin and end [s]
+        self._waiting: deque[tuple[float, Item]] = deque()
+
+    def silence(self, seconds: float) -> None:
+        """Begin an outage: nothing is received in either direction."""
+        self._outage = self.t, self.t + seconds
+
+    def silent(self, t: float) -> bool:
+        """Whether nothing is received at time `t` [s]."""
+        return self.faults.silent(t) or self._outage[0] <= t < self._outage[1]
+
+    def lost(self) -> bool:
+        """Whether the current packet is lost."""
+        loss = self.faults.loss
+        return self.silent(self.t) or (loss > 0.0 and self._random is not None and self._random.random() < loss)
+
+    def put(self, item: Item) -> None:
+        """Queue what the device sends now."""
+        self._waiting.append((self.t + self.faults.delay_s, item))
+
+    def due(self) -> Iterator[Item]:
+        """Take what is to be sent by now out of the queue."""
+        while self._waiting and self._waiting[0][0] <= self.t:
+            yield self._waiting.popleft()[1]
 
 
 class Device(Protocol):

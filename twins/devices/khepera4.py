@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import socket
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -19,7 +18,7 @@ from agents.body.interface import BodyError, settings
 from agents.body.kinds import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from twins.body import instants
-from twins.devices.device import DeviceRequest, Faults
+from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
 from twins.models.noise import Noise
@@ -227,11 +226,10 @@ class _Server:
     def __init__(self, robot: _Robot, name: str, faults: Faults, listener: socket.socket) -> None:
         self.robot, self.listener = robot, listener
         self._program = ParkProgram(robot, name) if name in protocol.PARK else None
-        self._faults = faults
+        self._answers = FaultyLink[bytes](faults)
         self._client: socket.socket | None = None
         self._left = False  # whether a client has left
         self._partial = b""
-        self._outbox: deque[tuple[float, bytes]] = deque()
 
     def sockets(self, *, silent: bool) -> list[socket.socket]:
         """Sockets to wait on; what is sent to a silent robot waits in its connection, as in a gap of the radio."""
@@ -241,6 +239,7 @@ class _Server:
 
     def serve(self, ready: socket.socket, t: float) -> None:
         """Accept a client, answer a command, or close the connection."""
+        self._answers.t = t
         try:
             if ready is self.listener:
                 self._client, _ = self.listener.accept()
@@ -257,18 +256,18 @@ class _Server:
         if not received:
             self.hang_up()
         else:
-            self._outbox.append((t + self._faults.delay_s, self._answer(received, t)))
-            self.flush(t)
+            self._answers.put(self._answer(received, t))
+            self.flush()
 
     def advance(self, t: float) -> None:
         """Let the program on the robot go on until `t` [s]."""
+        self._answers.t = t
         if self._program is not None:
             self._program.advance(t, connected=self._client is not None, left=self._left)
 
-    def flush(self, t: float) -> None:
+    def flush(self) -> None:
         """Send due answers."""
-        while self._outbox and self._outbox[0][0] <= t:
-            _, answer = self._outbox.popleft()
+        for answer in self._answers.due():
             if self._client is not None and answer:
                 try:
                     self._client.send(answer)
@@ -283,7 +282,7 @@ class _Server:
             if self._program is not None:
                 self._program.end_session()
         self._client, self._partial = None, b""
-        self._outbox.clear()
+        self._answers = FaultyLink(self._answers.faults)
 
     def _answer(self, received: bytes, t: float) -> bytes:
         if self._program is not None:
@@ -334,7 +333,7 @@ class KheperaDevice:
         self._t = t
         for server in self._servers:
             if not self._faults.silent(t):
-                server.flush(t)
+                server.flush()
 
     def truth(self) -> tuple[Array, Array]:
         return self._model.position.copy(), self._model.yaw.copy()

@@ -7,7 +7,6 @@ import math
 import re
 import socket
 import zlib
-from collections import deque
 from collections.abc import Sequence
 from enum import Enum
 from typing import Final
@@ -18,8 +17,8 @@ from agents.arrays import Array
 from agents.body.interface import BodyError, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
-from twins.body import FULL_WOBBLE, instants
-from twins.devices.device import DeviceRequest, Faults
+from twins.body import instants
+from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.disturbance import HoverJitter, Latency
 from twins.models.noise import Noise
 from twins.models.quadrotor import Quadrotor
@@ -67,15 +66,15 @@ class Mode(Enum):
     FALL = "motors off in the air"
 
 
-class _Drone:
+class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
     """Socket, client and commands of one drone."""
 
     def __init__(
         self, wire: socket.socket, faults: Faults, chance: np.random.Generator, chosen: protocol.TelloSettings
     ) -> None:
-        self.wire, self.faults, self._chance = wire, faults, chance
+        super().__init__(faults, chance)
+        self.wire = wire
         self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
-        self.silent_until = -math.inf  # end of a gap of the Wi-Fi [s]
         self.seeks_pads = False  # mission pads are switched on
         self.mode = Mode.GROUND
         self.sdk = False
@@ -90,7 +89,6 @@ class _Drone:
         self.motors_s = 0.0
         self.charge = faults.battery
         self.state_due = 0.0
-        self._outbox: deque[tuple[float, bytes, tuple[str, int]]] = deque()
 
     @property
     def aloft(self) -> bool:
@@ -102,32 +100,24 @@ class _Drone:
         if self.aloft:
             self.mode, self.sticks = Mode.STICKS, (0, 0, 0, 0)
 
-    def silent(self, t: float) -> bool:
-        """Whether the Wi-Fi is gone at time `t` [s]."""
-        return t < self.silent_until or self.faults.silent(t)
-
-    def lost(self) -> bool:
-        return self.faults.loss > 0.0 and float(self._chance.random()) < self.faults.loss
-
-    def send(self, text: str, to: tuple[str, int], t: float) -> None:
+    def send(self, text: str, to: tuple[str, int]) -> None:
         """Queue a packet; sent at once, or after the injected delay."""
-        if not (self.silent(t) or self.lost()):
-            self._outbox.append((t + self.faults.delay_s, text.encode("ascii", "replace"), to))
-            self.flush(t)
+        if not self.lost():
+            self.put((text.encode("ascii", "replace"), to))
+            self.flush()
 
-    def flush(self, t: float) -> None:
+    def flush(self) -> None:
         """Send due packets."""
-        while self._outbox and self._outbox[0][0] <= t:
-            _, packet, to = self._outbox.popleft()
+        for packet, to in self.due():
             try:
                 self.wire.sendto(packet, to)
             except OSError:
                 continue  # no client there: unknown to the drone
 
-    def finish(self, text: str, t: float) -> None:
+    def finish(self, text: str) -> None:
         """Answer the sender of a completed manoeuvre."""
         if self.answer_to is not None:
-            self.send(text, self.answer_to, t)
+            self.send(text, self.answer_to)
         self.answer_to = None
 
 
@@ -161,7 +151,7 @@ class TelloDevice:
 
     def silence(self, row: int, seconds: float) -> None:
         """Begin a gap of a drone's Wi-Fi: nothing is received in either direction, the sticks stay as they are."""
-        self._drones[row].silent_until = self._t + seconds
+        self._drones[row].silence(seconds)
 
     def sockets(self) -> Sequence[socket.socket]:
         return [drone.wire for drone in self._drones]
@@ -169,24 +159,27 @@ class TelloDevice:
     def serve(self, ready: socket.socket, t: float) -> None:
         for row, drone in enumerate(self._drones):
             if drone.wire is ready:
+                drone.t = t
                 try:
                     packet, sender = drone.wire.recvfrom(1024)
                 except OSError:
                     return
-                if not (drone.silent(t) or drone.lost()):
-                    self._receive(row, packet, sender, t)
+                if not drone.lost():
+                    self._receive(row, packet, sender)
 
     def advance(self, t: float) -> None:
+        for drone in self._drones:
+            drone.t = t
         for _ in instants(self._t, t, self._dt):
-            self._step(t)
+            self._step()
         self._t = t
         for row, drone in enumerate(self._drones):
             if drone.sdk and drone.peer is not None and t >= drone.state_due - 0.5 * self._dt:
                 late = t - drone.state_due
                 period = 1.0 / protocol.STATE_HZ
                 drone.state_due += period if late < period else late + period  # missed packets are not repeated
-                drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT), t)
-            drone.flush(t)
+                drone.send(self._state(row), (drone.peer[0], protocol.STATE_PORT))
+            drone.flush()
 
     def truth(self) -> tuple[Array, Array]:
         return self._truth.copy(), self._model.yaw.copy()
@@ -197,7 +190,7 @@ class TelloDevice:
 
     # ------------------------------------------------------------------ the protocol
 
-    def _receive(self, row: int, packet: bytes, sender: tuple[str, int], t: float) -> None:
+    def _receive(self, row: int, packet: bytes, sender: tuple[str, int]) -> None:
         words = packet.decode("ascii", "replace").split()
         if not words:
             return
@@ -206,10 +199,10 @@ class TelloDevice:
             drone.sdk = True
         if not drone.sdk:
             return  # before `command` the drone listens to the phone only
-        drone.peer, drone.last_command = sender, t
+        drone.peer, drone.last_command = sender, drone.t
         answer = self._answer(row, word) if word.endswith("?") else self._execute(row, word, words[1:], sender)
         if answer:
-            drone.send(answer, sender, t)
+            drone.send(answer, sender)
 
     def _answer(self, row: int, question: str) -> str:
         drone = self._drones[row]
@@ -338,7 +331,7 @@ class TelloDevice:
 
     # ------------------------------------------------------------------ the model
 
-    def _step(self, t: float) -> None:
+    def _step(self) -> None:
         self._setpoint[:] = np.nan
         for row, drone in enumerate(self._drones):
             self._setpoint[row] = self._model_setpoint(row, drone)
@@ -347,11 +340,9 @@ class TelloDevice:
         self._model.advance()
         self._truth[:] = self._model.position
         if self._jitter.present:
-            self._jitter.advance()
-            share = np.minimum(self._model.position[:, 2] / FULL_WOBBLE, 1.0)
-            self._truth[:, :2] += share[:, None] * self._jitter.displacement
+            self._truth[:, :2] += self._jitter.advance(self._model.position[:, 2])
         for row, drone in enumerate(self._drones):
-            self._update(row, drone, t)
+            self._update(row, drone)
 
     def _model_setpoint(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
         yaw = float(self._model.yaw[row])
@@ -367,17 +358,17 @@ class TelloDevice:
             return x, y, z, 0.0
         return math.nan, math.nan, math.nan, math.nan
 
-    def _update(self, row: int, drone: _Drone, t: float) -> None:
+    def _update(self, row: int, drone: _Drone) -> None:
         """Update a drone after a step: end of manoeuvres, battery, automatic landing."""
         model = self._model
         z = float(model.position[row, 2])
         flying = bool(model.flying[row])
         if drone.mode is Mode.CLIMB and abs(z - protocol.TAKEOFF_HEIGHT) < NEAR:
             drone.mode = Mode.STICKS
-            drone.finish("ok", t)
+            drone.finish("ok")
         elif drone.mode is Mode.LAND and not flying:
             drone.mode = Mode.GROUND
-            drone.finish("ok", t)
+            drone.finish("ok")
         elif drone.mode is Mode.FALL and z <= 0.0:
             drone.mode = Mode.GROUND
         elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(row, drone):
@@ -385,15 +376,15 @@ class TelloDevice:
                 drone.goal = drone.further.pop(0)
             else:
                 drone.hover()
-                drone.finish("ok", t)
+                drone.finish("ok")
         if not flying:
             return
         drone.motors_s += self._dt
         drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / TELLO.endurance_s)
-        alone = t - drone.last_command > protocol.AUTO_LAND_S
+        alone = drone.t - drone.last_command > protocol.AUTO_LAND_S
         if drone.mode is not Mode.LAND and (alone or drone.charge <= LANDING_CHARGE):
             model.land(np.array([row]))
-            drone.finish("error Auto land", t)
+            drone.finish("error Auto land")
             drone.mode = Mode.LAND
 
     def _arrived(self, row: int, drone: _Drone) -> bool:

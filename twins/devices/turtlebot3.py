@@ -8,7 +8,6 @@ for cmd_vel. `watchdog_s` in the robot's settings adds such a limit.
 from __future__ import annotations
 
 import socket
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import cos, inf, nan, pi, sin
@@ -26,7 +25,7 @@ from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
 from twins.body import instants
-from twins.devices.device import Device, DeviceRequest, Faults
+from twins.devices.device import Device, DeviceRequest, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
 from twins.models.noise import Noise
@@ -68,7 +67,6 @@ class TurtleBot3Twin:
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
         self._dt = 1.0 / body.rate_hz
-        self._faults: Faults = request.faults
         self._t = 0.0
         self._ticks = 0
         self._model = Differential(body.kinds, body.start, body.yaw, self._dt)
@@ -81,8 +79,8 @@ class TurtleBot3Twin:
             body.disturbance, np.tile([1.0, 1.0, 0.0], (rows, 1)), Noise(body.names, body.seeds, "measurement", 4)
         )
         self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
-        self._chance = np.random.default_rng([body.seeds[0], 0x7B3])
-        self._delayed: deque[tuple[float, Publisher, bytes]] = deque()
+        random = np.random.default_rng([body.seeds[0], 0x7B3])
+        self._link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
         self._bearing: Array = np.arange(turtlebot3.RAYS, dtype=float) * (2.0 * pi / turtlebot3.RAYS)
         self.surroundings: Surroundings = nothing  # for the laser scanners
         self.commands_received = [0] * rows  # executed commands
@@ -130,9 +128,9 @@ class TurtleBot3Twin:
 
     def advance(self, t: float) -> None:
         steps = instants(self._t, t, self._dt)
-        self._t = t
-        silent = self._faults.silent(t)
-        self._receive_commands(t, silent)
+        self._t = self._link.t = t
+        silent = self._link.faults.silent(t)
+        self._receive_commands(t)
         for _ in steps:
             self._model.command(self._twist)  # repeated: this robot has no timeout, unlike the model
             before = self._model.position[:, :2].copy()
@@ -147,9 +145,8 @@ class TurtleBot3Twin:
                 (turtlebot3.BATTERY_HZ, self._battery),
             ):
                 if self._ticks % max(1, round(1.0 / (rate * self._dt))) == 0 and not silent:
-                    publish(t)
-        while self._delayed and self._delayed[0][0] <= t:
-            _, publisher, payload = self._delayed.popleft()
+                    publish()
+        for publisher, payload in self._link.due():
             if not silent:
                 publisher.send(payload)
 
@@ -164,10 +161,10 @@ class TurtleBot3Twin:
 
     # ------------------------------------------------------------------ commands
 
-    def _receive_commands(self, t: float, silent: bool) -> None:
+    def _receive_commands(self, t: float) -> None:
         for index, row in enumerate(self._rows):
             for message in row.command.received():
-                if silent or self._lost():
+                if self._link.lost():
                     continue
                 said = message.twist if row.stamped else message
                 v, w = said.linear.x, said.angular.z
@@ -180,21 +177,13 @@ class TurtleBot3Twin:
             if t - row.commanded > row.watchdog:
                 self._twist[index] = 0.0
 
-    def _lost(self) -> bool:
-        return self._faults.loss > 0.0 and bool(self._chance.random() < self._faults.loss)
-
     # ------------------------------------------------------------------ published topics
 
-    def _publish(self, publisher: Publisher, types: ros2.Types, message: Message, t: float) -> None:
-        if self._lost():
-            return
-        payload = types.encode(message, publisher.kind)
-        if self._faults.delay_s > 0.0:
-            self._delayed.append((t + self._faults.delay_s, publisher, payload))
-        else:
-            publisher.send(payload)
+    def _publish(self, publisher: Publisher, types: ros2.Types, message: Message) -> None:
+        if not self._link.lost():
+            self._link.put((publisher, types.encode(message, publisher.kind)))
 
-    def _odometry(self, t: float) -> None:
+    def _odometry(self) -> None:
         position, yaw = self._model.position[:, :2].copy(), self._model.yaw.copy()
         if self._measurement.present:
             noise = self._measurement.draw()
@@ -228,9 +217,9 @@ class TurtleBot3Twin:
                 pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
                 twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
             )
-            self._publish(row.odometry, row.types, message, t)
+            self._publish(row.odometry, row.types, message)
 
-    def _scan(self, t: float) -> None:
+    def _scan(self) -> None:
         now = self._clock.utc()
         for index, row in enumerate(self._rows):
             yaw = float(self._model.yaw[index])
@@ -249,11 +238,11 @@ class TurtleBot3Twin:
                 ranges=np.where(seen, distance, inf).astype(np.float32),
                 intensities=np.zeros(turtlebot3.RAYS, np.float32),
             )
-            self._publish(row.scan, row.types, message, t)
+            self._publish(row.scan, row.types, message)
 
-    def _battery(self, t: float) -> None:
-        spent = self._used * self._faults.drain / TURTLEBOT3.endurance_s
-        charge = max(0.0, self._faults.battery - spent)
+    def _battery(self) -> None:
+        spent = self._used * self._link.faults.drain / TURTLEBOT3.endurance_s
+        charge = max(0.0, self._link.faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
         now = self._clock.utc()
         for row in self._rows:
@@ -276,7 +265,7 @@ class TurtleBot3Twin:
                 location="",
                 serial_number="",
             )
-            self._publish(row.battery, row.types, message, t)
+            self._publish(row.battery, row.types, message)
 
 
 def _row(

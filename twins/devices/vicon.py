@@ -10,7 +10,6 @@ import socket
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -32,7 +31,7 @@ from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
-from twins.devices.device import Faults
+from twins.devices.device import Faults, FaultyLink
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -82,13 +81,12 @@ class ViconTwin:
         """
         self._subjects = list(subjects)
         self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
-        self._faults = faults or Faults()
+        self._link = FaultyLink[bytes](faults or Faults())
         self._position = np.zeros((len(self._subjects), 3))
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
         self._visible = np.zeros(len(self._subjects), dtype=bool)
         self.latency_s = 0.0  # reported age of the frames
         self._frames = 0
-        self._delayed: deque[tuple[float, bytes]] = deque()
         self._names = b"".join(
             [vicon_datastream.pack_stream_info(rate_hz), vicon_datastream.pack_axes()]
             + [vicon_datastream.pack_subject(number, name) for number, name in enumerate(self._subjects)]
@@ -108,7 +106,7 @@ class ViconTwin:
 
     def set_faults(self, faults: Faults) -> None:
         """Replace the injected faults."""
-        self._faults = faults
+        self._link.faults = faults
 
     def sockets(self) -> Sequence[socket.socket]:
         return [self._listener, *self._clients]
@@ -121,13 +119,14 @@ class ViconTwin:
 
     def advance(self, t: float) -> None:
         """Send the frame that is due at `t` [s], if any."""
+        self._link.t = t
         due = int(t * self._rate + 1e-6)
         if due > self._frames:
             self._frames = due  # missed frames are not repeated
-            if not self._faults.silent(t):
-                self._delayed.append((t + self._faults.delay_s, self._frame(t)))
-        while self._delayed and self._delayed[0][0] <= t:
-            self._send(self._delayed.popleft()[1])
+            if not self._link.silent(t):
+                self._link.put(self._frame(t))
+        for frame in self._link.due():
+            self._send(frame)
         for connection, client in list(self._clients.items()):
             self._flush(connection, client)
 
@@ -152,7 +151,7 @@ class ViconTwin:
             received = connection.recv(65536)
             if not received:
                 raise ConnectionResetError
-            if self._faults.silent(t):
+            if self._link.silent(t):
                 return
             for body in client.framer.feed(received):
                 for kind, payload in vicon_datastream.blocks(body):
@@ -175,7 +174,7 @@ class ViconTwin:
         position = self._position
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
-        seen = self._visible & (not self._faults.occluded(t))
+        seen = self._visible & (not self._link.faults.occluded(t))
         frame = [
             vicon_datastream.pack_frame_number(self._frames),
             vicon_datastream.pack_latency([("Data Collected", self.latency_s)]),

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agents.arrays import Array, norm
+from agents.arrays import Array, every, norm
 from agents.body.interface import Disturbance
 from twins.models.noise import Noise
+
+FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
 
 
 class HoverJitter:
@@ -23,11 +25,14 @@ class HoverJitter:
         noise.scale = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
         self._push = noise
         self.present = bool(sigma.any())
-        self.displacement = np.zeros((len(disturbance), 2))
+        self._displacement = np.zeros((len(disturbance), 2))
 
-    def advance(self) -> None:
-        """One step of dt; exact for any dt."""
-        self.displacement = self._keep * self.displacement + self._push.draw()
+    def advance(self, height: Array) -> Array:
+        """One step of dt, exact for any dt; returns the displacement (n, 2) of rows at `height` (n,) [m]."""
+        self._displacement = self._keep * self._displacement + self._push.draw()
+        if every(height >= FULL_WOBBLE):
+            return self._displacement
+        return np.asarray(np.minimum(height / FULL_WOBBLE, 1.0)[:, None] * self._displacement)
 
 
 class Measurement:

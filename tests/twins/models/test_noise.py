@@ -45,10 +45,7 @@ def test_hover_jitter_has_its_sigma_and_its_correlation_time_whatever_the_step(d
     rows, sigma, tau = 64, 0.01, 0.5
     jitter = HoverJitter([Disturbance(hover_jitter=Jitter(sigma, tau))] * rows, noise(rows, 2), dt)
     assert jitter.present
-    seen = []
-    for _ in range(round(20.0 / dt)):
-        jitter.advance()
-        seen.append(jitter.displacement)
+    seen = [jitter.advance(np.ones(rows)) for _ in range(round(20.0 / dt))]
     settled = np.array(seen[round(3.0 / dt) :])
     assert settled.std() == pytest.approx(sigma, rel=0.04)
     for lag_s in (0.2, 0.5, 1.0):
@@ -61,9 +58,9 @@ def test_hover_jitter_has_its_sigma_and_its_correlation_time_whatever_the_step(d
 def test_rows_without_jitter_stand_still_beside_those_that_have_it():
     jitter = HoverJitter([Disturbance(), Disturbance(hover_jitter=Jitter(0.02))], noise(2, 2), 0.01)
     for _ in range(50):
-        jitter.advance()
-    assert not jitter.displacement[0].any()
-    assert jitter.displacement[1].all()
+        displacement = jitter.advance(np.ones(2))
+    assert not displacement[0].any()
+    assert displacement[1].all()
     assert not HoverJitter([Disturbance()], noise(1, 2), 0.01).present
 
 

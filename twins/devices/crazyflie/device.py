@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import socket
 import struct
-from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
@@ -19,7 +18,7 @@ from agents.protocols.crtp import Port, header
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink
-from twins.devices.device import DeviceRequest
+from twins.devices.device import DeviceRequest, FaultyLink
 
 SCANNED_PORTS: Final = range(19850, 19860)  # at which cflib looks for simulations
 LARGEST: Final = 64  # [bytes]
@@ -29,53 +28,40 @@ RECEIVE_BYTES: Final = 1 << 20
 Peer = tuple[str, int]
 
 
-class LossyLink:
-    """Link of one Crazyflie: socket, client, losses and delays."""
+class UdpLink(FaultyLink[bytes]):
+    """Link of one Crazyflie over UDP: socket and client."""
 
     def __init__(self, random: np.random.Generator, request: DeviceRequest) -> None:
+        super().__init__(request.faults, random)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         _bind(self.socket, (*SCANNED_PORTS, 0) if request.by_hand else (0,))
         self.socket.setblocking(False)
         self.peer: Peer | None = None  # client; None before the first packet
-        self.t = 0.0  # current time [s]
-        self.faults, self._random = request.faults, random
-        self._gap = (np.inf, -np.inf)  # begin and end of an outage [s]
-        self._waiting: deque[tuple[float, bytes]] = deque()
 
     @property
     def connected(self) -> bool:
         """Whether the firmware counts its link as connected; without polls of a radio: whether it could be polled."""
-        return not (self._silent(self.t) and self._silent(self.t - crazyradio.ACTIVITY_S))
+        return not (self.silent(self.t) and self.silent(self.t - crazyradio.ACTIVITY_S))
 
     @property
     def address(self) -> str:
         return f"udp://{HOST}:{self.socket.getsockname()[1]}"
 
-    def silence(self, seconds: float) -> None:
-        """Begin an outage: nothing is received in either direction."""
-        self._gap = self.t, self.t + seconds
-
-    def lost(self) -> bool:
-        """Whether the current packet is lost."""
-        loss = self.faults.loss
-        return self._silent(self.t) or (loss > 0.0 and self._random.random() < loss)
-
-    def _silent(self, t: float) -> bool:
-        return self.faults.silent(t) or self._gap[0] <= t < self._gap[1]
-
     def send(self, port: Port, channel: int, data: bytes) -> None:
         """Send a packet to the client, if there is one."""
-        packet = bytes((header(port, channel),)) + data
-        if self.faults.delay_s > 0.0:
-            self._waiting.append((self.t + self.faults.delay_s, packet))
-        else:
-            self._send_now(packet)
+        self.put(bytes((header(port, channel),)) + data)
+        self.send_due()
 
     def send_due(self) -> None:
-        """Send delayed packets that are due."""
-        while self._waiting and self._waiting[0][0] <= self.t:
-            self._send_now(self._waiting.popleft()[1])
+        """Send packets that are due."""
+        for packet in self.due():
+            if self.peer is None or self.lost():
+                continue
+            try:
+                self.socket.sendto(packet, self.peer)
+            except (BlockingIOError, ConnectionError):
+                continue  # lost, as on a radio
 
     def receive(self) -> bytes | None:
         """Next packet, or None. The newest sender becomes the client, as in Bitcraze's own simulation."""
@@ -89,14 +75,6 @@ class LossyLink:
             if packet and not self.lost():
                 self.peer = sender
                 return packet
-
-    def _send_now(self, packet: bytes) -> None:
-        if self.peer is None or self.lost():
-            return
-        try:
-            self.socket.sendto(packet, self.peer)
-        except (BlockingIOError, ConnectionError):
-            return  # lost, as on a radio
 
 
 def _bind(wire: socket.socket, ports: Sequence[int]) -> None:
@@ -128,13 +106,13 @@ class CrazyflieTwin:
         self._gaps = [sorted(gaps) for gaps in self.flock.gaps]  # that have not begun
         self._took_off = np.full(len(self.lines), np.inf)  # [s] first time of each
 
-    def _open_links(self, request: DeviceRequest) -> Sequence[LossyLink | RadioLink]:
+    def _open_links(self, request: DeviceRequest) -> Sequence[UdpLink | RadioLink]:
         random = [np.random.default_rng([seed, row]) for row, seed in enumerate(request.body.seeds)]
         if any(each.get("link") == "radio" for each in request.body.device):
             radios = [RadioLink(own, request.faults, row) for row, own in enumerate(random)]
             self._air = Air(radios, request.faults.exchanges_hz)
             return radios
-        wires = [LossyLink(own, request) for own in random]
+        wires = [UdpLink(own, request) for own in random]
         self._row = {wire.socket: row for row, wire in enumerate(wires)}
         return wires
 
@@ -147,7 +125,7 @@ class CrazyflieTwin:
             return
         row = self._row[ready]
         line = self.lines[row]
-        assert isinstance(line, LossyLink)
+        assert isinstance(line, UdpLink)
         line.t = t
         for _ in range(AT_ONCE):
             packet = line.receive()

@@ -12,7 +12,7 @@ from agents.body.interface import BodyRequest
 from agents.body.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
-from twins.body import FULL_WOBBLE, instants
+from twins.body import instants
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import Plan, Planner
@@ -233,9 +233,7 @@ class Flock:
         self._update_attitude(before)
         self.place = quadrotor.position.copy()
         if self._jitter.present:
-            self._jitter.advance()
-            share = np.minimum(quadrotor.position[:, 2] / FULL_WOBBLE, 1.0)
-            self.place[:, :2] += share[:, None] * self._jitter.displacement
+            self.place[:, :2] += self._jitter.advance(quadrotor.position[:, 2])
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
         self.estimator.advance(t, self.dt, self.place, self.ready(), self._flow, flying=quadrotor.flying)

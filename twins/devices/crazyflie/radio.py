@@ -15,7 +15,7 @@ import numpy as np
 from agents.protocols import crazyradio
 from agents.protocols.crazyradio import ACK, ANSWER, COUNTERS, DATA_RATES, DOWN, EXCHANGE, NULL, SAFELINK, UP
 from agents.protocols.crtp import Port, header
-from twins.devices.device import Faults
+from twins.devices.device import Faults, FaultyLink
 
 HOST: Final = "127.0.0.1"
 CHANNEL: Final = 80
@@ -26,19 +26,17 @@ NOTHING: Final = bytes((NULL, 0x01, 0x00))  # acknowledgement of a drone with no
 LOG_DATA: Final = header(Port.LOG, 2)
 
 
-class RadioLink:
+class RadioLink(FaultyLink[bytes]):
     """Radio chip of one Crazyflie and the queue before it. Its safelink outlives the session of a client."""
 
     def __init__(self, random: np.random.Generator, faults: Faults, row: int) -> None:
+        super().__init__(faults, random)
         self.own = bytes.fromhex(f"E7E7E7E7{row + 1:02X}")  # address on the air
         self.address = ""  # for the bridge
-        self.t = 0.0  # current time [s]
-        self.faults, self._random = faults, random
         self.queue: deque[bytes] = deque()
         self.dropped = 0  # log packets that found the queue full
         self.safelink = False
         self.heard = -np.inf  # last exchange [s]
-        self.silent_until = -np.inf  # end of an outage [s]
         self._up = self._down = 1  # counters of safelink
         self._acknowledgement = NOTHING
 
@@ -46,10 +44,6 @@ class RadioLink:
     def connected(self) -> bool:
         """Whether the firmware counts its radio as connected; else it removes its log blocks."""
         return self.t - self.heard <= crazyradio.ACTIVITY_S
-
-    def silence(self, seconds: float) -> None:
-        """Begin an outage: nothing is received in either direction."""
-        self.silent_until = self.t + seconds
 
     def send(self, port: Port, channel: int, data: bytes) -> None:
         """Queue a packet for the client. Answers wait behind log packets, which are dropped when the queue is full."""
@@ -67,19 +61,14 @@ class RadioLink:
     def exchange(self, packet: bytes, retries: int) -> tuple[int, bytes, bytes | None]:
         """One exchange: status byte and acknowledgement for the client, and the packet for the drone, or None."""
         received, forwarded = False, None
-        out = self.faults.silent(self.t) or self.t < self.silent_until
         for attempt in range(retries + 1):
-            if out or self._lost():
+            if self.lost():
                 continue
             if not received:  # the chip recognizes a retransmission and only repeats its acknowledgement
                 received, forwarded = True, self._receive(packet)
-            if not self._lost():
+            if not self.lost():
                 return ACK | attempt << 4, self._acknowledgement, forwarded
         return 0, b"", forwarded
-
-    def _lost(self) -> bool:
-        loss = self.faults.loss
-        return loss > 0.0 and bool(self._random.random() < loss)
 
     def _receive(self, packet: bytes) -> bytes | None:
         """Update safelink and the acknowledgement; returns the packet for the drone, None for a repetition."""
