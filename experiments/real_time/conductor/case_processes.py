@@ -19,7 +19,6 @@ from experiments.definition import bodies, standby
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import document
 from experiments.file.document import write_json
-from experiments.real_time.conductor import support
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.support import Servants
 from experiments.real_time.hosts.hosts import STATION
@@ -49,8 +48,6 @@ class CaseProcesses:
         self._groups: dict[str, list[str]] = {}  # by process, without the case
         for name, robot in context.experiment.robots.items():
             self._groups.setdefault(robot.process or name, []).append(name)
-        self._standins: tuple[str, ...] = ()
-        self._centre: tuple[str, ...] = ()
         self._servants = Servants(context)
         self.adopted: set[str] = set()  # robots that others have started, or will
         # hosts without address, by the robots that are started there
@@ -70,8 +67,10 @@ class CaseProcesses:
             files = str(context.file), str(context.recording)
             module = "experiments.real_time.processes.recorder"
             context.start("recorder", module, *files, "--name", context.case, "--source", str(context.source))
-        self._start_standins()
-        self._centre = self._servants.start_centre()
+        self._reached = self._servants.start()
+        if self._servants.standins:
+            self._addressed = context.folder / f"{context.case}-addressed.json"
+            self._addressed.write_bytes(write_json(self._reached))
 
     def adopt(self, there: Iterable[str]) -> list[str]:
         """Adopt robots that are `there`, and those of hosts without address, which are not started; returns all."""
@@ -154,9 +153,9 @@ class CaseProcesses:
     def end(self) -> None:
         """End all but the router: robots land first, and the recorder sees it."""
         self.end_robots()
-        self._launcher.end(self._centre, grace_s=2.0)  # its last report is recorded
+        self._launcher.end([self._context.process("centre")], grace_s=2.0)  # its last report is recorded
         self._launcher.end([self._context.process("recorder")], grace_s=5.0)
-        self._launcher.end(self._standins, grace_s=2.0)
+        self._launcher.end(self._servants.standins, grace_s=2.0)
 
     def end_robots(self) -> list[str]:
         """End the processes of all robots, which land first; return the robots whose process had to be killed."""
@@ -169,7 +168,7 @@ class CaseProcesses:
             again = self._servants.again(process)
             if again is not None:
                 yield Death(again[0], "conductor", again[1])
-            elif process.name in self._standins:
+            elif process.name in self._servants.standins:
                 what = process.name.removeprefix(self._context.process(""))
                 text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
                 yield Death("device", "conductor", text)
@@ -199,13 +198,3 @@ class CaseProcesses:
 
     def _process(self, group: str) -> str:
         return self._context.process(group)
-
-    def _start_standins(self) -> None:
-        """Start world, protocol twins and positioning, and write a file with the addresses of the robots."""
-        started = support.start(self._context)
-        self._reached, self._standins = started.experiment, started.names
-        if started.positioning is not None:
-            self._servants.keep(*started.positioning)
-        if self._standins:
-            self._addressed = self._context.folder / f"{self._context.case}-addressed.json"
-            self._addressed.write_bytes(write_json(self._reached))

@@ -33,75 +33,11 @@ class RouterEnded(StandInError):
     """A router that ended instead of listening: its port was taken, or its lab cannot be used."""
 
 
-@dataclass(frozen=True)
-class StandIns:
-    """Stand-ins that were started."""
-
-    experiment: Experiment  # with the addresses at which robots are
-    names: tuple[str, ...]  # of the processes
-    # name of the process that publishes positions, and the call that starts it again; None: there is none
-    positioning: tuple[str, Callable[[], Process]] | None
-
-
-def start(context: CaseContext) -> StandIns:
-    """Start the stand-ins that the experiment asks for, and fill in the addresses of its robots.
-
-    Raises:
-        StandInError: If one does not start in time.
-    """
-    experiment = context.experiment
-    world = start_world(context)
-    words = registry.names(registry.DEVICES)
-    groups: dict[str, list[str]] = {}
-    for name, robot in experiment.robots.items():
-        if robot.body in words:
-            groups.setdefault(robot.body, []).append(name)
-    module = "experiments.real_time.processes.protocol_twins"
-    processes = {word: context.start(word, module, str(context.file), *names) for word, names in groups.items()}
-    addresses: dict[str, str] = {}
-    for word, names in groups.items():
-        addresses |= _announced(processes[word], r"^address (\w+) (\S+)$", len(names), context.ended)
-    started = [process.name for process in processes.values()]
-    if world is not None:
-        _announced(world, r"^(world) (ready)\b", 1, context.ended)
-        started.append(world.name)
-    robots = {
-        name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
-        for name, robot in experiment.robots.items()
-    }
-    addressed = msgspec.structs.replace(experiment, robots=robots)
-    measuring, positioning = _start_positioning(context, addressed)
-    return StandIns(addressed, (*started, *measuring), positioning)
-
-
 def start_world(context: CaseContext) -> Process | None:
     """Start the world of an experiment, for the first time or again; None if no robot asks for one."""
     if not any(bodies.WORLD in (robot.body, robot.ranges) for robot in context.experiment.robots.values()):
         return None
     return context.start("world", "experiments.real_time.processes.world", str(context.file))
-
-
-def _start_positioning(
-    context: CaseContext, experiment: Experiment
-) -> tuple[list[str], tuple[str, Callable[[], Process]] | None]:
-    """Start the motion capture of the case, whose robots have addresses: names of its processes; see `StandIns`."""
-    measured = Plan(experiment).externally_measured
-    if experiment.positioning is None or not measured:
-        return [], None
-    started = []
-    realm = ["--realm", experiment.network.realm]
-    host = experiment.positioning.removeprefix(VICON)
-    if experiment.positioning == bodies.VICON_TWIN:
-        sigma = max(bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
-        noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
-        arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
-        twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)
-        started.append(twin.name)
-        host = _announced(twin, r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
-    maps = [part for name in measured for part in ("--map", f"{name}={name}")]
-    bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
-    name = bridge().name
-    return [*started, name], (name, bridge)
 
 
 def _announced(process: Process, pattern: str, count: int, interrupted: Callable[[], bool]) -> dict[str, str]:
@@ -149,11 +85,14 @@ class _Servant:
 
 
 class Servants:
-    """Supervised processes of one case: routers, world, central controller, motion capture."""
+    """Supervised processes of one case: routers, world, central controller, motion capture; and protocol twins."""
+
+    standins: list[str]  # processes of protocol twins, world and motion capture
 
     def __init__(self, context: CaseContext) -> None:
-        """Start nothing: routers and world are started by others, the central controller by `start_centre`."""
+        """Start nothing: routers are started by others."""
         self._context = context
+        self.standins = []
         count = context.experiment.network.routers
         self._known = {
             each.name: _Servant(
@@ -163,24 +102,60 @@ class Servants:
             )
             for each in make_routers(context.hosts.routers, count)
         } | {context.process("world"): _Servant(partial(start_world, context))}
-        self._centre: tuple[str, ...] = ()
-        if Plan(context.experiment).guided:
-            self._centre = (context.process("centre"),)
-            self._known[self._centre[0]] = _Servant(
-                partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file)),
-                given_up=": the robots that it guides hold, and land at the end",
-            )
 
-    def keep(self, name: str, start: Callable[[], object]) -> None:
-        """Supervise motion capture as well: robots without a position hold, and drones land."""
+    def start(self) -> Experiment:
+        """Start what the robots of the case need; return its experiment with the addresses of its robots.
+
+        Raises:
+            StandInError: If a protocol twin or a positioning system does not start in time.
+        """
+        context, experiment = self._context, self._context.experiment
+        world = start_world(context)
+        words = registry.names(registry.DEVICES)
+        groups: dict[str, list[str]] = {}
+        for name, robot in experiment.robots.items():
+            if robot.body in words:
+                groups.setdefault(robot.body, []).append(name)
+        module = "experiments.real_time.processes.protocol_twins"
+        processes = {word: context.start(word, module, str(context.file), *names) for word, names in groups.items()}
+        addresses: dict[str, str] = {}
+        for word, names in groups.items():
+            addresses |= _announced(processes[word], r"^address (\w+) (\S+)$", len(names), context.ended)
+            self.standins.append(processes[word].name)
+        if world is not None:
+            _announced(world, r"^(world) (ready)\b", 1, context.ended)
+            self.standins.append(world.name)
+        robots = {
+            name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
+            for name, robot in experiment.robots.items()
+        }
+        addressed = msgspec.structs.replace(experiment, robots=robots)
+        self._start_positioning(addressed)
+        if Plan(experiment).guided:
+            centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))
+            given_up = ": the robots that it guides hold, and land at the end"
+            self._known[centre().name] = _Servant(centre, given_up=given_up)
+        return addressed
+
+    def _start_positioning(self, experiment: Experiment) -> None:
+        """Start the motion capture of the case, whose robots have addresses."""
+        context, measured = self._context, Plan(experiment).externally_measured
+        if experiment.positioning is None or not measured:
+            return
+        realm = ["--realm", experiment.network.realm]
+        host = experiment.positioning.removeprefix(VICON)
+        if experiment.positioning == bodies.VICON_TWIN:
+            sigma = max(bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
+            noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
+            arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
+            twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)
+            self.standins.append(twin.name)
+            host = _announced(twin, r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
+        maps = [part for name in measured for part in ("--map", f"{name}={name}")]
+        bridge = partial(context.start, "vicon", "bridges.vicon.publisher", host, *maps, *realm)
+        self.standins.append(bridge().name)
         hold = ": robots without a position hold, drones land"
-        self._known[name] = _Servant(start, hold, hold)
-
-    def start_centre(self) -> tuple[str, ...]:
-        """Start the central controller, if robots are guided by one; the names of its processes."""
-        for name in self._centre:
-            self._known[name].start()
-        return self._centre
+        self._known[self.standins[-1]] = _Servant(bridge, hold, hold)
 
     def again(self, process: Process) -> tuple[str, str] | None:
         """Restart a process that has died; its role and the text of the event. None if it is not supervised."""

@@ -44,7 +44,6 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
         ROUTER,
         "the router ended (killed by SIGKILL); given up: the robots hold, and land at the end",
     )
-    assert servants.start_centre() == ()
     assert servants.again(SimpleNamespace(name="only-KH01", exit="exit code 2")) is None
 
 
