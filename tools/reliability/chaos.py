@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -15,33 +15,10 @@ from tools.commands.options import AsJson, File, Out, Settings, example, print_j
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
     from tools.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
-    from tools.reliability.chaos_round import Say, Setting
-    from tools.reliability.fault_script import Fault
 
 app: Final = typer.Typer()
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
-
-
-def run(
-    setting: Setting, script: Sequence[Fault], *, interrupted: Callable[[], bool], say: Say
-) -> tuple[list[FaultResult], list[RoundResult]]:
-    """Run rounds until all faults are done; those that had no time in theirs come again."""
-    from tools.reliability.chaos_round import ChaosRound
-    from tools.reliability.fault_script import take_round
-
-    waiting = list(script)
-    outcomes: list[FaultResult] = []
-    ends: list[RoundResult] = []
-    barren = 0
-    while waiting and not interrupted() and barren < BARREN:
-        chosen = take_round(waiting, setting.experiment.duration_s)
-        flown = ChaosRound(setting, chosen, len(ends) + 1, interrupted, say)
-        ends.append(flown.run())
-        outcomes += flown.outcomes
-        waiting += ends[-1].left
-        barren = 0 if flown.outcomes else barren + 1
-    return outcomes, ends
 
 
 # pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
@@ -49,7 +26,6 @@ ALWAYS: Final = ('world.engine="pymunk"', "world.wheels_stop_s=0.5", "start.dead
 # without one, robots cannot keep clear of a dead one that stands in their way, nor of one that lands below them
 AVOIDANCE: Final = 'avoidance={ kind = "barrier", hears = "all", clearance = 1.0 }'
 BODY_HZ: Final = 50.0  # relays, world and robots share one machine: at 100 Hz two cores are full, and ticks are missed
-BODIES: Final = "world"
 SCRIPT: Final = "script.json"
 
 
@@ -75,8 +51,8 @@ def chaos(
     from experiments.recording.run_folder import SOURCE, new_folder
     from tools.reliability import chaos_report
     from tools.reliability.chaos_report import ChaosResult
-    from tools.reliability.chaos_round import Setting
-    from tools.reliability.fault_script import script
+    from tools.reliability.chaos_round import ChaosRound, Setting
+    from tools.reliability.fault_script import script, take_round
 
     changes = [*defaults(load(file).experiment), *(settings or [])]
     read = load(file, *changes)
@@ -91,9 +67,17 @@ def chaos(
         print(text, file=sys.stderr, flush=True)
 
     say(f"{faults} faults in rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
-    setting = Setting(folder / SOURCE, name, experiment, folder, changes, BODIES, seed)
+    waiting, barren = list(planned), 0
+    outcomes: list[FaultResult] = []
+    ends: list[RoundResult] = []
     with Interrupts() as interrupted:
-        outcomes, ends = run(setting, planned, interrupted=interrupted, say=say)
+        setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted, say)
+        while waiting and not interrupted() and barren < BARREN:
+            flown = ChaosRound(setting, take_round(waiting, experiment.duration_s), len(ends) + 1)
+            ends.append(flown.run())
+            outcomes += flown.outcomes
+            waiting += ends[-1].left  # those that had no time in it come again
+            barren = 0 if flown.outcomes else barren + 1
     result = ChaosResult(read.experiment.title, seed, planned, outcomes, ends)
     words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds or () for part in ("--kinds", kind)]

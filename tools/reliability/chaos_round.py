@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -48,7 +49,6 @@ NOTICE_S: Final = 1.0  # after which it must have stopped
 FEWEST: Final = 3  # running robots with which a round goes on
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LEAD_S: Final = 1.0  # the start is announced not longer before
-SWITCHES: Final = "switches"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
 DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
 NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
@@ -56,9 +56,6 @@ REFUSED: Final = 2  # exit code of a process whose name is taken
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
 LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
 END_S: Final = 60.0  # and no round takes longer than this after its time
-
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -70,8 +67,13 @@ class Setting:
     experiment: Experiment  # the same, changes applied
     folder: Path  # where each round gets a folder
     changes: Sequence[str]  # as behind `--set`
-    bodies: str | None  # as behind `--bodies`
     seed: int  # of nonsense, which the script leaves open
+    interrupted: Callable[[], bool]  # by the user
+    say: Callable[[str], None]
+
+
+class _Over(Exception):
+    """The run has ended, or goes on without end."""
 
 
 @dataclass
@@ -81,16 +83,14 @@ class _ActiveFault:
     fault: Fault
     victim: str
     begun: float
-    note: str
-    before: Array
-    lifted: float | None = None
-    well_since: float | None = None
-    why: str = ""  # last reason of not being well
-    held_at: Array | None = None
+    at_s: float  # since the common start
+    there: set[str]  # robots under way before
+    events: int  # that had happened before
+    incidents: dict[str, int]  # number of the last incident of each robot before
+    note: str = ""
     utc: float = field(default_factory=time.time)
-    there: set[str] = field(default_factory=set)  # robots under way before
-    events: int = 0  # that had happened before
-    incidents: dict[str, int] = field(default_factory=dict)  # number of the last incident of each robot before
+    lifted: float = 0.0
+    held_at: Array | None = None
     restarted: float | None = None
     back: float | None = None
     violations: list[str] = field(default_factory=list)
@@ -108,9 +108,8 @@ class ChaosRound:
         outcomes: Of the faults that were done.
     """
 
-    def __init__(self, setting: Setting, script: Round, number: int, interrupted: Callable[[], bool], say: Say) -> None:
+    def __init__(self, setting: Setting, script: Round, number: int) -> None:
         self._setting, self._script, self._number = setting, script, number
-        self._interrupted, self._say = interrupted, say
         self.outcomes: list[FaultResult] = []
         self._left = list(script.faults)
         self._wrong: list[str] = []
@@ -120,110 +119,131 @@ class ChaosRound:
         self._conductor_dead = self._disk_full = False
         self._now: _ActiveFault | None = None
         self._started: float | None = None
-        self._at = 0.0
-        self._well: float | None = None  # since when all is well, before a fault
-        self._formed_since: float | None = None
         self._senders: dict[str, set[str]] = {name: set() for name in setting.experiment.robots}
         for link in Plan(setting.experiment).one_way_links:
             self._senders[link.receiver].add(link.sender)
 
     def run(self) -> RoundResult:
         """Run the round to its end; no process is left behind."""
-        setting = self._setting
+        setting, stage = self._setting, self._script.stage
         folder = setting.folder / f"round-{self._number:03}"
-        folder.mkdir()
-        random = np.random.default_rng([setting.seed, self._number])
+        switches = folder / "switches"
+        switches.mkdir(parents=True)
         experiment = setting.experiment
         groups = {name: robot.process or name for name, robot in experiment.robots.items()}
-        stage = self._script.stage
         routers = [free_endpoint(preferred_port=0) for _ in range(2 if stage == "two routers" else 1)]
         recording = folder / f"{setting.case}.mcap"
+        own = [*setting.changes, f"network.listen={json.dumps(routers)}", f"network.routers={len(routers)}"]
+        if stage == "motion capture":
+            flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
+            own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
+            own.append('positioning="vicon-twin"')
+        Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
+        nearest, missed = math.inf, 0.0
         with ExitStack() as stack:
-            switches = folder / SWITCHES
-            switches.mkdir()
-            Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
             cables = stack.enter_context(Cables())
             laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
             launcher = stack.enter_context(Launcher(folder / "logs"))
-            own = [*setting.changes, f"network.listen={json.dumps(routers)}"]
-            own.append(f"network.routers={len(routers)}")
-            if stage == "motion capture":
-                flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
-                own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
-                own.append('positioning="vicon-twin"')
-            watched = WatchedRun(
-                launcher,
-                Request(
-                    str(setting.file),
-                    str(folder),
-                    setting.case,
-                    own,
-                    setting.bodies,
-                    cables=laid,
-                    switches=str(switches),
-                ),
-            )
-            stack.callback(self._sweep, watched)
-            self._injector = Injector(watched, launcher, cables, switches, random, groups=groups, recording=recording)
-            nearest, missed = math.inf, 0.0
+            request = Request(str(setting.file), str(folder), setting.case, own, "world", laid, str(switches))
+            watched = self._watched = WatchedRun(launcher, request)
+            stack.callback(_sweep, watched)
             try:
                 with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
                     self._observer = Observer(session, experiment)
-                    self._follow(watched)
+                    self._injector = Injector(
+                        watched,
+                        launcher,
+                        cables,
+                        self._observer,
+                        folder=switches,
+                        random=np.random.default_rng([setting.seed, self._number]),
+                        groups=groups,
+                        recording=recording,
+                    )
+                    with contextlib.suppress(_Over):
+                        self._follow()
+                    self._injector.release()
                     nearest, missed = self._observer.invariants.nearest, self._missed_share()
             except network.Unreachable as error:
                 self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
-            if self._now is not None:
-                self._unfinished(self._now)
-            self._injector.release()
-            gone_s = self._finish(watched)
+            if self._now is not None:  # put back: its recovery was not observed before the run ended
+                active = self._now
+                self._wrong += [f"{active.fault.kind} {active.victim}: {text}" for text in active.violations]
+                self._left.insert(0, active.fault)
+            gone_s = self._finish()
         if self._started is not None:
             self._wrong += recording_faults(recording, self.outcomes, disk_full=self._disk_full)
         for each in self._wrong:
-            self._say(f"round {self._number}: {each}")
+            setting.say(f"round {self._number}: {each}")
         kept = folder.name if recording.exists() else ""
         return RoundResult(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
 
     # ------------------------------------------------------------------ the run
 
-    def _follow(self, watched: WatchedRun) -> None:
-        """Inject the faults of the script until it is through or the run ends."""
-        duration = self._setting.experiment.duration_s
+    def _follow(self) -> None:
+        """Inject the faults of the script, one after the other, until it is through or the run's time is over."""
+        experiment = self._setting.experiment
         began = time.monotonic()
-        while watched.process.alive and not self._conductor_dead:
-            time.sleep(POLL_S)
-            self._observer.update()
-            now = time.monotonic()
-            for event in watched.news():
-                self._events.append(event)
-                if event.kind == "start":
-                    self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
-            if self._started is None:
-                self._observer.violations()  # robots are placed
-                if now > began + BEGIN_S:
-                    self._wrong.append(f"no common start within {BEGIN_S:g} s")
+        while self._started is None:
+            self._poll()
+            self._observer.violations()  # robots are placed
+            if time.monotonic() > began + BEGIN_S:
+                self._wrong.append(f"no common start within {BEGIN_S:g} s")
+                return
+        well, why = self._settle(self._not_formed, FORM_S)
+        if why:
+            self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
+            return
+        while self._left and not self._conductor_dead:
+            nature, t = self._left[0].properties, self._poll()
+            if self._setting.interrupted() or t > experiment.duration_s - nature.lasts_s - max(
+                LATEST_S, nature.heals_s
+            ):
+                return
+            if time.monotonic() >= well + self._left[0].after_s:
+                running = self._observer.running() - self._dead.keys()
+                if len(running) < FEWEST:
                     return
-                continue
-            t = now - self._started
-            self._judge(now)
-            if self._now is not None:
-                self._lift_fault(self._now, t, now)
-            elif self._nothing_left(t, duration) or not self._inject_next(t, now):
-                return
-            if t > duration + END_S:
-                self._wrong.append(f"it does not end {END_S:g} s after its time")
-                return
+                self._do(self._left.pop(0), t, running)
+                well = time.monotonic()
 
-    def _nothing_left(self, t: float, duration: float) -> bool:
-        """Whether nothing more can be done in this round."""
-        if not self._left or self._interrupted():
-            return True
-        nature = self._left[0].properties
-        return t > duration - nature.lasts_s - max(LATEST_S, nature.heals_s)
+    def _poll(self) -> float:
+        """Wait a moment, and take in what has happened; return the time since the common start [s]."""
+        if not (self._watched.process.alive or self._conductor_dead):
+            raise _Over
+        time.sleep(POLL_S)
+        self._observer.update()
+        now = time.monotonic()
+        for event in self._watched.news():
+            self._events.append(event)
+            if event.kind == "start":
+                self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
+        if self._started is None:
+            return 0.0
+        self._judge(now)
+        if now - self._started > self._setting.experiment.duration_s + END_S:
+            self._wrong.append(f"it does not end {END_S:g} s after its time")
+            raise _Over
+        return now - self._started
 
-    def _run_is_over(self) -> bool:
-        """Whether the run's time is over: then the conductor lands all robots, and lets none in again."""
-        return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
+    def _settle(self, reason: Callable[[float], str], limit_s: float) -> tuple[float, str]:
+        """Wait until there has been no `reason` against it for a while; return since when, else the last reason.
+
+        Args:
+            reason: By the time since the common start [s].
+            limit_s: Since the common start, or `FORM_S` since the leader began to drive: with avoidance, robots need up
+                to 35 s to come up with it, without any fault.
+        """
+        since, last = None, ""
+        while True:
+            t, now = self._poll(), time.monotonic()
+            why = reason(t)
+            since, last = None if why else (since or now), why or last
+            if since is not None and now >= since + SETTLED_S:
+                return since, ""
+            driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
+            if t > max(limit_s, driven + FORM_S) and why:
+                return now, last
 
     def _judge(self, now: float) -> None:
         """Add new violations to the active fault, or to the round."""
@@ -235,125 +255,91 @@ class ChaosRound:
         target = self._wrong if self._now is None else self._now.violations
         target += [each for each in wrong if each not in target]
 
-    def _inject_next(self, t: float, now: float) -> bool:
-        """Inject the next fault when its time has come; False if the round is over."""
-        if self._well is None:
-            live = self._observer.running()
-            formed = bool(live) and not self._not_in_formation(live, now - FRESH_S, t)
-            self._formed_since = (self._formed_since or now) if formed else None
-            if self._formed_since is not None and now - self._formed_since >= SETTLED_S:
-                self._well = now
-            elif t > FORM_S:
-                why = self._not_in_formation(live, now - FRESH_S, t)
-                self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
-                return False
-            return True
-        return now < self._well + self._left[0].after_s or self._begin(t, now)
-
-    def _begin(self, t: float, now: float) -> bool:
-        """Inject the next fault; False if too few robots are left for it."""
-        running = self._observer.running() - self._dead.keys()
-        if len(running) < FEWEST:
-            return False
-        fault = self._left.pop(0)
-        victim = fault.victim
+    def _do(self, fault: Fault, t: float, running: set[str]) -> None:
+        """Inject a fault, lift it when its time is over, and wait until all is well."""
+        observer, victim = self._observer, fault.victim
         if victim:
-            order = [*self._observer.invariants.names, *self._observer.invariants.names]
-            victim = next(name for name in order[order.index(victim) :] if name in running)
-        before = self._observer.invariants.position.copy()
-        note = self._injector.begin(fault, victim, self._observer.session, self._observer.keys)
+            names = observer.invariants.names
+            victim = next(name for name in (*names, *names)[names.index(victim) :] if name in running)
+        observer.orders.clear()
+        last = {name: status.incidents[-1].seq for name, status in observer.status.items() if status.incidents}
+        active = self._now = _ActiveFault(fault, victim, time.monotonic(), t, running, len(self._events), last)
+        active.note = self._injector.begin(fault, victim)
         if fault.kind == "kill":
-            self._dead[victim] = now
+            self._dead[victim] = active.begun
         self._disk_full |= fault.kind == "disk"
         self._conductor_dead = fault.kind == "conductor"
-        self._observer.orders.clear()
-        last = {name: status.incidents[-1].seq for name, status in self._observer.status.items() if status.incidents}
-        events = len(self._events)
-        self._now = _ActiveFault(fault, victim, now, note, before, there=running, events=events, incidents=last)
-        self._at = t
-        if fault.kind == "conductor":
-            self._watch_landing(self._now)
-        return True
-
-    def _lift_fault(self, active: _ActiveFault, t: float, now: float) -> None:
-        """Lift the fault when its time is over, and wait until all is well."""
-        fault = active.fault
-        if fault.kind in ("freeze", "partition") and active.lifted is None:
-            self._hold(active, now)
-        if active.lifted is None and now >= active.begun + fault.lasts_s:
-            self._injector.end(fault)
-            active.lifted = time.monotonic()
-        if active.lifted is None:
-            return
-        why = self._not_recovered(active, t, now)
-        active.why = why or active.why
-        active.well_since = None if why else (active.well_since or now)
-        settled = active.well_since is not None and now - active.well_since >= SETTLED_S
-        # with avoidance, robots need up to 35 s to come up with a leader that drives, without any fault
-        driven = max((leg.at_s for leg in self._setting.experiment.timeline if leg.at_s <= t), default=-math.inf)
-        if not settled and (now < active.lifted + HEAL_S + fault.properties.heals_s or t < driven + FORM_S):
-            return
-        if not settled:
-            active.violations.append(f"not well {now - active.lifted:.0f} s later: {active.why}")
-        self._close(active, active.well_since)
-
-    def _close(self, active: _ActiveFault, well: float | None) -> None:
-        now = time.monotonic()
-        well = now if well is None else well
-        if active.fault.kind == "read-error":
-            self._dead[active.victim] = now
+        while time.monotonic() < active.begun + fault.lasts_s:
+            t = self._poll()
+            if fault.kind in ("freeze", "partition"):
+                self._check_held(active)
+        self._injector.end(fault)
+        active.lifted = time.monotonic()
+        well, why = self._settle(partial(self._not_recovered, active), t + HEAL_S + fault.properties.heals_s)
+        if why:
+            active.violations.append(f"not well {well - active.lifted:.0f} s later: {why}")
+        if fault.kind == "read-error":
+            self._dead[victim] = time.monotonic()
         left = set() if self._conductor_dead or self._run_is_over() else active.there - self._dead.keys()
         down = [name for name in sorted(left) if self._is_down(name)]
-        reasons = [f"{name}: {self._observer.status[name].reason}" for name in down]
+        reasons = [f"{name}: {observer.status[name].reason}" for name in down]
         outcome = FaultResult(
             self._number,
-            active.fault,
-            active.victim,
-            round(self._at, 2),
+            fault,
+            victim,
+            round(active.at_s, 2),
             "; ".join(filter(None, (active.note, *reasons))),
-            not any(text.startswith("not well") for text in active.violations),
+            not why,
             round(well - active.begun, 3),
-            round(max(0.0, well - (active.lifted or active.begun)), 3),
+            round(max(0.0, well - active.lifted), 3),
             bool(down),
-            list(active.violations),
+            active.violations,
         )
         self.outcomes.append(outcome)
-        self._now, self._well = None, now
-        self._say(line(outcome))
-
-    def _unfinished(self, active: _ActiveFault) -> None:
-        """Put a fault back whose recovery was not observed before the run ended."""
-        if active.violations:
-            self._wrong += [f"{active.fault.kind} {active.victim}: {text}" for text in active.violations]
-        self._left.insert(0, active.fault)
         self._now = None
+        self._setting.say(line(outcome))
 
-    def _hold(self, active: _ActiveFault, now: float) -> None:
+    def _run_is_over(self) -> bool:
+        """Whether the run's time is over: then the conductor lands all robots, and lets none in again."""
+        return time.monotonic() - (self._started or 0.0) > self._setting.experiment.duration_s - NOTICE_S
+
+    def _check_held(self, active: _ActiveFault) -> None:
         """Check that the body of a victim stops soon, for no process steers it."""
-        if now < active.begun + NOTICE_S or not self._observer.connected:
+        if time.monotonic() < active.begun + NOTICE_S or not self._observer.connected:
             return
         if active.held_at is None:
             active.held_at = self._observer.invariants.where(active.victim)
         if self._observer.moved(active.victim, active.held_at) > HELD_M:
             active.add_violation(f"{active.victim} moved although no process steered it")
 
-    def _not_recovered(self, active: _ActiveFault, t: float, now: float) -> str:
+    def _not_recovered(self, active: _ActiveFault, t: float) -> str:
         """Reason why the run is not yet as it was; empty if it is."""
+        if self._conductor_dead:
+            return self._not_landed()
         live = self._observer.running() - self._dead.keys()
         check = getattr(self, f"_after_{active.fault.kind.replace('-', '_')}", self._after_any)
         away = active.there - live - self._dead.keys() - {active.victim}
         away = {name for name in away if self._observer.invariants.in_the_air(name) or not self._is_down(name)}
+        since = max(active.lifted, time.monotonic() - FRESH_S)
         return (
             check(active, live)
             or (f"{', '.join(sorted(away))}: not back" if away else "")
-            or self._not_in_formation(live, max(active.lifted or now, now - FRESH_S), t)
+            or self._not_in_formation(live, since, t)
         )
+
+    def _not_landed(self) -> str:
+        """Reason why robots without a conductor are not down yet; empty if they are."""
+        observer = self._observer
+        up = [name for name in observer.invariants.names if observer.invariants.in_the_air(name)]
+        asked = observer.status.keys() - self._dead.keys()
+        awake = sorted(name for name in asked if observer.status[name].phase != "done")
+        return f"in the air {up}, not done {awake}" if up or awake else ""
 
     # ------------------------------------------------------------------ checks by kind: why it is not well yet
 
     def _after_any(self, active: _ActiveFault, live: Set[str]) -> str:
         if active.victim:
-            return self._not_back(active.victim, live, active.lifted or active.begun)
+            return self._not_back(active.victim, live, active.lifted)
         ended = active.fault.properties.reported
         if ended and not any(event.kind.startswith(ended) and "ended" in event.text for event in self._events):
             return f"the end of the {ended} is not reported"
@@ -392,7 +378,7 @@ class ChaosRound:
                 return f"the loss of {victim} is not reported"
             self._off.add(victim)
             active.restarted = time.monotonic()
-            self._injector.restart(victim, self._observer.session, self._observer.keys)
+            self._injector.restart(victim)
         if (
             why := self._injector.answer.reason or self._injector.answer.refused.get(victim)
         ) and not self._run_is_over():
@@ -460,6 +446,10 @@ class ChaosRound:
             return f"{victim} has not come down yet" if self._observer.invariants.in_the_air(victim) else ""
         return "" if victim in live else f"{victim} is not back"
 
+    def _not_formed(self, t: float) -> str:
+        """Reason why running robots are not in formation."""
+        return self._not_in_formation(self._observer.running(), time.monotonic() - FRESH_S, t)
+
     def _not_in_formation(self, live: Set[str], since: float, t: float) -> str:
         """Reason why living robots are not in formation: silent since then, missing each other, or elsewhere."""
         if not live and not self._dead:
@@ -473,31 +463,11 @@ class ChaosRound:
         error = self._observer.invariants.formation_error(live, t)
         return f"a link is {error:.3f} off" if error > self._setting.experiment.tolerance else ""
 
-    def _watch_landing(self, active: _ActiveFault) -> None:
-        """The conductor is dead: robots land by themselves, and everything ends."""
-        active.lifted = active.begun
-        deadline = active.begun + LANDED_S
-        names = set(self._setting.experiment.robots) - self._dead.keys()
-        while time.monotonic() < deadline:
-            time.sleep(POLL_S)
-            self._observer.update()
-            active.violations += [each for each in self._observer.violations() if each not in active.violations]
-            down = [self._observer.status[name].phase == "done" for name in names if name in self._observer.status]
-            if all(down) and not any(map(self._observer.invariants.in_the_air, self._observer.invariants.names)):
-                break
-        else:
-            up = [name for name in self._observer.invariants.names if self._observer.invariants.in_the_air(name)]
-            awake = [
-                name for name in names if name in self._observer.status and self._observer.status[name].phase != "done"
-            ]
-            active.violations.append(f"not well {LANDED_S:g} s later: in the air {up}, not done {awake}")
-        self._close(active, time.monotonic())
-
     # ------------------------------------------------------------------ the end
 
-    def _finish(self, watched: WatchedRun) -> float:
+    def _finish(self) -> float:
         """End the run if it has not ended; return the time until all its processes had ended [s]."""
-        began = time.monotonic()
+        watched, began = self._watched, time.monotonic()
         if watched.process.alive:
             watched.close()
         deadline = began + LANDED_S
@@ -521,9 +491,9 @@ class ChaosRound:
         ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
         return round(missed / (ticks + missed), 4) if ticks else 0.0
 
-    @staticmethod
-    def _sweep(watched: WatchedRun) -> None:
-        """Kill what is left of the run, whatever happened."""
-        for pid in watched.processes():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+
+def _sweep(watched: WatchedRun) -> None:
+    """Kill what is left of the run, whatever happened."""
+    for pid in watched.processes():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)

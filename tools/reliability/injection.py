@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import zenoh
 
 from agents.network import messages
-from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
-from experiments.real_time.hosts.launcher import Launcher, Process
+from experiments.real_time.hosts.launcher import Launcher, Process, tagged
 from tools.reliability.cables import Cables
 from tools.reliability.fault_script import Fault
-from tools.reliability.run_process import PROC, WatchedRun
+from tools.reliability.observer import Observer
+from tools.reliability.run_process import WatchedRun
 from tools.reliability.spoilt_process import Switch
 
 GARBAGE: Final = 20  # payloads of nonsense at a time, on each key of a victim
@@ -35,21 +34,23 @@ class Injector:
         watched: WatchedRun,
         launcher: Launcher,
         cables: Cables,
+        observer: Observer,
+        *,
         folder: Path,
         random: np.random.Generator,
-        *,
         groups: Mapping[str, str],
         recording: Path,
     ) -> None:
         """No fault is done yet."""
         self._watched, self._launcher, self._cables = watched, launcher, cables
+        self._session, self._keys = observer.session, observer.keys
         self._folder, self._random, self._groups, self._recording = folder, random, groups, recording
         self._stopped: list[int] = []
         self._switches: dict[str, Switch] = {}
         self.second: Process | None = None  # second process of a name
         self.answer = messages.RunReply()  # to the last restart
 
-    def begin(self, fault: Fault, victim: str, session: zenoh.Session, keys: Keys) -> str:
+    def begin(self, fault: Fault, victim: str) -> str:
         """Inject a fault; return a note for the report.
 
         Args:
@@ -73,7 +74,7 @@ class Injector:
             return f"{direction * size:+g} s"
         if kind == "disk":
             return self._fill()
-        return f"{self.spoil(victim, session, keys)} payloads of nonsense" if kind == "corrupt" else ""
+        return f"{self._spoil(victim)} payloads of nonsense" if kind == "corrupt" else ""
 
     def end(self, fault: Fault) -> None:
         if fault.kind == "mocap-clock":
@@ -81,12 +82,12 @@ class Injector:
         elif fault.lasts_s:
             self.release()
 
-    def restart(self, victim: str, session: zenoh.Session, keys: Keys) -> None:
+    def restart(self, victim: str) -> None:
         """Have the conductor start a robot again; do not wait for that."""
         order = messages.RunOrder("restart", [victim], who="chaos")
 
         def ask() -> None:
-            self.answer = orders.send_run_order(session, keys, order)
+            self.answer = orders.send_run_order(self._session, self._keys, order)
 
         self.answer = messages.RunReply()
         threading.Thread(target=ask, name="restart", daemon=True).start()
@@ -99,27 +100,26 @@ class Injector:
         self._stopped = []
         self._cables.mend()
 
-    def spoil(self, victim: str, session: zenoh.Session, keys: Keys) -> int:
+    def _spoil(self, victim: str) -> int:
         """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
+        keys = self._keys
         read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
         targets = [key(victim) for key in read]
         for key in targets:
             for _ in range(GARBAGE):
-                session.put(key, self._malformed_payload(victim), encoding=messages.JSON)
+                self._session.put(key, self._malformed_payload(victim), encoding=messages.JSON)
         return GARBAGE * len(targets)
 
     def _malformed_payload(self, victim: str) -> bytes:
-        kind = int(self._random.integers(5))
-        if kind == 0:
-            return self._random.bytes(int(self._random.integers(1, 400)))
-        if kind == 1:
-            return b"[" * 10_000
-        if kind == 2:
-            return b'{"robot": "' + victim.encode() + b'", "seq": 1e999, "stamp": -1, "position": [1e308, 0, 0]}'
-        if kind == 3:
-            return b"x" * 100_000
         whole = messages.encode(messages.pose(victim, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
-        return whole[: int(self._random.integers(len(whole)))]
+        payloads = (
+            self._random.bytes(int(self._random.integers(1, 400))),
+            b"[" * 10_000,
+            b'{"robot": "' + victim.encode() + b'", "seq": 1e999, "stamp": -1, "position": [1e308, 0, 0]}',
+            b"x" * 100_000,
+            whole[: int(self._random.integers(len(whole)))],
+        )
+        return payloads[int(self._random.integers(len(payloads)))]
 
     def _switch(self, name: str) -> Switch:
         return self._switches.setdefault(name, Switch(self._folder / name))
@@ -127,8 +127,8 @@ class Injector:
     def _start_duplicate(self, victim: str) -> Process:
         """A second process of a name: the same command again."""
         pid = self._running(victim)[0]
-        words = (PROC / str(pid) / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
         tag = self._watched.tag
+        words = dict(tagged(tag))[pid][:-1]  # the last one is empty
         return self._launcher.spawn(f"double-{victim}-{pid}-{time.monotonic_ns()}", ["env", tag, *words])
 
     def _fill(self) -> str:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from experiments.report.page import Finding, Section, Table, date_of, render
+from experiments.report.page import Finding, Mark, Section, Table, date_of, render
 from experiments.report.page import Row as Line
 
 PAGE: Final = "soak.html"
@@ -75,17 +75,19 @@ class Soaked:
 class Ends:
     """Rows of a process after the warm-up: first and last window."""
 
-    first: Sequence[Row]  # of the first window
-    last: Sequence[Row]  # of the last window
+    first: Sequence[Row]
+    last: Sequence[Row]
 
-    def growth(self, what: Callable[[Row], float]) -> float:
-        """Growth of the median, as a share of the first."""
-        first, last = (statistics.median(map(what, rows)) for rows in (self.first, self.last))
+    def over(self, what: Callable[[Iterable[float]], float], field: str) -> tuple[float, float]:
+        """A statistic of a field in both windows."""
+        first, last = (what(getattr(row, field) for row in rows) for rows in (self.first, self.last))
+        return first, last
+
+    @property
+    def growth(self) -> float:
+        """Growth of the memory, as a share of the first."""
+        first, last = self.over(statistics.median, "rss_mb")
         return last / first - 1.0 if first else 0.0
-
-    def more(self, what: Callable[[Row], int]) -> int:
-        """Growth of the maximum."""
-        return max(map(what, self.last)) - max(map(what, self.first))
 
 
 def ends(soaked: Soaked) -> dict[str, Ends]:
@@ -101,15 +103,38 @@ def ends(soaked: Soaked) -> dict[str, Ends]:
 
 def judge(soaked: Soaked) -> list[Finding]:
     """The verdict; bad findings fail it."""
-    both = ends(soaked)
-    return [
-        *_alive(soaked),
-        *_memory(soaked, both),
-        *_handles(both),
-        *_losses(soaked),
-        *_delays(soaked, both),
-        *_punctual(soaked),
-    ]
+    both, sampled = ends(soaked), soaked.by_process()
+    last = {process: rows[-1] for process, rows in sampled.items()}
+    found = [*_alive(soaked, sampled), _memory(soaked, both)]
+
+    def add(wrong: str, right: str) -> None:
+        found.append(Finding("bad", wrong) if wrong else Finding("good", right))
+
+    for what, field in (("threads", "threads"), ("file descriptors", "files")):
+        counts = {process: each.over(max, field) for process, each in both.items()}
+        grown = ", ".join(
+            f"{process} +{after - before}" for process, (before, after) in counts.items() if after > before
+        )
+        add(grown and f"{what} grow: {grown}", f"{what} do not grow")
+    lost = ", ".join(f"{process} {row.lost}" for process, row in last.items() if row.lost)
+    received = sum(row.heard or 0 for row in soaked.rows)
+    untested = "" if received else "no pose was received: nothing was tested"
+    add(f"lost poses: {lost}" if lost else untested, f"0 of {received} poses were lost")
+    if malformed := sum(row.malformed or 0 for row in last.values()):
+        found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
+    early = [row.delay_s for each in both.values() for row in each.first if row.delay_s is not None]
+    late = [row.delay_s for each in both.values() for row in each.last if row.delay_s is not None]
+    if early and late:
+        before, after = statistics.median(early), statistics.median(late)
+        longest = max(row.longest_s or 0.0 for row in soaked.rows)
+        text = f"{1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
+        slow = after > max(SLOWER * before, DELAY_S)
+        found.append(Finding("bad" if slow else "good", f"delay of poses: {text}"))
+    missed, ticks = (sum(getattr(row, field) or 0 for row in last.values()) for field in ("missed", "ticks"))
+    if ticks:
+        mark: Mark = "good" if missed < 0.01 * ticks else "fair"
+        found.append(Finding(mark, f"{missed} of {ticks} ticks were missed ({100.0 * missed / ticks:.3f} %)"))
+    return found
 
 
 def passed(findings: Sequence[Finding]) -> bool:
@@ -117,9 +142,8 @@ def passed(findings: Sequence[Finding]) -> bool:
     return all(finding.mark != "bad" for finding in findings)
 
 
-def _alive(soaked: Soaked) -> list[Finding]:
+def _alive(soaked: Soaked, sampled: Mapping[str, Sequence[Row]]) -> list[Finding]:
     lasted = max((row.time_s for row in soaked.rows), default=0.0)
-    sampled = soaked.by_process()
     bad = [f"{name} ended after {at:.0f} s" for name, at in soaked.died.items()]
     bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled and name not in soaked.died]
     if soaked.exit != 0:
@@ -131,70 +155,18 @@ def _alive(soaked: Soaked) -> list[Finding]:
     return [Finding("good", f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes")]
 
 
-def _memory(soaked: Soaked, both: dict[str, Ends]) -> list[Finding]:
+def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> Finding:
     if not both:
-        return [Finding("bad", "too few samples to compare beginning and end: let it run longer")]
-    grown = {process: each.growth(lambda row: row.rss_mb) for process, each in both.items()}
+        return Finding("bad", "too few samples to compare beginning and end: let it run longer")
+    grown = {process: each.growth for process, each in both.items()}
     most = max(grown, key=lambda process: grown[process])
     text = f"memory: largest growth after {soaked.warm_s:.0f} s is {100 * grown[most]:+.2f} % ({most})"
     if soaked.duration_s < JUDGED_S:
-        return [Finding("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")]
+        return Finding("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")
     if grown[most] <= GROWTH:
-        return [Finding("good", f"{text}, within {100 * GROWTH:g} %")]
+        return Finding("good", f"{text}, within {100 * GROWTH:g} %")
     beyond = ", ".join(f"{p} {100 * g:+.2f} %" for p, g in sorted(grown.items()) if g > GROWTH)
-    return [Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")]
-
-
-def _handles(both: dict[str, Ends]) -> list[Finding]:
-    found = []
-    counted: tuple[tuple[str, Callable[[Row], int]], ...] = (
-        ("threads", lambda row: row.threads),
-        ("file descriptors", lambda row: row.files),
-    )
-    for what, count in counted:
-        more = {process: each.more(count) for process, each in both.items()}
-        grown = ", ".join(f"{process} +{extra}" for process, extra in more.items() if extra > 0)
-        found.append(Finding("bad", f"{what} grow: {grown}") if grown else Finding("good", f"{what} do not grow"))
-    return found
-
-
-def _losses(soaked: Soaked) -> list[Finding]:
-    last = {process: rows[-1] for process, rows in soaked.by_process().items()}
-    lost = {process: row.lost for process, row in last.items() if row.lost}
-    received = sum(row.heard or 0 for row in soaked.rows)
-    malformed = sum(row.malformed or 0 for row in last.values())
-    found = []
-    if lost:
-        found.append(Finding("bad", "lost poses: " + ", ".join(f"{name} {count}" for name, count in lost.items())))
-    elif not received:
-        found.append(Finding("bad", "no pose was received: nothing was tested"))
-    else:
-        found.append(Finding("good", f"0 of {received} poses were lost"))
-    if malformed:
-        found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
-    return found
-
-
-def _delays(soaked: Soaked, both: dict[str, Ends]) -> list[Finding]:
-    first = [row.delay_s for each in both.values() for row in each.first if row.delay_s is not None]
-    last = [row.delay_s for each in both.values() for row in each.last if row.delay_s is not None]
-    longest = max((row.longest_s or 0.0 for row in soaked.rows), default=0.0)
-    if not (first and last):
-        return []
-    before, after = statistics.median(first), statistics.median(last)
-    text = (
-        f"delay of poses: {1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
-    )
-    return [Finding("bad" if after > max(SLOWER * before, DELAY_S) else "good", text)]
-
-
-def _punctual(soaked: Soaked) -> list[Finding]:
-    last = [rows[-1] for rows in soaked.by_process().values() if rows[-1].ticks]
-    ticks, missed = sum(row.ticks or 0 for row in last), sum(row.missed or 0 for row in last)
-    if not ticks:
-        return []
-    share = 100.0 * missed / ticks
-    return [Finding("good" if share < 1.0 else "fair", f"{missed} of {ticks} ticks were missed ({share:.3f} %)")]
+    return Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
 
 
 # ---------------------------------------------------------------------- the page
@@ -224,20 +196,17 @@ def table(soaked: Soaked) -> Table:
     rows = soaked.by_process()
     for process, each in sorted(ends(soaked).items()):
         last, first = each.last[-1], each.first[0]
-        lasted = last.time_s - first.time_s
-        share = 100.0 * (last.cpu_s - first.cpu_s) / lasted if lasted > 0.0 else 0.0
+        share = 100.0 * (last.cpu_s - first.cpu_s) / max(last.time_s - first.time_s, 1e-9)
         delays = [row.delay_s for row in rows[process] if row.delay_s is not None]
-        memory = [statistics.median(row.rss_mb for row in window) for window in (each.first, each.last)]
+        counts = ("–" if count is None else str(count) for count in (last.lost, last.missed))
         cells = (
             process,
-            f"{memory[0]:.1f}",
-            f"{memory[1]:.1f}",
-            f"{100 * each.growth(lambda row: row.rss_mb):+.2f} %",
+            *(f"{memory:.1f}" for memory in each.over(statistics.median, "rss_mb")),
+            f"{100 * each.growth:+.2f} %",
             str(last.threads),
             str(last.files),
             f"{share:.1f} %",
-            "–" if last.lost is None else str(last.lost),
-            "–" if last.missed is None else str(last.missed),
+            *counts,
             f"{1e3 * statistics.median(delays):.2f}" if delays else "–",
         )
         lines.append(Line(cells))
