@@ -40,21 +40,15 @@ class ControlView(View):
         self.predictor, self._anchored = HOLD, anchored
         self.links, self._last, self.now, self._law, self._errors = links, last, now, law, errors
 
-    @cached_property
-    def offset(self) -> Array:
-        return self._law()
-
-    @cached_property
-    def _both_errors(self) -> tuple[Array, Array]:
-        return self._errors()
-
-    @property
-    def error(self) -> Array:  # type: ignore[override]
-        return self._both_errors[0]
-
-    @property
-    def energy(self) -> Array:  # type: ignore[override]
-        return self._both_errors[1]
+    def __getattr__(self, name: str) -> Array:
+        """Offset, error and energy, on first use."""
+        if name == "offset":
+            self.offset = self._law()
+        elif name in {"error", "energy"}:
+            self.error, self.energy = self._errors()
+        else:
+            raise AttributeError(f"a view has no '{name}'")
+        return np.asarray(getattr(self, name))
 
     @cached_property
     def deviation(self) -> Array:

@@ -53,13 +53,9 @@ class Transmitter:
     ) -> Transmission:
         """Transmission at `t` [s]; rows without a known position do not transmit. For the arguments see `View`.
 
-        `setpoint` (N, 4) is the last command to the bodies, NaN for rows that their bodies drive by themselves; used
-        where the trigger smooths.
-
-        An unknown velocity is transmitted as NaN, and counts as 0 for trigger and smoothing, as the neighbours assume.
-
-        Raises:
-            PluginError: If the trigger fails; the error names it.
+        `setpoint` (N, 4) is the last command to the bodies, NaN for rows that their bodies drive by themselves. An
+        unknown velocity is transmitted as NaN, and counts as 0 for trigger and smoothing, as the neighbours assume.
+        Raises PluginError, which names the trigger, if it fails.
         """
         trigger = self.trigger
         unknown: Index | None = None
@@ -71,10 +67,7 @@ class Transmitter:
             if self._smoothed is None:
                 self._smoothed = LowPass(len(position), self._kinds)
             position, velocity = self._smoothed.smooth(t, position, velocity, trigger.smoothing_s, setpoint)
-        view = View(
-            t, position, velocity, self.last_event,
-            error=error, energy=energy, start=start, offset=offset, predictor=self._predictor,
-        )  # fmt: skip
+        view = View(t, position, velocity, self.last_event, error, energy, start, offset, self._predictor)
         rows = due_rows(trigger, view, self._state)
         if len(rows):
             valid = np.isfinite(position if len(rows) == len(position) else position[rows])

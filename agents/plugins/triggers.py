@@ -55,6 +55,7 @@ class LastEvent:
         self.offset[rows], self.energy[rows] = view.offset[rows], view.energy[rows]
 
 
+@dataclass(eq=False)
 class View:
     """Quantities that a trigger may use, in rows (N); the costly ones are computed on first use."""
 
@@ -65,24 +66,8 @@ class View:
     error: Array  # (N,) Σ|e| of its links, as the row itself knows them [m]
     energy: Array  # (N,) edge potential Σ ½e² of its links [m²]
     start: Array  # (N,) start of each row in the experiment [s]
-    predictor: Predictor  # of the neighbours
-
-    def __init__(
-        self,
-        t: float,
-        position: Array,
-        velocity: Array,
-        last_event: LastEvent,
-        *,
-        error: Array,
-        energy: Array,
-        start: Array,
-        offset: Array,
-        predictor: Predictor = HOLD,
-    ) -> None:
-        self.t, self.position, self.velocity, self.last_event = t, position, velocity, last_event
-        self.error, self.energy, self.start, self.predictor = error, energy, start, predictor
-        self._offset = offset
+    offset: Array  # (N, 3) u of the law [m]: of the last decision; for control, as it would be now
+    predictor: Predictor = HOLD  # of the neighbours
 
     @property
     def since_event(self) -> Array:
@@ -93,11 +78,6 @@ class View:
     def since_start(self) -> Array:
         """(N,) time since the row's start in the experiment [s], 0 before."""
         return np.maximum(self.t - self.start, 0.0)
-
-    @property
-    def offset(self) -> Array:
-        """(N, 3) u of the law [m]: of the last decision; for control, as it would be now."""
-        return self._offset
 
     @cached_property
     def believed(self) -> Array:
