@@ -161,11 +161,7 @@ class Agent:
     def start(self, row: int, at: float, t: float = -np.inf, origin: Setpoint | None = None) -> str:
         """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
 
-        Args:
-            row: Of the robot.
-            at: Common start [s].
-            t: Now [s].
-            origin: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: it begins anew.
+        `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: it begins anew.
         """
         waits = self.lifecycle.phase[row] == AIRBORNE
         refusal = self.lifecycle.start(row, at)

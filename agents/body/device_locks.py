@@ -38,11 +38,7 @@ class Claims:
         self._locks: dict[Path, int] = {}  # open files
 
     def take(self) -> None:
-        """Locks all devices, or none; before the first byte goes to a device.
-
-        Raises:
-            BodyError: If a process has one of them, with the address and that process; or if the folder cannot be had.
-        """
+        """Locks all devices, or none, before the first byte goes to one; raises BodyError with the holder."""
         try:
             for name, address in self._wanted:
                 path = runtime_folder() / f"device-{hashlib.sha256(address.encode()).hexdigest()[:32]}.lock"

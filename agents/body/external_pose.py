@@ -21,11 +21,7 @@ def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
     """The velocity estimate after one more measured position: a low-pass with `SMOOTHING_S` on the difference quotient.
 
     Used for motion capture and odometry. White noise σ of the positions makes σ / `SMOOTHING_S` of noise, at any rate.
-
-    Args:
-        velocity: The estimate before, any shape [m/s].
-        moved: Measured position less the one before [m].
-        since: Time between the two, above 0 [s].
+    The position `moved` [m] in `since` [s], above 0; velocities [m/s] of any shape.
     """
     share = since / (SMOOTHING_S + since)
     return velocity + share * (moved / since - velocity)

@@ -101,9 +101,7 @@ class Fleet:
 def assemble(request: BodyRequest) -> Body:
     """The bodies for the addresses of a request; without a fleet if one body carries all rows.
 
-    Raises:
-        plugins.UnknownPlugin: If no body of that name is installed.
-        BodyError: If a body cannot carry these rows.
+    Raises registry.UnknownPlugin if a body is not installed, BodyError if one cannot carry its rows.
     """
     names = [registry.body_name(address) for address in request.addresses]
     parts = []

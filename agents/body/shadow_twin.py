@@ -140,11 +140,7 @@ def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
     """The body, made for `request`, with undisturbed twins beside it; the body itself without any.
 
     `restart_s` (n,) is the period with which the twin is put onto its robot [s]: infinite for once, NaN for robots
-    without a twin.
-
-    Raises:
-        plugins.PluginError: If no twin is installed.
-        BodyError: If there is no twin of a robot's kind.
+    without a twin. Raises registry.PluginError if no twin is installed, BodyError if there is none of a robot's kind.
     """
     rows = np.flatnonzero(~np.isnan(restart_s))
     if not len(rows):

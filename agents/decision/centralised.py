@@ -92,15 +92,10 @@ class Centre:
         return rows[~np.isfinite(poses.stamp[rows]) | (poses.lost_since[rows] < np.inf)]
 
     def decide(self, t: float, phase: Index, start: Array) -> CentreGoals:
-        """Goals at `t` [s].
+        """Goals at `t` [s], for robots in `phase` (N,), as far as known, that `start` (N,) [s].
 
         A running robot gets a goal whenever a new one was decided, and again before the last one is too old. A waiting
         robot gets its own place as goal: with this goal and poses of all its neighbours it can begin.
-
-        Args:
-            t: Now [s].
-            phase: (N,) of the robots, as far as known.
-            start: (N,) start of each robot [s].
         """
         deciding, poses, limits = self.goal_computer, self.poses, self.assignment.limits
         deciding.update_links(t)
@@ -153,13 +148,7 @@ class Guidance:
     lost_since: float  # loss of the controller [s]; infinity while it is alive
 
     def __init__(self, guided: Mask, flies: Mask, silence_s: float) -> None:
-        """Start without goals.
-
-        Args:
-            guided: (N,) rows that the controller guides.
-            flies: (N,) rows that fly; goals of the others are on the floor.
-            silence_s: Goals older than this are ignored [s].
-        """
+        """Start without goals; those on wheels are on the floor, those older than `silence_s` [s] are ignored."""
         rows = len(guided)
         self.guided, self._flies, self._silence_s = guided, flies, silence_s
         self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)

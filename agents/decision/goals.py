@@ -116,18 +116,15 @@ class GoalComputer:
             self._updating.require_update(rows)
 
     def decide(
-        self, t: float, position: Array, velocity: Array, yaw: Array, *, start: Array, running: Mask
+        self,
+        t: float,  # now [s]
+        position: Array,  # (N, 3) measured or believed [m]
+        velocity: Array,  # (N, 3) [m/s]
+        yaw: Array,  # (N,) [rad]
+        *,
+        start: Array,  # (N,) [s]
+        running: Mask,  # (N,) rows that want a goal
     ) -> GoalDecision:
-        """New goals of running rows.
-
-        Args:
-            t: Now [s].
-            position: (N, 3) measured or believed [m].
-            velocity: (N, 3) [m/s].
-            yaw: (N,) [rad].
-            start: (N,) start of each row [s].
-            running: (N,) rows that want a goal.
-        """
         follows, due, view = self._uses_law, running, None
         if self._reshaping is not None:
             everywhere = self.neighbours.extrapolate_all(self._assignment.predictor, t)

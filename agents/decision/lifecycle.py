@@ -127,14 +127,9 @@ class Lifecycle:
         return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
 
     def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> BodyCommands | None:
-        """Advance the phase of every row as far as the facts allow.
+        """Advance the phase of every row at `t` [s]: `position` (N, 3) [m], `velocity` (N, 3) [m/s], `flying` (N,).
 
-        Args:
-            t: Now, on the process's clock [s].
-            ready: (N,) nothing is missing; a ready row that loses this is idle again, unless it climbs already.
-            position: (N, 3) [m].
-            velocity: (N, 3) [m/s].
-            flying: (N,) motors on.
+        `ready` (N,): nothing is missing; a ready row that loses this is idle again, unless it climbs already.
         """
         if t < self._settled_until:
             self.moved = False

@@ -41,11 +41,7 @@ class PositionController:
     def setpoint(self, goal: Array, goal_yaw: Array, position: Array, yaw: Array) -> Array:
         """Setpoints (N, 4), in the meaning of each row's kind (see `agents.network.messages.State`).
 
-        Args:
-            goal: (N, 3) [m].
-            goal_yaw: (N,) wanted at the goal [rad], NaN for any.
-            position: (N, 3) measured [m].
-            yaw: (N,) measured [rad].
+        From `goal` (N, 3) [m], `goal_yaw` (N,) [rad], NaN for any, measured `position` (N, 3) [m] and `yaw` (N,) [rad].
         """
         setpoint = np.zeros((len(goal), 4))
         if self._any_position:

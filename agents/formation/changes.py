@@ -134,12 +134,9 @@ class Presence(Columns, frozen=True):
         return (self.since <= elapsed + ROUNDING_S) & (self.until > elapsed + ROUNDING_S) & np.isinf(self.reach)
 
     def present_now(self, elapsed: Array, apart: Array, were: Mask) -> Mask:
-        """Links (E,) that exist now.
+        """Links (E,) that exist now, of which some `were` (E,) at the last decision.
 
-        Args:
-            elapsed: (E,) time since the start on each receiver's clock [s].
-            apart: (E,) distance of the two robots [m], NaN where unknown.
-            were: (E,) links that existed at the last decision.
+        `elapsed` (E,) [s] since the start by each receiver's clock; `apart` (E,) [m] are the robots, NaN where unknown.
         """
         planned = (elapsed >= self.since - ROUNDING_S) & (elapsed < self.until - ROUNDING_S)
         near = np.isinf(self.reach) | (apart <= np.where(were, self.release, self.reach))

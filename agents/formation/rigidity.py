@@ -13,11 +13,8 @@ from agents.arrays import Array, Index, Mask
 def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) -> Array:
     """R (M, 3N): row of edge (i, j) holds (p_i − p_j)ᵀ at i and its negative at j.
 
-    Args:
-        position: (N, 3) [m].
-        pairs: (M, 2) undirected edges.
-        moves: (N, 3) free coordinates; columns of held ones (a hover height, the floor) are left out, which gives the
-            rigidity in the motions that the robots really have.
+    Robots at `position` (N, 3) [m], undirected edges `pairs` (M, 2). Columns of coordinates that are not in `moves`
+    (N, 3), such as hover heights, are left out: the rigidity is that in motions that the robots really have.
     """
     rows = len(position)
     i, j = pairs[:, 0], pairs[:, 1]

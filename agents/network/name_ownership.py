@@ -46,10 +46,8 @@ def claim(
     The decision has two rounds, before and after the token of the owner is declared. Of two processes, the one whose
     token a router got later sees the other one's in its round, so that exactly one passes both.
 
-    Raises:
-        NameTaken: If another process owns one of the names, or claimed it earlier; the tokens of a killed process are
-            given `OWNER_VANISH_S` to vanish.
-        network.Unreachable: If no router answers within `ANSWER_S`, or `stop` was set.
+    Raises NameTaken if another process owns one of the names, or claimed it earlier; the tokens of a killed process are
+    given `OWNER_VANISH_S` to vanish. Raises network.Unreachable without an answer in `ANSWER_S`, or when `stop` is set.
     """
     pause = stop or threading.Event()
     mine = str(session.zid())

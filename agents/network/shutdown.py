@@ -26,8 +26,7 @@ LEAVING: Final = "leaving the network"
 def leave(session: zenoh.Session, *declared: object, limit_s: float = LEAVE_S) -> bool:
     """Closes a session; returns whether that ended in time. If not it goes on in the background.
 
-    Args:
-        declared: Owners of entities of the session: kept until it is closed, because dropping an entity waits as well.
+    `declared` own entities of the session: kept until it is closed, because dropping an entity waits as well.
     """
     closing = threading.Thread(target=_close, args=(session, declared), name=LEAVING, daemon=True)
     closing.start()

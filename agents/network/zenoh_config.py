@@ -52,11 +52,9 @@ def settings(
 ) -> dict[str, object]:
     """Settings of every session: no multicast, no gossip, no shared memory, listening on loopback only.
 
-    With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed.
-
-    Raises:
-        EndpointError: If an endpoint is malformed, or one to listen on can be reached from outside this machine
-            although there is no lab, or the lab has no such identity, or its router no rights to enforce.
+    With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed. Raises
+    EndpointError if an endpoint is malformed, or one to listen on can be reached from outside this machine although
+    there is no lab, or the lab has no such identity, or its router no rights to enforce.
     """
     for endpoint in (*connect, *listen):
         _check_form(endpoint)

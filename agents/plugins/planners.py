@@ -25,15 +25,9 @@ class Planner(Protocol):
     """Target as a function of time."""
 
     def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """Target position and yaw of rows that began this leg `elapsed` seconds ago.
+        """Target position (R, 3) [m] and yaw (R,) [rad], NaN where any yaw will do.
 
-        Args:
-            elapsed: (R,) since the leg began, not negative [s].
-            anchor: (R, 3) where each row was then [m].
-            heading: (R,) its yaw then [rad].
-
-        Returns:
-            (R, 3) position [m] and (R,) yaw [rad], NaN where any yaw will do.
+        The rows began this leg `elapsed` (R,) [s] ago, at `anchor` (R, 3) [m] with the yaw `heading` (R,) [rad].
         """
         ...
 
@@ -200,12 +194,9 @@ class Itinerary:
         self._origin = np.full((len(rows), 4), np.nan)
 
     def target(self, t: Array, position: Array, yaw: Array) -> tuple[Array, Array]:
-        """Target position (R, 3) [m] and yaw (R,) [rad] at the rows' experiment times; NaN before the first leg.
+        """Target position (R, 3) [m] and yaw (R,) [rad] at times `t` (R,) [s]; NaN before the first leg.
 
-        Args:
-            t: (R,) experiment time [s].
-            position: (R, 3) where the rows are: anchor of the first leg.
-            yaw: (R,) [rad].
+        The first leg begins at `position` (R, 3) [m] and `yaw` (R,) [rad].
         """
         target, toward = np.full((len(self.rows), 3), np.nan), _any_yaw(len(self.rows))
         for number, leg in enumerate(self.legs):

@@ -60,10 +60,8 @@ def names(group: str) -> list[str]:
 def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on the group
     """The object registered under a name.
 
-    Raises:
-        UnknownPlugin: If there is none, with the nearest name or all of them.
-        PluginError: If two distributions register different ones under this name, or if its module fails to import,
-            with the distribution it came from and why.
+    Raises UnknownPlugin with the nearest name, or all of them; and PluginError, with the distributions, if two register
+    different ones under this name, or if the module fails to import.
     """
     known = _registered(group)
     what = group.rpartition(".")[2]
@@ -92,12 +90,7 @@ def unusable(use: Callable[[str, str], object]) -> list[str]:
 
 
 def struct(group: str, name: str) -> type[msgspec.Struct]:
-    """The struct of parameters registered under a name.
-
-    Raises:
-        UnknownPlugin: If there is none.
-        PluginError: If it fails to import, or is no frozen `msgspec.Struct`.
-    """
+    """The struct of parameters registered under a name; raises as `load`, and PluginError if it is no frozen struct."""
     plugin = load(group, name)
     origin = _origin(_registered(group)[name][0])
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
@@ -111,15 +104,9 @@ def struct(group: str, name: str) -> type[msgspec.Struct]:
 
 
 def build(group: str, choice: str | Mapping[str, Any]) -> Any:  # noqa: ANN401 - likewise
-    """The plug-in that a choice names, with its parameters.
+    """The plug-in of a choice such as `"periodic"` or `{"kind": "send-on-delta", "threshold": 0.01}`.
 
-    Args:
-        choice: `"periodic"`, or `{"kind": "send-on-delta", "threshold": 0.01}`.
-
-    Raises:
-        UnknownPlugin: If there is none of that name.
-        PluginError: If it cannot be imported or is no frozen `msgspec.Struct`.
-        msgspec.ValidationError: If a parameter is unknown, missing or out of range, with its path `$.parameter`.
+    Raises as `struct`, and msgspec.ValidationError with the path `$.parameter` of a parameter that is wrong or missing.
     """
     name, parameters = split(choice)
     return msgspec.convert(parameters, struct(group, name))

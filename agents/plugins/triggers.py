@@ -146,10 +146,7 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Rows without any event yet have one. Others have one where the condition holds, no sooner than the minimum
         interval, and in any case at the maximum silence. With `evaluate_every_s` this is periodic event-triggered
         control (Heemels, Donkers and Teel, "Periodic event-triggered control for linear systems", IEEE Transactions
-        on Automatic Control 58(4), 2013).
-
-        Raises:
-            ValueError: If `fires` does not give one bool per row.
+        on Automatic Control 58(4), 2013). Raises ValueError if `fires` does not give one bool per row.
         """
         fired = self._evaluated(view, state)
         if np.shape(fired) != view.last_event.time.shape:

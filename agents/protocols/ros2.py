@@ -175,12 +175,7 @@ def dds_token(zid: str, role: Role, topic: str, kind: str) -> str:
 
 
 def endpoints(style: Style, role: Role, topic: str, *, domain: int | None = None) -> str:
-    """Key expression of the tokens of the publishers or subscribers of a topic.
-
-    Args:
-        topic: By its full name; "*" means any.
-        domain: None means any.
-    """
+    """Key expression of the tokens of publishers or subscribers of a topic by its full name; "*", or None, for any."""
     if style == "ros2dds":
         return f"@/*/@ros2_lv/{role}/{topic.removeprefix('/').replace('/', '§')}/**"
     return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/{role}/*/*/*/{mangle(topic)}/**"

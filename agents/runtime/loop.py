@@ -90,11 +90,9 @@ class Runtime:
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
 
-        Raises:
-            BodyError: If the body cannot be opened.
-            NameTaken: If another process owns the name of a robot, or took it while this one stood still or was cut
-                off: then the body belongs to that process and is left as it is.
-            network.Unreachable: If no router answers.
+        Raises BodyError if the body cannot be opened, network.Unreachable if no router answers, and NameTaken if
+        another process owns the name of a robot, or took it while this one stood still or was cut off: then the body
+        belongs to that process and is left as it is.
         """
         lost = threading.Event()
         lifeline = Lifeline(lost, on_line=self._setup.clock.follow)

@@ -45,10 +45,7 @@ def serve(
 ) -> int:
     """Runs a router until SIGINT, SIGTERM or the loss of its lifeline; returns the exit code of the process.
 
-    Prints one line when clients can connect.
-
-    Raises:
-        EndpointError: If it cannot listen there, or the lab cannot be used.
+    Prints one line when clients can connect. Raises as `serve_router`.
     """
     stop, lost = threading.Event(), threading.Event()
     rope = Lifeline(lost)
@@ -95,11 +92,8 @@ def serve_router(
 
     When the register of its lab changes, the router restarts with the new rules: revoked certificates have no rights
     from then on. Clients reconnect by themselves. `ready` gets the router as soon as clients can connect, also after a
-    restart; the rest as of `serve`.
-
-    Raises:
-        EndpointError: If an endpoint is malformed, not on loopback though there is no lab, or taken, or if the lab
-            cannot be used.
+    restart; the rest as of `serve`. Raises EndpointError if an endpoint is malformed, not on loopback without a lab, or
+    taken, or if the lab cannot be used.
     """
     register = _register(endpoints)
     patience_s = 0.0

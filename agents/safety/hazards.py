@@ -186,13 +186,10 @@ class Hazards:
         self.incidents = []
 
     def update(self, t: float, found: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
-        """Update for one tick; returns incidents of the rows that must land or be cut now, for the first time.
+        """Update at `t` [s]; returns incidents of the rows that must land or be cut now, for the first time.
 
-        Args:
-            t: Now [s].
-            found: Causes present; a cause that is left out is present on no row.
-            active: (N,) rows that climb, wait in the air, or run: the others have no hazards.
-            landing: (N,) rows that land: they have the hazards with `Rule.landing`.
+        Hazards are for `active` rows (N,), which climb, wait in the air, or run; those with `Rule.landing` for `landing`
+        rows (N,) as well. A cause that is not among those `found` is present on no row.
         """
         if self._quiet and not found:
             return []

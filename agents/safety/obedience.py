@@ -44,10 +44,8 @@ class Continuity:
     def jumps(self, time: Array, position: Array, watched: Mask) -> Array | None:
         """Lengths (N,) [m] of the jumps of rows, NaN of those that have not; None if no row has.
 
-        Args:
-            time: (N,) of the measurement [s].
-            position: (N, 3) measured [m].
-            watched: (N,) rows in motion: the others may be carried, and begin anew unless they have jumped.
+        The `position` (N, 3) [m] was measured at `time` (N,) [s]. Rows that are not `watched` (N,), not in motion, may
+        be carried, and begin anew unless they have jumped.
         """
         moved = position - self._place
         squared = np.vecdot(moved, moved)
@@ -108,11 +106,8 @@ class Obedience:
     def update(self, t: float, setpoint: Array, position: Array, yaw: Array, watched: Mask) -> None:
         """Compare at `t` [s]; before the next sample is due nothing happens.
 
-        Args:
-            setpoint: (N, 4) of the tick before; rows of NaN have none.
-            position: (N, 3) measured [m].
-            yaw: (N,) measured [rad].
-            watched: (N,) rows that follow their setpoints, with a valid pose.
+        `setpoint` (N, 4) is that of the tick before, NaN without one; `position` (N, 3) [m] and `yaw` (N,) [rad] are
+        measured; `watched` rows (N,) follow their setpoints and have a valid pose.
         """
         if not self.due(t):
             return
