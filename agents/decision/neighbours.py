@@ -77,7 +77,7 @@ class NeighbourStates:
     incomplete: bool  # a sender is missing or lost, so that time alone can change the active links
 
     def __init__(self, links: Links, avoidance_only: Mask | None, silence_s: float) -> None:
-        """Start without poses; `avoidance_only` (E,) links never enter the law, lost ones leave it after `silence_s`."""
+        """Start without poses; `avoidance_only` (E,) links never enter the law, lost ones leave after `silence_s`."""
         self.poses = NeighbourPoses.none_received(len(links))
         self.incomplete = True
         self.clock_lag = None

@@ -188,7 +188,7 @@ class Hazards:
     def update(self, t: float, found: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
         """Update at `t` [s]; returns incidents of the rows that must land or be cut now, for the first time.
 
-        Hazards are for `active` rows (N,), which climb, wait in the air, or run; those with `Rule.landing` for `landing`
+        Hazards are for `active` rows (N,), which climb, wait aloft or run; those with `Rule.landing` for `landing`
         rows (N,) as well. A cause that is not among those `found` is present on no row.
         """
         if self._quiet and not found:
