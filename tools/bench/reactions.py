@@ -1,8 +1,8 @@
 """Reaction times of robots: to an emergency stop, to a neighbour that was killed, to one that hangs.
 
 Twenty robots run as processes of their own. The command to cut the motors is stamped where the body obeys it, by the
-monotonic clock by which the stop was sent: in the robot's own process for twins (`tools.bench.reactions_robot`), as for
-a device that is driven from there; here for external bodies, of which the bench is the far end. The knowledge of a
+monotonic clock by which the stop was sent: for twins in the robot's own process (`tools.reliability.spoilt_process`),
+as for a device that is driven from there; for external bodies here, for the bench is their far end. The knowledge of a
 death is stamped when a status, which names the missing neighbours, arrives here: one way over the router more than the
 robot itself needs.
 
@@ -19,11 +19,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from math import cos, pi, sin
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import zenoh
 from zenoh.handlers import Callback
@@ -38,6 +37,8 @@ from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.launcher import Launcher
 from tools.bench.measuring import Figure
+from tools.reliability import spoilt_process
+from tools.reliability.spoilt_process import Switch
 
 ROBOTS: Final = 20
 BODIES: Final = ("twin", "external")
@@ -63,13 +64,13 @@ def safety() -> Iterator[Figure]:
     missed = wrong = 0
     for _ in range(STOPS):
         for body, ways in stops.items():
-            with _Park(ROBOTS, body) as park:
+            with _Park(body) as park:
                 pings += park.pings()
                 taken, lost = park.stop()
                 ways.extend(taken)
                 missed, wrong = missed + lost, wrong + park.wrong()
     for _ in range(DEATHS):
-        with _Park(ROBOTS) as park:
+        with _Park() as park:
             pings += park.pings()
             # every second robot at most: both neighbours of each dead robot must live to notice
             for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
@@ -133,68 +134,35 @@ def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> 
                 publishers[name].put(messages.encode(messages.Position(name, now, (x, y, 0.0), 0.0)))
 
 
-@dataclass
-class _Arrivals:
-    """Messages with their times of arrival; filled by callbacks."""
-
-    phase: dict[str, str] = field(default_factory=dict)
-    missing: dict[tuple[str, str], float] = field(
-        default_factory=dict
-    )  # (robot, its missing neighbour) -> since [monotonic s]
-    stopped: dict[str, float] = field(default_factory=dict)  # time of the first stop by robot [monotonic s]
-
-    def status(self, sample: zenoh.Sample) -> None:
-        """Take a robot's status."""
-
-        now = time.monotonic()
-        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
-        self.phase[status.robot] = status.phase
-        for name in status.missing:
-            self.missing.setdefault((status.robot, name), now)
-
-    def command(self, sample: zenoh.Sample) -> None:
-        """Take a command to a body."""
-
-        now = time.monotonic()
-        payload = sample.payload.to_bytes()
-        if b'"action":"stop"' in payload:  # the others come two thousand times a second
-            command = messages.decode(payload, str(sample.encoding), messages.Command)
-            self.stopped.setdefault(command.robot, now)
-
-
 class _Park:
     """A run of the ring: its processes, and the far end of all bodies; robots run when it is entered."""
 
-    def __init__(self, count: int, body: str = BODIES[0]) -> None:
-        self._experiment, self._body = ring(count, body), body
+    def __init__(self, body: str = BODIES[0]) -> None:
+        self._experiment, self._body = ring(ROBOTS, body), body
         self._names = list(self._experiment.robots)
-        self._arrivals = _Arrivals()
-        self._over = threading.Event()
-        self._stack = ExitStack()
+        self._keys = Keys(self._experiment.network.realm)
         self._ended: set[str] = set()
+        self._pong, self._pinged = threading.Event(), 0.0
+        # filled by callbacks, all times are monotonic [s]
+        self._phase: dict[str, str] = {}
+        self._missing: dict[tuple[str, str], float] = {}  # (robot, its missing neighbour) -> since
+        self._stopped: dict[str, float] = {}  # first stop of an external body, by robot
+        self._cuts: dict[str, Switch] = {}  # and that of a twin
 
-    def __enter__(self) -> _Park:
-        try:
-            self._open()
-            self._await(lambda: self._all("ready"), "ready")
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._open(stack)
+            self._await("ready")
             self._order(messages.Order("takeoff"))
-            self._await(lambda: self._all("airborne"), "airborne")
+            self._await("airborne")
             self._order(messages.Order("start", at=time.time() + 0.5))
-            self._await(lambda: self._all("running"), "running")
-            self._over.wait(SETTLE_S)
-            self._arrivals.missing.clear()  # at the begin of the run no pose had been received
-        except BaseException:
-            self._over.set()
-            self._stack.close()
-            raise
+            self._await("running")
+            time.sleep(SETTLE_S)
+            self._missing.clear()  # at the begin of the run no pose had been received
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for name in self._names:  # a frozen process cannot land
-            process = self._launcher.get(name)
-            if process.alive:
-                os.kill(process.handle.pid, signal.SIGKILL)
-        self._over.set()
         self._stack.close()
 
     def pings(self) -> list[float]:
@@ -206,30 +174,26 @@ class _Park:
             self._session.put(f"{self._keys.realm}/bench/ping", str(number))
             if self._pong.wait(1.0):
                 taken.append(self._pinged - began)
-            self._over.wait(0.01)
+            time.sleep(0.01)
         return taken
 
     def stop(self) -> tuple[list[float], int]:
         """Times from an emergency stop to the command at each body [s], and the number of commands that never came."""
 
         payload = messages.encode(messages.Stop("bench", "to see how long it takes"))
-        self._arrivals.stopped.clear()
-        self._stamps.write_bytes(b"")  # a body that is opened has its motors cut
+        for cut in self._cuts.values():  # a body that is opened has its motors cut
+            cut.write(0.0)
+        self._stopped.clear()
         began = time.monotonic()
-        self._session.put(self._keys.estop, payload, encoding=messages.JSON, priority=self._urgent, express=True)
-        self._wait(lambda: len(self._stopped()) == len(self._names))
-        taken = [at - began for at in self._stopped().values()]
+        urgent = zenoh.Priority.REAL_TIME
+        self._session.put(self._keys.estop, payload, encoding=messages.JSON, priority=urgent, express=True)
+        _wait(lambda: len(self._stops()) == len(self._names), MISSED_S)
+        taken = [at - began for at in self._stops().values()]
         return taken, len(self._names) - len(taken)
 
-    def _stopped(self) -> dict[str, float]:
+    def _stops(self) -> dict[str, float]:
         """Time of the first command to cut the motors, by robot [monotonic s]."""
-        if self._body == "external":
-            return self._arrivals.stopped
-        first: dict[str, float] = {}
-        for line in self._stamps.read_text().splitlines():
-            name, at = line.split()
-            first.setdefault(name, float(at))
-        return first
+        return self._stopped | {name: at for name, cut in self._cuts.items() if (at := cut.read())}
 
     def lose(self, row: int, cause: signal.Signals) -> tuple[list[float], int]:
         """Times from the end of a robot until each of its two neighbours knows [s], and the number that never did."""
@@ -238,77 +202,87 @@ class _Park:
         self._ended.add(name)
         began = time.monotonic()
         os.kill(self._launcher.get(name).handle.pid, cause)
-        self._wait(lambda: all(pair in self._arrivals.missing for pair in around))
-        self._over.wait(0.3)  # the next measurement begins undisturbed
-        known = [self._arrivals.missing[pair] - began for pair in around if pair in self._arrivals.missing]
+        _wait(lambda: all(pair in self._missing for pair in around), MISSED_S)
+        time.sleep(0.3)  # the next measurement begins undisturbed
+        known = [self._missing[pair] - began for pair in around if pair in self._missing]
         return known, len(around) - len(known)
 
     def wrong(self) -> int:
         """Number of reports that a robot is missing which is there."""
-        return sum(name not in self._ended for _, name in self._arrivals.missing)
+        return sum(name not in self._ended for _, name in self._missing)
 
     # ------------------------------------------------------------------ processes and sessions
 
-    def _open(self) -> None:
-        self._urgent = zenoh.Priority.REAL_TIME
-        self._keys: Keys = Keys(self._experiment.network.realm)
-        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
-        self._stamps = folder / "stamps"
-        self._stamps.touch()
-        self._launcher: Launcher = self._stack.enter_context(Launcher(folder / "logs"))
+    def _open(self, stack: ExitStack) -> None:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        self._launcher = stack.enter_context(Launcher(folder / "logs"))
+        stack.callback(self._kill)
         file = folder / "ring.json"
         file.write_bytes(write_json(self._experiment))
         endpoints = [free_endpoint(0)]
         start_router(self._launcher, endpoints)
-        self._session = self._stack.enter_context(network.open_session(endpoints, name="bench"))
-        listener = self._stack.enter_context(network.open_session(endpoints, name="bench listens"))
-        self._pong, self._pinged = threading.Event(), 0.0
+        self._session = stack.enter_context(network.open_session(endpoints, name="bench"))
+        listener = stack.enter_context(network.open_session(endpoints, name="bench listens"))
         callbacks: dict[str, Callable[[zenoh.Sample], None]] = {
-            self._keys.status("*"): self._arrivals.status,
-            self._keys.setpoint("*"): self._arrivals.command,
-            f"{self._keys.realm}/bench/ping": self._pong_arrived,
+            self._keys.status("*"): self._take_status,
+            self._keys.setpoint("*"): self._take_command,
+            f"{self._keys.realm}/bench/ping": self._take_pong,
         }
         self._held = [
             listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in callbacks.items()
         ]
-        external = self._body == "external"
-        if external:
+        start = ["experiments.real_time.processes.robot"]
+        if self._body == "external":
             # in a process of its own: arriving messages would wait for an interpreter that is busy with this
             starts = {name: tuple(robot.start) for name, robot in self._experiment.robots.items()}
-            far_end = get_context("spawn").Process(
-                target=places, args=(endpoints[0], self._keys.realm, starts), daemon=True
-            )
+            arguments = (endpoints[0], self._keys.realm, starts)
+            far_end = get_context("spawn").Process(target=places, args=arguments, daemon=True)
             far_end.start()
-            self._stack.callback(far_end.join)
-            self._stack.callback(far_end.terminate)
-        start = (
-            ("experiments.real_time.processes.robot",)
-            if external
-            else ("tools.bench.reactions_robot", str(self._stamps))
-        )
+            stack.callback(far_end.join)
+            stack.callback(far_end.terminate)
+        else:
+            self._cuts = {name: Switch(folder / f"cut-{name}") for name in self._names}
+            start = [spoilt_process.MODULE, str(folder), *start]
         for name in self._names:
             self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
 
-    def _pong_arrived(self, _sample: zenoh.Sample) -> None:
+    def _kill(self) -> None:
+        """Kill the robots: a frozen process cannot land."""
+        for name in self._names:
+            if (process := self._launcher.get(name)).alive:
+                os.kill(process.handle.pid, signal.SIGKILL)
+
+    def _take_status(self, sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
+        self._phase[status.robot] = status.phase
+        for name in status.missing:
+            self._missing.setdefault((status.robot, name), now)
+
+    def _take_command(self, sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        payload = sample.payload.to_bytes()
+        if b'"action":"stop"' in payload:  # the others come two thousand times a second
+            command = messages.decode(payload, str(sample.encoding), messages.Command)
+            self._stopped.setdefault(command.robot, now)
+
+    def _take_pong(self, _sample: zenoh.Sample) -> None:
         self._pinged = time.monotonic()
         self._pong.set()
 
-    def _all(self, phase: str) -> bool:
-        return all(self._arrivals.phase.get(name) == phase for name in self._names)
+    def _await(self, phase: str) -> None:
+        if not _wait(lambda: all(self._phase.get(name) == phase for name in self._names), PATIENCE_S):
+            raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {phase}: {self._phase}")
 
     def _order(self, order: messages.Order) -> None:
         for name, reply in orders.send_order(self._session, self._keys, self._names, order).items():
             if not reply.ok:
                 raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")
 
-    def _await(self, true: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while not true():
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {what}: {self._arrivals.phase}")
-            self._over.wait(0.02)
 
-    def _wait(self, true: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + MISSED_S
-        while not true() and time.monotonic() < deadline:
-            self._over.wait(0.01)
+def _wait(true: Callable[[], bool], limit_s: float) -> bool:
+    """Wait until something is true; False if it is not in time."""
+    deadline = time.monotonic() + limit_s
+    while not (over := true()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return over

@@ -7,6 +7,7 @@ writes and the processes of the run map into memory. Stamps of the network libra
     clock, clock-ROLE   how much more the wall clock of all processes, or of those with that role, reads [s]
     lease               lease that a router announces [s]; 0: its own
     read-ROBOT          not 0: reading the body of that robot raises
+    cut-ROBOT           when its twin cut the motors, by the machine's monotonic clock [s]; only if the file is there
 """
 
 from __future__ import annotations
@@ -81,18 +82,20 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
         _announce(Switch(folder / "lease").read())
     elif ROBOT in words:
         _break_body([Switch(folder / f"read-{name}") for name in role.split("+")])
+        if (file := folder / f"cut-{role}").exists():
+            _stamp_stops(Switch(file))
 
 
 def _announce(lease_s: float) -> None:
-    from agents.network import zenoh_config  # noqa: PLC0415 - not in every process
+    from agents.network import zenoh_config  # not in every process
 
     if lease_s > 0.0:
         zenoh_config.settings = partial(zenoh_config.settings, lease_s=lease_s)
 
 
 def _break_body(broken: Sequence[Switch]) -> None:
-    from agents.body.interface import BodyState  # noqa: PLC0415 - not in every process
-    from bridges.external import ExternalBody  # noqa: PLC0415
+    from agents.body.interface import BodyState  # not in every process
+    from bridges.external import ExternalBody
 
     read = ExternalBody.read
 
@@ -102,6 +105,19 @@ def _break_body(broken: Sequence[Switch]) -> None:
         return read(body, t)
 
     ExternalBody.read = failing  # type: ignore[assignment, method-assign]
+
+
+def _stamp_stops(stamp: Switch) -> None:
+    from agents.arrays import Index  # not in every process
+    from twins.body import TwinBody
+
+    cut = TwinBody.stop
+
+    def stop(body: TwinBody, rows: Index) -> None:
+        cut(body, rows)
+        stamp.write(stamp.read() or time.monotonic())
+
+    TwinBody.stop = stop  # type: ignore[method-assign, assignment]
 
 
 if __name__ == "__main__":
