@@ -78,6 +78,18 @@ def test_trouble_ends_with_2_and_a_message(bootstrap, monkeypatch, capsys):
     assert capsys.readouterr().err == "zenpark: no core\n"
 
 
+def test_ctrl_c_waits_until_the_command_line_can_answer_it(bootstrap, monkeypatch):
+    masks = []
+    now = bootstrap.signal.pthread_sigmask
+    monkeypatch.setattr(bootstrap, "prepare", lambda level: None)
+    monkeypatch.setattr(bootstrap.os, "execve", lambda *_: masks.append(now(bootstrap.signal.SIG_BLOCK, [])))
+    try:
+        bootstrap.main(["--version"])
+    finally:
+        now(bootstrap.signal.SIG_UNBLOCK, [bootstrap.signal.SIGINT])
+    assert bootstrap.signal.SIGINT in masks[0]
+
+
 def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
     with pytest.raises(bootstrap.Trouble, match="getting it failed:\n  why\ndo this"):
         bootstrap.call(["sh", "-c", "echo why; exit 3"], {}, "getting it", "do this")

@@ -42,7 +42,8 @@ def test_ctrl_c_while_python_starts_ends_it_without_a_traceback():
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.kill(os.getpid(), signal.SIGINT)
 
-    done = subprocess.run([ROOT / "zenpark", "--version"], preexec_fn=interrupted, capture_output=True, check=False)
+    command = [sys.executable, "-m", "tools.guard", "--version"]
+    done = subprocess.run(command, cwd=ROOT, preexec_fn=interrupted, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
 
 
