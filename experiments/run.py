@@ -104,9 +104,7 @@ class Run:
         """The figures of the report by name, `width` [in] wide: 3.5 for one column, 7.16 for a whole page."""
         from experiments.report import figures  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-        traces = list(self.traces.values())
-        drawn = figures.every(list(self.metrics.values()), traces, width)
-        return Figures(drawn | figures.shadow_figures(traces, width))
+        return Figures(figures.every(list(self.metrics.values()), list(self.traces.values()), width))
 
     def __repr__(self) -> str:
         where = f" in {self.folder}" if self.folder else ""

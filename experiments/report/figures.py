@@ -94,6 +94,8 @@ def every(
         figures["robot_bars"] = robot_bars(cases, width)
     if first:
         figures["events"], figures["intervals"] = events(first, width), intervals(first, width)
+    if any(map(_rows, first)):
+        figures["shadows"] = shadows(first, width)
     return figures
 
 
@@ -410,11 +412,6 @@ PARTS: Final[tuple[tuple[str, str, Style], ...]] = (
     ("to the left", CASES[1], "--"),
     ("up", CASES[2], ":"),
 )
-
-
-def shadow_figures(traces: Sequence[Trace], width: float = WIDTH) -> dict[str, Figure]:
-    """The figures of twins beside robots by name; nothing where there are none."""
-    return {"shadows": shadows(traces, width)} if any(map(_rows, traces)) else {}
 
 
 @styled

@@ -129,9 +129,9 @@ def render(
     title: str,
     source: str,
     facts: Sequence[tuple[str, str]],
-    command: str,
     verdict: Sequence[Finding],
     sections: Sequence[Section],
+    command: str = "",
     foot: Sequence[str] | None = None,
     replay: str = "",
 ) -> Path:

@@ -14,10 +14,10 @@ import msgspec
 from experiments.metrics.measure import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.statistics import by_case
-from experiments.recording.run_folder import ORIGIN, RunOrigin, keep_origin, read_origin
+from experiments.recording.run_folder import RunOrigin, read_origin
 from experiments.recording.trace import Trace
 from experiments.recording.version import provenance
-from experiments.report import figures, replay, scenery
+from experiments.report import figures, replay
 from experiments.report.metrics_files import Band
 from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
@@ -77,27 +77,21 @@ def write(
     folder: Path,
     traces: Sequence[Trace],
     *,
-    command: str = "",
     text: str = "",
     date: str = "",
-    name: str = "report.html",
     measured: Sequence[CaseMetrics] | None = None,
     notes: Sequence[str] = (),
     run: Path | None = None,
     bands: Mapping[str, Band] | None = None,
     drawings: Mapping[str, str] | None = None,
 ) -> Path:
-    """Writes the report of one run.
-
-    The first time it also writes how and when the run was made into `run.json` in the folder of the run; a report that
-    is made again says the same.
+    """Writes the report of one run; how and when it was made is in `run.json` in its folder.
 
     Args:
         traces: The cases of the run, the reference first; several seeds of a case become means with 95 % intervals,
             and the figures of motions show the first seed.
-        command: How to do the run again; not shown if left out.
         text: The experiment file; the experiment of the first trace as JSON if left out.
-        date: When the run was, see `date_of`; now if left out.
+        date: When a run without `run.json` was, see `date_of`; now if left out.
         measured: `measure` of each trace, if that was done already; and of seeds whose traces are not known.
         notes: What the reader should know besides: a damaged recording, robots that were lost. That runs were
             interrupted is seen from the traces.
@@ -116,9 +110,9 @@ def write(
     experiment = traces[0].experiment
     seeds = sorted({case.seed for case in cases})
     folder.mkdir(parents=True, exist_ok=True)
-    made = _origin(
-        folder if run is None else run, RunOrigin(command, date or date_of(time.time()), made_by=provenance())
-    )
+    made = read_origin(folder if run is None else run)
+    if made is None or not made.date:  # another file of that name has no date
+        made = RunOrigin(date=date or date_of(time.time()), made_by=provenance())
     facts = [
         ("Date", made.date),
         ("Clock", _joined(trace.clock for trace in traces)),
@@ -129,29 +123,26 @@ def write(
     ]
     bands = bands or figures.error_bands(traces)
     if drawings is None:
-        drawn = figures.every(cases, traces, bands=bands) | figures.shadow_figures(first)
-        drawings = {each: figures.svg(figure) for each, figure in drawn.items()}
+        drawn = figures.every(cases, traces, bands=bands)
+        drawings = {name: figures.svg(figure) for name, figure in drawn.items()}
     pictures = _pictures(cases, traces, bands, drawings)
     short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
-        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
-        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
+        *_results(cases),
         Section("Figures", pictures=pictures),
         Section("Events", tables=(short,), more=every_event),
-        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
-        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
-        *_tables("Network model", NETWORK, network_tables(cases)),
+        *_details(cases),
         *_of_worlds(cases, drawings, len(pictures)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
-        Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
+        _DEFINED,
     ]
     first_of_all, verdict = [*failures(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
         verdict.append(Finding("plain", SAME_STARTS))
     return render(
-        folder / name,
+        folder / "report.html",
         title=experiment.title,
         source=experiment.source,
         facts=facts,
@@ -198,10 +189,7 @@ def compare(
     target: Path,
     runs: Sequence[tuple[str, Sequence[CaseMetrics]]],
     *,
-    title: str = "Comparison of runs",
     source: str = "",
-    command: str = "",
-    date: str = "",
     differences: Sequence[tuple[str, str, Sequence[str]]] = (),
 ) -> Path:
     """Writes several runs side by side: a column for each case of each run, the first one as the reference.
@@ -221,7 +209,7 @@ def compare(
     drawn = [figures.global_bars(cases), figures.robot_bars(cases)]
     captions = (_global_caption(cases), _robot_caption(cases))
     facts = [
-        ("Date", date or date_of(time.time())),
+        ("Date", date_of(time.time())),
         ("Runs", ", ".join(names)),
         ("Reference", cases[0].case),
     ]
@@ -232,21 +220,17 @@ def compare(
     differ = Table(("Run", "Folder", "Differs from the first in"), tuple(how), words=True)
     sections = [
         *_tables("Differences", DIFFERENCES, [differ], folded=False),
-        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
-        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
+        *_results(cases),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
-        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
-        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
-        *_tables("Network model", NETWORK, network_tables(cases)),
-        Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms"),
+        *_details(cases),
+        _DEFINED,
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     return render(
         target,
-        title=title,
+        title="Comparison of runs",
         source=source,
         facts=facts,
-        command=command,
         verdict=[*_noted(differences), *findings(cases)],
         sections=sections,
     )
@@ -270,12 +254,22 @@ def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: b
     return [Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
-def _origin(folder: Path, now: RunOrigin) -> RunOrigin:
-    """Origin of the run as its folder keeps it; kept now if the folder has none, and there is a command."""
-    kept = read_origin(folder)
-    if kept is None and now.command and not (folder / ORIGIN).exists():
-        keep_origin(folder, now)
-    return kept if kept is not None and kept.date else now  # another file of that name has no date
+_DEFINED: Final = Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms")
+
+
+def _results(cases: Sequence[CaseMetrics]) -> list[Section]:
+    return [
+        Section("Results", (left_out(cases),), (summary_table(cases), *whole_tables(cases))),
+        *_tables("Architecture", ARCHITECTURE, [architecture_table(cases)], folded=False),
+    ]
+
+
+def _details(cases: Sequence[CaseMetrics]) -> list[Section]:
+    return [
+        Section("Each robot", tables=robot_tables(cases), folded="metrics of every robot"),
+        Section("Data integrity", (PROOF,), proof_tables(cases), folded="poses sent, recorded, received, lost"),
+        *_tables("Network model", NETWORK, network_tables(cases)),
+    ]
 
 
 def _pictures(
@@ -284,20 +278,20 @@ def _pictures(
     legs = "; legs of the timeline dashed" if any(len(case.starts_s) > 1 for case in cases) else ""
     seeds = len({case.seed for case in cases})
     seed = f" Seed {traces[0].seed}." if seeds > 1 else ""
-    shown = [trace.experiment for trace in traces]
     of_cases = "all cases, the first one's robots named" if len({trace.case for trace in traces}) > 1 else "by robot"
     drawn_seeds = max((band.seeds for band in bands.values()), default=1)
     curves = f"median and range of {drawn_seeds} seeds" if drawn_seeds > 1 else "single robots thin"
+    pushed = any(each.mass is not None for trace in traces for each in trace.experiment.arena.obstacles.values())
+    standing = " Obstacles that can be pushed are where they stood at the start." if pushed else ""
     recorded = f"{seed} Recordings of the others are not kept." if seeds > 1 and drawn_seeds == 1 else ""
     captions = {
         "global_bars": _global_caption(cases),
-        "formation": f"Trajectories in space, {of_cases}; start hollow, end full, with its links."
-        f"{scenery.caption(shown, space=True)}{seed}",
+        "formation": f"Trajectories in space, {of_cases}; start hollow, end full, with its links.{standing}{seed}",
         "robot_bars": _robot_caption(cases),
         "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.{recorded}",
         "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
-        "plan_view": f"From above: start hollow, end full, with its links.{scenery.caption(shown)}{seed}",
+        "plan_view": f"From above: start hollow, end full, with its links.{standing}{seed}",
     }
     return numbered((svg, captions[name]) for name, svg in drawings.items() if name in captions)
 

@@ -142,22 +142,6 @@ def legend(experiments: Sequence[Experiment], *, space: bool = False) -> tuple[l
     return list(found.values()), list(found)
 
 
-def caption(experiments: Sequence[Experiment], *, space: bool = False) -> str:
-    """Caption text about the obstacles, from above or in space; empty without any."""
-    given = [obstacle for experiment in experiments for obstacle in experiment.arena.obstacles.values()]
-    words = []
-    if given:
-        words.append("obstacles grey")
-    if any(obstacle.plan is not None for obstacle in given):
-        words.append("paths of moving ones dotted")
-    if any(obstacle.mass is not None for obstacle in given):
-        words.append(f"movable ones {'pale' if space else 'hatched'}, where they stood at the start")
-    if any(experiment.arena.starts for experiment in experiments):
-        words.append("start boxes dashed")
-    text = ", ".join(words)
-    return f" {text[0].upper()}{text[1:]}." if text else ""
-
-
 _SQUARE: Final = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 

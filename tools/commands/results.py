@@ -419,7 +419,7 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     recorded = len({trace.seed for trace in traces}) == len(runs)
     place = Path(runs[0].folder or folder) / "figures" / metrics_files.BANDS
     bands = {} if recorded else metrics_files.read_bands(place)
-    drawn = figures.every(every, traces, width, bands) | figures.shadow_figures(list(runs[0].traces.values()), width)
+    drawn = figures.every(every, traces, width, bands)
     stays = [] if recorded or bands else ["errors"]  # the one that is there is of all seeds
     drawings = {
         name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name)[0].read_text("utf-8")

@@ -88,15 +88,6 @@ def test_the_legend_names_what_there_is(short):
     assert "above the floor" not in scenery.legend([full], space=True)[1]
 
 
-def test_the_caption_says_how_it_is_drawn(short):
-    assert scenery.caption([short.experiment]) == ""
-    said = scenery.caption([within(short, FULL).experiment])
-    assert said == (
-        " Obstacles grey, paths of moving ones dotted, movable ones hatched, where they stood at the start, "
-        "start boxes dashed."
-    )
-
-
 def solids(axes):
     return [each for each in axes.collections if isinstance(each, Poly3DCollection)]
 
