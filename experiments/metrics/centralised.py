@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -13,20 +12,13 @@ from experiments.metrics.results import Guidance
 from experiments.recording.trace import Trace
 
 
-@dataclass(frozen=True)
-class Delays:
-    """Mean, 95th percentile and maximum [s]; None where there was none."""
-
-    mean: float | None
-    p95: float | None
-    largest: float | None
-
-    @classmethod
-    def of_series(cls, delay: Array) -> Delays:
-        """Statistics of delays (A,) [s]."""
-        if not len(delay):
-            return cls(None, None, None)
-        return cls(float(delay.mean()), float(np.quantile(delay, 0.95)), float(delay.max()))
+def _delays(delay: Array) -> dict[str, float | None]:
+    """Mean, 95th percentile and maximum of delays (A,) [s], by their names in the results; None without any."""
+    found = (delay.mean(), np.quantile(delay, 0.95), delay.max()) if len(delay) else (None,) * 3
+    return {
+        f"delay_{what}_s": None if each is None else float(each)
+        for what, each in zip(("mean", "p95", "max"), found, strict=True)
+    }
 
 
 def guided_rows(trace: Trace) -> Mask:
@@ -43,13 +35,11 @@ def received_by_centre(trace: Trace) -> Mask:
     return np.asarray(hears & rows.any())
 
 
-def delays(trace: Trace) -> list[Delays]:
-    """Delays of the goals to each robot."""
+def delays(trace: Trace) -> list[dict[str, float | None]]:
+    """Delays of the goals to each robot, as fields of its metrics."""
     goals = trace.goals
-    none = Delays.of_series(np.zeros(0))
-    if goals is None:
-        return [none] * len(trace.robots)
-    return [Delays.of_series(goals.delay[goals.follower == row]) for row in range(len(trace.robots))]
+    rows = range(len(trace.robots))
+    return [_delays(np.zeros(0) if goals is None else goals.delay[goals.follower == row]) for row in rows]
 
 
 def goals_to(trace: Trace) -> tuple[Index, Index]:
@@ -74,7 +64,6 @@ def guidance(trace: Trace) -> Guidance | None:
     if goals is None:
         return None
     duration = float(trace.time[-1] - trace.time[0])
-    all_of_them = Delays.of_series(goals.delay)
     load = [report.load for report in goals.reports] if trace.clock == "real" else []
     missed = [report.missed for report in goals.reports]
     return Guidance(
@@ -85,9 +74,7 @@ def guidance(trace: Trace) -> Guidance | None:
         goals_lost=max(0, len(goals.sent) - int(goals.reached.sum())),
         heard=int(goals.received.sum()),
         poses_lost=int(goals.lost.sum() + goals.dropped.sum()),
-        delay_mean_s=all_of_them.mean,
-        delay_p95_s=all_of_them.p95,
-        delay_max_s=all_of_them.largest,
+        **_delays(goals.delay),
         load=statistics.fmean(load) if load else None,
         load_max=max(load, default=None),
         missed=sum(max(0, b - a) for a, b in pairwise(missed)),

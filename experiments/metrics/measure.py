@@ -244,6 +244,7 @@ def _robots(
     own_numbers: list[dict[str, Any]] = [
         {what: int(each[i]) for what, each in numbers.items()}
         | {what: _number(each[i]) for what, each in unsure.items()}
+        | late[i]
         for i in range(rows)
     ]
     return tuple(
@@ -269,9 +270,6 @@ def _robots(
             intervened_share=_share(trace.interventions[i], trace.ticks[i]),
             avoided_share=_share(trace.avoided[i], trace.ticks[i]),
             shadow=agreements[i],
-            delay_mean_s=late[i].mean,
-            delay_p95_s=late[i].p95,
-            delay_max_s=late[i].largest,
             **own_numbers[i],
         )
         for i, name in enumerate(trace.robots)

@@ -10,18 +10,17 @@ import zlib
 from collections.abc import Iterator
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
 from experiments.definition.experiment import Experiment
 from experiments.file.structure import plugin_files
 from experiments.recording.reader import RecordingError, Records
-from experiments.recording.run_folder import ORIGIN, SOURCE, RunOrigin, read_origin
+from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, RunOrigin, flattened, read_origin
 from experiments.recording.version import PACKAGES, ROOT
 
 SUFFIX: Final = ".zip"
-METRICS: Final = "metrics.json"
 LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
 DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
 LARGEST: Final = 1 << 34  # [bytes] of all members together
@@ -129,25 +128,15 @@ def differences(repeated: Path, former: Path) -> list[str]:
     found = []
     mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
     if mine != theirs:
-        found.append("figures: " + ", ".join(sorted(_changed(theirs, mine, ""))[:5]))
+        old, new = dict(flattened(theirs)), dict(flattened(mine))
+        changed = [path for path in sorted(old.keys() | new.keys()) if old.get(path) != new.get(path)]
+        found.append("figures: " + ", ".join(f"{path} {old.get(path)} → {new.get(path)}" for path in changed[:5]))
     for file in sorted(former.glob("*.mcap")):
         if not (repeated / file.name).exists():
             found.append(f"{file.name} is missing")
         elif _messages(repeated / file.name) != _messages(file):
             found.append(f"{file.name}: other messages")
     return found
-
-
-def _changed(old: Any, new: Any, path: str) -> Iterator[str]:  # noqa: ANN401 - JSON
-    """Paths of the values that differ."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in old.keys() | new.keys():
-            yield from _changed(old.get(key), new.get(key), f"{path}.{key}" if path else key)
-    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        for number, (before, after) in enumerate(zip(old, new, strict=True)):
-            yield from _changed(before, after, f"{path}[{number}]")
-    elif old != new:
-        yield f"{path} {old} → {new}"
 
 
 def _messages(file: Path) -> str:

@@ -163,7 +163,7 @@ def _number(value: object) -> float | None:
 
 def differences(first: PastRun, other: PastRun) -> list[str]:
     """How the file, the options, the seeds, the code and the versions of a run differ from those of another one."""
-    before, after = (dict(_flat(_document(Path(run.folder)), "")) for run in (first, other))
+    before, after = (dict(flattened(_document(Path(run.folder)))) for run in (first, other))
     found = [
         f"{key} {_formatted(before.get(key))} → {_formatted(after.get(key))}"
         for key in dict.fromkeys([*before, *after])
@@ -189,10 +189,14 @@ def _document(folder: Path) -> Any:  # noqa: ANN401 - whatever stands there
         return {}
 
 
-def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
+def flattened(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
+    """The values in a document with their paths; lists of values count as one."""
     if isinstance(value, dict) and value:
         for key, each in value.items():
-            yield from _flat(each, f"{path}.{key}" if path else str(key))
+            yield from flattened(each, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        for number, each in enumerate(value):
+            yield from flattened(each, f"{path}[{number}]")
     else:
         yield path, value
 

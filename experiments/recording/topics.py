@@ -27,7 +27,6 @@ from agents.network.messages import (
     Pose,
     State,
     Status,
-    Vector,
     WorldState,
 )
 
@@ -41,28 +40,16 @@ RARE: Final = 1_000  # of those at 1 Hz or rarer: a ring takes its memory as it 
 Message = Pose | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
 
 
-class SentPose(msgspec.Struct, frozen=True):
+class SentPose(Pose, frozen=True, kw_only=True):
     """A pose as it was sent to the neighbours."""
 
-    robot: str
-    seq: int
-    stamp: float
-    position: Vector
-    velocity: Vector | None
-    yaw: float | None
     received: float  # [s] UTC, by the recorder
     size: int  # [bytes] of the payload on the network
 
 
-class SentGoal(msgspec.Struct, frozen=True):
-    """A goal as the central controller sent it, see `agents.network.messages.Goal`."""
+class SentGoal(Goal, frozen=True, kw_only=True):
+    """A goal as the central controller sent it."""
 
-    robot: str
-    seq: int
-    stamp: float
-    position: Vector
-    yaw: float | None
-    pose: float
     received: float  # [s] UTC, by the recorder
     size: int  # [bytes] of the payload on the network
 

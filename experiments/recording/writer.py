@@ -27,50 +27,31 @@ BLOCK_BYTES: Final = 1024 * 1024
 PRIVATE: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
 
 
-class Block:
-    """Some indices as they stand in the file."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-
-    def write(self, stream: RecordBuilder) -> None:
-        """Adds them to the summary."""
-        stream.write(self._data)
-
-
 class ChunkIndices:
     """Chunk indices in an unnamed file, in place of the writer's list, which grows in memory with the recording."""
 
-    def __init__(self, folder: Path) -> None:
-        """The file without a name is in `folder`, and gone with the process."""
+    def __init__(self, folder: Path, writer: Writer) -> None:
+        """Takes the place of a new writer's list; the file without a name is in `folder`, and gone with the process."""
         self._kept = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
         self.end = 0  # [ns] latest log time in the chunks so far
-
-    def stand_in(self, writer: Writer) -> None:
-        """Takes the place of a new writer's list.
-
-        Raises:
-            AttributeError: If this version of the library has none of that name.
-        """
-        if getattr(writer, PRIVATE):
-            raise ValueError("the writer has begun already")
+        assert getattr(writer, PRIVATE) == [], "another version of mcap"
         setattr(writer, PRIVATE, self)
 
     def append(self, index: ChunkIndex) -> None:
-        """Keeps the index of a chunk.
-
-        Raises:
-            OSError: If the disk takes no more.
-        """
+        """Keeps the index of a chunk."""
         self.end = max(self.end, index.message_end_time)
         record = RecordBuilder()
         index.write(record)
         self._kept.write(record.end())  # type: ignore[no-untyped-call]
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[ChunkIndices]:
+        yield self  # all at once, see `write`
+
+    def write(self, stream: RecordBuilder) -> None:
+        """Adds all indices to the summary."""
         self._kept.seek(0)
         while block := self._kept.read(BLOCK_BYTES):
-            yield Block(block)
+            stream.write(block)
 
     def close(self) -> None:
         """Close the file, which is then deleted."""
@@ -141,8 +122,7 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._index = ChunkIndices(path.parent)
-        self._index.stand_in(self._writer)
+        self._index = ChunkIndices(path.parent, self._writer)
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
         about |= {"code": made.code, "commit": made.commit, "python": made.python, "host": made.host, "cpu": made.cpu}
@@ -170,7 +150,7 @@ class Recording:
         recorded, topic = self._topics[type(message)]
         entry: Any = message
         if received is not None:
-            entry = recorded(*msgspec.structs.astuple(message), received, size)
+            entry = recorded(*msgspec.structs.astuple(message), received=received, size=size)
         logged = message.stamp if received is None else received
         if self._utc is not None and received is None:
             now = self._utc()

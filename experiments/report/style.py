@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, Final, ParamSpec
@@ -231,8 +231,3 @@ def last_known(trace: Trace) -> Array:
     alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
     last = len(alive) - 1 - alive[::-1].argmax(axis=0)
     return np.asarray(trace.true_position[last, np.arange(len(trace.robots))])
-
-
-def edges(receiver: Iterable[Any], sender: Iterable[Any]) -> list[tuple[int, int]]:
-    """Each pair of linked rows once."""
-    return sorted({(min(i, j), max(i, j)) for i, j in zip(receiver, sender, strict=True)})

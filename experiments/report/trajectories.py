@@ -22,6 +22,7 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from agents.arrays import Array
+from agents.formation.graph import edges
 from experiments.check.analysis import Analysis
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
@@ -39,7 +40,6 @@ from experiments.report.style import (
     Drawing,
     Line,
     case_line,
-    edges,
     fitting,
     last_known,
     legend_above,
@@ -105,10 +105,10 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
 
 def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
     """Paths of a case from above: in one style, robots named, or with a colour for each robot."""
-    place, last, net = trace.true_position, last_known(trace), trace.plan.links
+    place, last = trace.true_position, last_known(trace)
     ink = "#8a8a8a" if style is None else style["color"]
-    for i, j in edges(net.receiver, net.sender):
-        axes.plot(*last[[i, j], :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
+    for pair in edges(trace.plan.links):
+        axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
     small = 3.0 if len(trace.robots) <= MANY else 2.0
     for i, line in enumerate(robot_lines(trace)):
         colour = line["color"] if style is None else ink
@@ -299,12 +299,10 @@ def _draw_in_space(axes: Axes3D, trace: Trace, case: Line | None) -> None:
     place = trace.true_position
     known = np.asarray(np.isfinite(place).all(axis=2))
     starts, ends = place[known.argmax(axis=0), np.arange(place.shape[1])], last_known(trace)
-    net = trace.plan.links
     few_robots = len(trace.robots) <= MANY
-    if pairs := edges(net.receiver, net.sender):
-        lines = [ends[[i, j]] for i, j in pairs]
-        links = Line3DCollection(lines, colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
-        axes.add_collection3d(links)
+    if len(pairs := edges(trace.plan.links)):
+        lines = Line3DCollection(ends[pairs], colors=colour or "#8a8a8a", linewidths=0.5, alpha=0.7, zorder=1)
+        axes.add_collection3d(lines)
     few = slice(None, None, max(1, len(place) // 400))
     size = 3.0 if few_robots else 2.0
     named = not axes.texts

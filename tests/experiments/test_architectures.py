@@ -222,7 +222,7 @@ def test_the_report_compares_them(tmp_path, cases):
     assert any("a centre decides for TB01" in finding.text for finding in findings(found))
     page = report.write(tmp_path, traces, measured=found).read_text()
     assert "Architecture</h2>" in page
-    alone = report.write(tmp_path, traces[:1], measured=found[:1], name="one.html").read_text()
+    alone = report.write(tmp_path, traces[:1], measured=found[:1]).read_text()
     assert "Architecture</h2>" not in alone
     metrics_files.write_csv(tmp_path / "metrics.csv", found)
     header, *rows = (tmp_path / "metrics.csv").read_text().splitlines()

@@ -268,9 +268,9 @@ def cdr() -> Iterator[Target]:
     pose: Any = said["pose"][0]
     fields = [getattr(pose, name) for name in ("robot", "seq", "stamp", "position", "velocity", "yaw")]
     made: list[Any] = [
-        said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, 1.0, 150),
+        said["state"][0], said["state"][1], said["status"][0], SentPose(*fields, received=1.0, size=150),
         *(of_all()[key][0] for key in (KEYS.event, KEYS.contact, KEYS.world, KEYS.centre, KEYS.clock)),
-        SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, 1.0, 150),
+        SentGoal("KH01", 1, 1.0, (0.0, 0.0, 0.0), None, 0.9, received=1.0, size=150),
     ]  # fmt: skip
     codecs = {type(each).__name__: codec(type(each)) for each in made}
     examples = [type(each).__name__.encode() + b"\0" + codecs[type(each).__name__].encode(each) for each in made]

@@ -209,7 +209,7 @@ def test_a_status_survives(battery):
     "message",
     [
         Pose("CF01", 7, 1.76e9, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), 0.4),
-        SentPose("CF01", 7, 1.76e9, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), 0.4, 1.76e9 + 0.002, 143),
+        SentPose("CF01", 7, 1.76e9, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), 0.4, received=1.76e9 + 0.002, size=143),
         Event(1.76e9, "start", "conductor", "µ: 3 > 2"),
     ],
 )
