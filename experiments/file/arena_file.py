@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,8 +20,7 @@ from experiments.file import structure
 from experiments.file import text as syntax
 from experiments.file.consistency import arena_faults
 from experiments.file.overrides import merged
-from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
-from experiments.file.problems import Path as Keys
+from experiments.file.problems import Fault, Text, refusal
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
 _HERE: Final = ("arena", "file")
@@ -36,22 +34,11 @@ class _Whole(Part, frozen=True):
 
 
 @dataclass(frozen=True)
-class ArenaFile:
+class ArenaFile(Text):
     """Arena file without errors."""
 
     name: str  # as the experiment names it
-    label: str  # as its errors name it
-    text: str  # as it stands there
     table: dict[str, Any]  # its [arena]
-
-    @cached_property
-    def places(self) -> dict[Keys, Place]:
-        return places(self.text)
-
-    def located(self, fault: Fault) -> Problem:
-        stands, place = nearest(self.places, fault.path)
-        offset = place.key if fault.on_key and stands == fault.path else place.value
-        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
 class Misnamed(ValueError):
@@ -99,9 +86,9 @@ def load(name: str, folder: Path) -> ArenaFile:
         content = syntax.parsed(text, label, json=False)
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
-    read = ArenaFile(name, label, text, content.get("arena", {}))
-    _refuse(read, [*structure.number_faults(content), *_faults_of_shape(content)])
-    _refuse(read, list(arena_faults(msgspec.convert(content, _Whole).arena)))
+    read = ArenaFile(label, text, is_json=False, name=name, table=content.get("arena", {}))
+    read.refuse([*structure.number_faults(content), *_faults_of_shape(content)])
+    read.refuse(arena_faults(msgspec.convert(content, _Whole).arena))
     return read
 
 
@@ -131,9 +118,3 @@ def _faults_of_shape(content: Mapping[str, Any]) -> Iterator[Fault]:
     arena = content.get("arena")
     if isinstance(arena, dict) and "file" in arena:
         yield Fault(_HERE, "an arena file cannot name another", "copy its tables from there", on_key=True)
-
-
-def _refuse(read: ArenaFile, faults: list[Fault]) -> None:
-    problems = dict.fromkeys(read.located(fault) for fault in faults)
-    if problems:
-        raise DocumentError(sorted(problems, key=lambda problem: (problem.line, problem.column)))

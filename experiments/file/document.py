@@ -6,10 +6,9 @@ for name, experiment in document.cases().items(): ...
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,8 +18,8 @@ from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.overrides import Override, assign, chosen_parameters, fill_from_shape, merged, parse
-from experiments.file.problems import DocumentError, Fault, Place, Problem, at_offset, nearest, places, refusal
+from experiments.file.overrides import Override, assign, fill_from_shape, merged, parse
+from experiments.file.problems import DocumentError, Fault, Problem, Text, nearest, refusal
 from experiments.file.problems import Path as Keys
 from experiments.file.text import content, decoded, parsed
 
@@ -144,25 +143,11 @@ def _overrides(flags: Sequence[str], content: _Table) -> list[Override]:
 
 
 @dataclass(frozen=True)
-class Source:
-    """Text of an experiment with its changes and its arena files: where each fault has its place."""
+class Source(Text):
+    """Text of an experiment with its changes and its arena files."""
 
-    label: str  # the file, as the user named it
-    text: str
-    is_json: bool
     overrides: Sequence[Override] = ()
     arenas: dict[str, ArenaFile] = field(default_factory=dict)
-
-    @cached_property
-    def places(self) -> dict[Keys, Place]:
-        return places(self.text, json=self.is_json)
-
-    def refuse(self, faults: Iterable[Fault]) -> None:
-        """Raise DocumentError if there is any fault, all in the order of the file."""
-        problems = dict.fromkeys(map(self.located, faults))
-        if problems:
-            ours = (self.label, *(problem.file for problem in problems if not problem.line))
-            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
 
     def located(self, fault: Fault) -> Problem:
         """A fault in the text, in an arena file or in a `--set`."""
@@ -174,12 +159,11 @@ class Source:
                 return override.refused(fault.message, fault.hint).problems[0]
             if whole[: len(path)] == path and path not in self.places:
                 return override.refused(fault.message, fault.hint).problems[0]
-        stands, place = nearest(self.places, path)
+        stands, _ = nearest(self.places, path)
         file = self.arenas.get(str(case), self.arenas.get(""))
         if file is not None and len(nearest(file.places, inside)[0]) > len(stands) - (len(path) - len(inside)):
             return file.located(replace(fault, path=inside))
-        offset = place.key if fault.on_key and stands == path else place.value
-        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
+        return super().located(fault)
 
 
 def join_texts(texts: Sequence[str]) -> str:
@@ -206,7 +190,7 @@ def _resolved(file: Path, source: Source, content: _Table) -> tuple[dict[str | N
         elif override not in of_all:
             assign(content, override)
     tables, documents = _tables(content), dict[str | None, _Table]()
-    unused = {override for override in of_all if override.path not in _ABOVE}
+    unused: dict[Override, list[str]] = {override: [] for override in of_all if override.path not in _ABOVE}
     for name, table in ((None, {}), *tables.items()):
         document = deepcopy(merged(_without_cases(content), _without_cases(table)))
         mine = [*of_all, *(each for each in source.overrides if each.case is not None and each.case == name)]
@@ -214,9 +198,15 @@ def _resolved(file: Path, source: Source, content: _Table) -> tuple[dict[str | N
             if override.path in _ABOVE:
                 assign(document, override)
         documents[name] = document = _with_arena_file(file, source, document, name)
-        unused -= {override for override in mine if override.path not in _ABOVE and assign(document, override)}
+        for override in mine:
+            if override.path not in _ABOVE:
+                known = assign(document, override)
+                if known is None:
+                    unused.pop(override, None)
+                elif override in unused:
+                    unused[override] += known
     if unused:
-        raise DocumentError([_unused(each, list(documents.values())) for each in of_all if each in unused])
+        raise DocumentError([_unused(override, known) for override, known in unused.items()])
     if "cases" in content:
         documents[None]["cases"] = content["cases"]
     return documents, tables
@@ -237,13 +227,12 @@ def _with_arena_file(file: Path, source: Source, document: _Table, case: str | N
     return deepcopy(arena_file.with_arena_file(document, own))
 
 
-def _unused(override: Override, documents: Sequence[Mapping[str, Any]]) -> Problem:
-    """Problem of a parameter that no trigger, law or plan of the experiment has."""
+def _unused(override: Override, known: Sequence[str]) -> Problem:
+    """Problem of a parameter that no trigger, law or plan of the experiment has; they have those `known`."""
     end = next(end for end in range(1, len(override.path)) if structure.group_of(override.path[:end]))
-    known = dict.fromkeys(name for document in documents for name in chosen_parameters(document, override.path[:end]))
     parameter = str(override.path[end])
     message = f"no {override.path[end - 1]} of this experiment has a parameter '{parameter}'"
-    return override.refused(message, did_you_mean(parameter, known)).problems[0]
+    return override.refused(message, did_you_mean(parameter, dict.fromkeys(known))).problems[0]
 
 
 def _each_once(found: Mapping[str | None, Sequence[Fault]], tables: Mapping[str, _Table]) -> Iterator[Fault]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from operator import attrgetter
@@ -73,7 +73,7 @@ def parse(flag: str, document: Mapping[str, Any]) -> Override:
     return Override(flag, path, _typed(text.strip()), case)
 
 
-def assign(document: dict[str, Any], override: Override, *, part: bool = False) -> bool:
+def assign(document: dict[str, Any], override: Override, *, part: bool = False) -> list[str] | None:
     """Puts the value in its place.
 
     A parameter of a trigger, law or plan is left alone where the kind that is chosen has no such parameter: `--set
@@ -83,7 +83,7 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         part: `document` holds the changes of a case alone, so that any key may be missing.
 
     Returns:
-        Whether there was a place for it.
+        None, or the parameters that the kind has if this is none of them.
 
     Raises:
         DocumentError: If the path leads nowhere.
@@ -101,15 +101,16 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
         inside = {} if inside is None else _as_table(inside, path)
         if not isinstance(inside, dict | list):
             raise override.refused(f"'{step}' is no table, so it has no '{below}'", f"set {step} itself")
-        if group and not part and isinstance(inside, dict) and below not in ("kind", *_own_parameters(inside, group)):
-            return False
+        known = parameters(group, str(inside.get("kind"))) if group and isinstance(inside, dict) else None
+        if known is not None and not part and below not in ("kind", *known):
+            return known
         at[step] = inside
         at = inside
     last = _known(at, last, override.path, override, part=True)
     if group_of(path) and last == "kind" and at.get("kind") != override.value:
         at.clear()
     at[last] = deepcopy(override.value)
-    return True
+    return None
 
 
 def merged(document: Mapping[str, Any], changes: Mapping[str, Any], path: Path = ()) -> dict[str, Any]:
@@ -206,20 +207,6 @@ def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -
         return length
     planar = len(shape[first]) == len(shape[second]) == 2
     return offset[:2] if planar else offset
-
-
-def chosen_parameters(document: Mapping[str, Any], path: Path) -> Iterable[str]:
-    """The parameters of the plug-in that a document chooses at `path`."""
-    at: Any = document
-    for step in path[:-1]:
-        at = at.get(step, {}) if isinstance(at, dict) else at[int(step)]
-    choice = _as_table(at.get(path[-1], _default(path)), path)
-    group = group_of(path)
-    return _own_parameters(choice, group) if group and isinstance(choice, dict) else []
-
-
-def _own_parameters(choice: Mapping[str, Any], group: str) -> list[str]:
-    return parameters(group, str(choice.get("kind")))
 
 
 def _known(at: Any, step: str | int, path: Path, override: Override, *, part: bool) -> Any:  # noqa: ANN401

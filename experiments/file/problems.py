@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final
 
 import msgspec
@@ -224,6 +225,31 @@ def refusal(file: str, message: str, hint: str = "") -> DocumentError:
 def at_offset(file: str, text: str, offset: int, message: str, hint: str = "") -> Problem:
     line, column = line_column(text, offset)
     return Problem(file, line, column, message, hint, text.split("\n")[line - 1])
+
+
+@dataclass(frozen=True)
+class Text:
+    """Text of a file: where each fault has its place."""
+
+    label: str  # the file, as the user named it
+    text: str  # as it stands there
+    is_json: bool
+
+    @cached_property
+    def places(self) -> dict[Path, Place]:
+        return places(self.text, json=self.is_json)
+
+    def refuse(self, faults: Iterable[Fault]) -> None:
+        """Raise DocumentError if there is any fault, all in the order of the file."""
+        problems = dict.fromkeys(map(self.located, faults))
+        if problems:
+            ours = (self.label, *(problem.file for problem in problems if not problem.line))
+            raise DocumentError(sorted(problems, key=lambda each: (each.file not in ours, each.line, each.column)))
+
+    def located(self, fault: Fault) -> Problem:
+        stands, place = nearest(self.places, fault.path)
+        offset = place.key if fault.on_key and stands == fault.path else place.value
+        return at_offset(self.label, self.text, offset, fault.message, fault.hint)
 
 
 def shown(value: object) -> str:
