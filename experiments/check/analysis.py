@@ -37,6 +37,7 @@ from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
+from experiments.metrics.signals import after_last
 from twins.scene import Scene
 
 MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
@@ -83,11 +84,6 @@ class Analysis:
         return self.plan.names
 
     @property
-    def edges(self) -> int:
-        """Number of linked pairs, directions ignored."""
-        return len(edges(self.assignment.links))
-
-    @property
     def speed(self) -> Array:
         """(N,) that each robot may drive or fly at [m/s]."""
         own = np.array([kind.speed for kind in self.assignment.kinds])
@@ -130,19 +126,14 @@ class Analysis:
         window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
         total = np.cumsum(np.concatenate([np.zeros((1, self.error.shape[1])), self.error]), axis=0)
         end = np.arange(1, len(total))
-        before = np.maximum(
-            end - window, 0
-        )  # the window fills up at the start, as it does in `experiments.metrics.measure`
+        before = np.maximum(end - window, 0)  # the window fills up at the start, as in `experiments.metrics.signals`
         return np.asarray((total[end] - total[before]) / (end - before)[:, None])
 
     def acquired(self, until: float) -> float | None:
         """Time from which on the mean of every link over `WINDOW_S` is within the tolerance, up to `until` [s]."""
         time = self.prediction.time
-        mean = self.mean_error[time <= until + 1e-9]
-        bad = np.flatnonzero(mean.max(axis=1, initial=0.0) > self.experiment.tolerance + FORGIVEN)
-        if not len(mean) or (len(bad) and bad[-1] == len(mean) - 1):
-            return None
-        return float(time[bad[-1] + 1]) if len(bad) else 0.0
+        worst = self.mean_error[time <= until + 1e-9].max(axis=1, initial=0.0)[:, None]
+        return after_last(worst > self.experiment.tolerance + FORGIVEN, time)[0] if len(worst) else None
 
     def stopped(self, at: int) -> Index:
         """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""

@@ -13,6 +13,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from agents.formation.graph import edges
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
@@ -186,7 +187,7 @@ def _figures(analysis: Analysis) -> Figures:
             name: surroundings.describe_obstacle(obstacle) for name, obstacle in experiment.arena.obstacles.items()
         },
         links=len(assignment.links),
-        edges=analysis.edges,
+        edges=len(edges(assignment.links)),
         parts=analysis.parts,
         leaders=analysis.plan.leaders,
         algebraic_connectivity=analysis.fiedler,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -107,8 +107,7 @@ def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
     return flights
 
 
-@dataclass(frozen=True)
-class Approach:
+class Approach(NamedTuple):
     """Closest approach of two robots: `distance` [m] in the plane, at `time` [s]."""
 
     first: int
@@ -146,8 +145,5 @@ def message_rate(experiment: Experiment) -> float:
     """
     duration = min(experiment.duration_s, QUESTIONS / experiment.rates.pose_hz)
     bare = isolated(msgspec.structs.replace(experiment, duration_s=duration))
-    try:
-        log = simulation.simulate(bare, [bare.seed], lean=True, landing=False)
-    except conductor.Stuck:
-        return 0.0
-    return len(sent_in_run(log.sent, bare.duration_s)) / bare.duration_s
+    flight = predict(bare)
+    return 0.0 if flight.stuck else flight.transmissions / bare.duration_s

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from itertools import takewhile
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -220,8 +221,7 @@ def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask
     return Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position))
 
 
-@dataclass(frozen=True)
-class Conflict:
+class Conflict(NamedTuple):
     """Distances that contradict one another whatever the rest of the formation does."""
 
     # two robots whose heights alone are farther apart than they should be, or the three of a triangle
@@ -268,8 +268,7 @@ def _of_triangle(triangle: tuple[int, ...], wanted: Array, height: Array) -> Con
     return Conflict(triangle, math.nan, ())
 
 
-@dataclass(frozen=True)
-class Contradiction:
+class Contradiction(NamedTuple):
     """Relative positions that do not add up: around `rows`, each linked to the next and the last to the first."""
 
     rows: tuple[int, ...]  # two robots of which each asks for something else, or more around a ring
@@ -281,46 +280,32 @@ def contradictions(links: Links) -> list[Contradiction]:
     """Rings of links by relative position whose vectors do not add up to zero, the shortest rings first."""
     if links.wants is None or links.relative is None:
         return []
-    here = np.flatnonzero(links.wants == BY_RELATIVE)
-    place: dict[int, Array] = {}
-    above: dict[int, int] = {}
+    here = [
+        (k, int(links.receiver[k]), int(links.sender[k]), links.relative[k])
+        for k in np.flatnonzero(links.wants == BY_RELATIVE).tolist()
+    ]
     neighbours: dict[int, list[tuple[int, Array]]] = {}
-    for k in here.tolist():
-        i, j = int(links.receiver[k]), int(links.sender[k])
-        neighbours.setdefault(j, []).append((i, links.relative[k]))
-        neighbours.setdefault(i, []).append((j, -links.relative[k]))
+    for _, i, j, offset in here:
+        neighbours.setdefault(j, []).append((i, offset))
+        neighbours.setdefault(i, []).append((j, -offset))
+    place: dict[int, Array] = {}
+    way: dict[int, list[int]] = {}  # from the root of a tree through the network to each row
     for root in neighbours:
         if root in place:
             continue
-        place[root], queue = np.zeros(3), [root]
+        place[root], way[root], queue = np.zeros(3), [root], [root]
         for at in queue:
             for to, step in neighbours[at]:
                 if to not in place:
-                    place[to], above[to] = place[at] + step, at
+                    place[to], way[to] = place[at] + step, [*way[at], to]
                     queue.append(to)
     found = []
-    for k in here.tolist():
-        i, j = int(links.receiver[k]), int(links.sender[k])
-        gap = float(norm((place[i] - place[j] - links.relative[k])[None, :2])[0])
+    for k, i, j, offset in here:
+        gap = float(norm((place[i] - place[j] - offset)[None, :2])[0])
         if gap > ROUNDED:
-            found.append(Contradiction(_ring(i, j, above), k, gap))
+            fork = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(way[i], way[j], strict=False)))
+            found.append(Contradiction((*reversed(way[i][fork - 1 :]), *way[j][fork:]), k, gap))
     return sorted(found, key=lambda each: len(each.rows))
-
-
-def _ring(one: int, other: int, above: dict[int, int]) -> tuple[int, ...]:
-    """The way from one row to another through a tree with the parents `above`."""
-
-    def up(row: int) -> list[int]:
-        way = [row]
-        while way[-1] in above:
-            way.append(above[way[-1]])
-        return way
-
-    first, second = up(one), up(other)
-    while len(first) > 1 and len(second) > 1 and first[-2] == second[-2]:
-        first.pop()
-        second.pop()
-    return (*first, *reversed(second[:-1]))
 
 
 def formation_rigidity(

@@ -29,19 +29,17 @@ def safety(analysis: Analysis) -> Iterator[Claim]:
 
 def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
     """Check the separation of linked pairs: at the start, at their target, and on their way."""
-    names, path = tuple(analysis.experiment.robots), ("safety", "separation")
+    names, path, track = analysis.names, ("safety", "separation"), analysis.prediction.position
     links, poses = analysis.plan.links, analysis.plan.pose_links
     pairs = sorted({tuple(sorted(pair)) for pair in zip(poses.receiver.tolist(), poses.sender.tolist(), strict=True)})
     wanted = {
         tuple(sorted(pair)): distance
         for *pair, distance in zip(links.receiver.tolist(), links.sender.tolist(), links.distance.tolist(), strict=True)
     }
-    start, _ = bodies.start_poses(analysis.experiment, names)
     nearer, quiet = f"nearer than the separation of {limit:g} m", True
     for first, second in pairs:
         both = f"{names[first]} and {names[second]}"
-        apart = float(norm(start[first] - start[second]))
-        track = analysis.prediction.position
+        apart = float(norm(analysis.start[first] - analysis.start[second]))
         least = float(norm(track[:, first] - track[:, second]).min())
         if apart < limit - FORGIVEN:
             message = f"{both} start {apart:.2f} m apart, {nearer}: neither takes off"
