@@ -20,11 +20,7 @@ def names() -> list[tuple[str, str]]:
 
 
 def path(name: str) -> Path:
-    """The file of a catalogue entry.
-
-    Raises:
-        DocumentError: If there is none of that name.
-    """
+    """The file of a catalogue entry; raises DocumentError if there is none of that name."""
     if name not in index.names():
         raise DocumentError([no_entry(name)])
     return _entry(name)

@@ -60,11 +60,7 @@ def reason(error: OSError | ValueError) -> str:
 
 
 def decoded(content: bytes, label: str) -> str:
-    """Text, with plain line ends.
-
-    Raises:
-        DocumentError: If it is binary, empty or not UTF-8.
-    """
+    """Text, with plain line ends; raises DocumentError if it is binary, empty or not UTF-8."""
     if b"\0" in content:
         raise refusal(label, "is binary, no text", "name an experiment file (.toml or .json)")
     try:
