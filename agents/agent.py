@@ -25,8 +25,7 @@ from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
 from agents.network.messages import Setpoint
-from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.calls import call
 from agents.plugins.triggers import LastEvent, Trigger
 from agents.safety.detection import Detector, RowStatus
 from agents.safety.hazards import Hazards, Outcome
@@ -274,7 +273,8 @@ class Agent:
             filtered = self._safety.check(setpoint, state.position, state.yaw, age, where=where)
         else:
             own, near = self._perception.sense(t, state, self.neighbours.poses)
-            wanted, goal = goal, self._deviate(avoidance, goal, own, near)
+            inputs, wanted = (goal, own, near, 1.0 / self.assignment.body_hz), goal
+            goal = call("avoidance", avoidance.deviate, *inputs, shape=goal.shape, each="a goal per row")
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
             filtered = self._safety.check(
                 setpoint, state.position, state.yaw, age, where=where, avoidance=(avoidance, own, near)
@@ -384,16 +384,3 @@ class Agent:
             self.goal_yaw = np.where(follows, guidance.goal_yaw, self.goal_yaw)
             self.updates += follows & guidance.fresh
         guidance.fresh[:] = False
-
-    def _deviate(self, avoidance: Avoidance, wanted: Array, own: OwnState, near: Nearby) -> Array:
-        """Goals after avoidance."""
-        name = type(avoidance).__name__
-        try:
-            goal = avoidance.deviate(wanted, own, near, 1.0 / self.assignment.body_hz)
-        except FAILURES as error:
-            raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
-        if np.shape(goal) != wanted.shape:
-            raise PluginError(
-                f"`deviate` of the avoidance {name} must give a goal per row, {wanted.shape}, not {np.shape(goal)}"
-            )
-        return goal

@@ -15,8 +15,8 @@ from agents.decision.control_updates import ControlUpdates, ControlView
 from agents.decision.neighbours import NeighbourStates
 from agents.formation.changes import Reshaping
 from agents.plugins import laws
+from agents.plugins.calls import call
 from agents.plugins.planners import Itinerary, Leg, Waypoints
-from agents.plugins.registry import FAILURES, PluginError
 
 
 class GoalDecision(msgspec.Struct, frozen=True):
@@ -159,12 +159,8 @@ class GoalComputer:
         """Offset of all rows (N, 3) [m]; raises PluginError, which names the law, if it fails."""
         law, neighbours, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        try:
-            offset = law.offset(position, believed, neighbours.links)
-        except FAILURES as error:
-            raise _failed(law, error) from error
-        if np.shape(offset) != position.shape:
-            raise PluginError(_wrong_shape(law, "offset", "a vector for each robot", position.shape, offset))
+        inputs = position, believed, neighbours.links
+        offset = call("law", law.offset, *inputs, shape=position.shape, each="a vector for each robot")
         return offset if anchors is None else offset + anchors.offset(position)
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
@@ -174,14 +170,8 @@ class GoalComputer:
         """
         law, neighbours = self._assignment.law, self.neighbours
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        try:
-            error = law.error(position, believed, neighbours.links)
-        except FAILURES as failure:
-            raise _failed(law, failure) from failure
-        if np.shape(error) != neighbours.links.receiver.shape:
-            raise PluginError(
-                _wrong_shape(law, "error", "one value for each link", neighbours.links.receiver.shape, error)
-            )
+        inputs, shape = (position, believed, neighbours.links), neighbours.links.receiver.shape
+        error = call("law", law.error, *inputs, shape=shape, each="one value for each link")
         both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
         if anchors is not None:
@@ -237,11 +227,3 @@ def _error_and_energy(error: Array) -> Array:
     both = np.empty((len(error), 2))  # `stack` takes three times as long
     both[:, 0], both[:, 1] = error, 0.5 * error * error
     return both
-
-
-def _failed(law: laws.Law, error: Exception) -> PluginError:
-    return PluginError(f"the law {type(law).__name__} failed: {type(error).__name__}: {error}")
-
-
-def _wrong_shape(law: laws.Law, method: str, wanted: str, shape: tuple[int, ...], given: Array) -> str:
-    return f"`{method}` of the law {type(law).__name__} must give {wanted}, {shape}, not {np.shape(given)}"

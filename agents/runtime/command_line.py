@@ -21,13 +21,13 @@ from agents.network.lab import LabError, secured
 
 
 @contextmanager
-def on_termination(end: Callable[[], object]) -> Iterator[None]:
-    """Inside, each SIGINT and SIGTERM calls `end`; afterwards the former handlers hold."""
+def on_termination(end: Callable[[], object], *more: signal.Signals) -> Iterator[None]:
+    """Inside, each SIGINT and SIGTERM, and each of `more`, calls `end`; afterwards the former handlers hold."""
 
     def handle(_signal: int, _frame: FrameType | None) -> None:
         end()
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, *more)}
     try:
         yield
     finally:
@@ -135,30 +135,20 @@ def detach() -> None:
     sys.stdout, sys.stderr = Output(1), Output(2)
 
 
-class Interrupts:
-    """Ctrl-C, SIGTERM and SIGHUP, polled: the first asks to land, the second ends at once.
+@contextmanager
+def interrupts() -> Iterator[Callable[[], bool]]:
+    """Inside, Ctrl-C, SIGTERM and SIGHUP are polled: the first asks to land, the second ends at once.
 
-    A SIGHUP that `nohup` ignores stays ignored.
+    Yields whether one has asked. A SIGHUP that `nohup` ignores stays ignored.
     """
+    asked = False
 
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._ask)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def __call__(self) -> bool:
-        return self.asked
-
-    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
-        if self.asked:
+    def ask() -> None:
+        nonlocal asked
+        if asked:
             raise KeyboardInterrupt
-        self.asked = True
+        asked = True
+
+    hang_up = () if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else (signal.SIGHUP,)
+    with on_termination(ask, *hang_up):
+        yield lambda: asked

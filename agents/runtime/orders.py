@@ -21,30 +21,27 @@ Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the 
 
 def carry_out(agent: Agent, row: int, order: Order, t: float, utc: float) -> Answer:
     """Carries out an order to one row at `t` [s] of a clock that was 0 at `utc` [s]."""
+    refusal = ""  # also of "inspect": the loop adds the inspection to the reply, it has the body
     match order.order:
         case "takeoff":
-            return agent.lifecycle.takeoff(row), None
-        case "start" | "go":
-            return (
-                _start(agent, row, order, t, utc)
-                if order.order == "start"
-                else _send_to_goal(agent, row, order.goal, t)
-            ), None
+            refusal = agent.lifecycle.takeoff(row)
+        case "start":
+            refusal = _start(agent, row, order, t, utc)
+        case "go":
+            refusal = _send_to_goal(agent, row, order.goal, t)
         case "hold":
-            return _hold(agent, row), None
+            refusal = _hold(agent, row)
         case "resume":
-            return _resume(agent, row), None
+            _resume(agent, row)
         case "leave":
             agent.lifecycle.land(row, "ordered to leave")
         case "land":
             agent.lifecycle.land(row, LAND)
         case "stop":
             agent.lifecycle.stop(row, STOP)
-        case "inspect":
-            pass  # the loop adds the inspection to the reply: it has the body
         case "get" | "set":
             return _parameter(agent, order)
-    return "", None
+    return refusal, None
 
 
 def _hold(agent: Agent, row: int) -> str:
@@ -54,11 +51,10 @@ def _hold(agent: Agent, row: int) -> str:
     return refusal
 
 
-def _resume(agent: Agent, row: int) -> str:
+def _resume(agent: Agent, row: int) -> None:
     agent.resume(row)
     if agent.lifecycle.reason[row] == PAUSED:
         agent.lifecycle.reason[row] = ""
-    return ""
 
 
 def _send_to_goal(agent: Agent, row: int, goal: tuple[float, float] | None, t: float) -> str:
@@ -75,8 +71,10 @@ def _start(agent: Agent, row: int, order: Order, t: float, utc: float) -> str:
         return f"start at {at} is not within this experiment; are the clocks set?"
     if origin is not None and not all(map(isfinite, origin)):
         return "the `origin` of a start is x, y, z, yaw, all of them known"
-    refusal = agent.start(row, at - utc, t, origin)
-    return refusal or _resume(agent, row)
+    if refusal := agent.start(row, at - utc, t, origin):
+        return refusal
+    _resume(agent, row)
+    return ""
 
 
 def _parameter(agent: Agent, order: Order) -> Answer:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from enum import Enum
 from math import inf, nan
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -14,6 +14,8 @@ import zenoh
 
 from agents.agent import Agent
 from agents.arrays import Array, Index, PoseTable
+from agents.decision.centralised import Centre
+from agents.decision.neighbours import NeighbourStates
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
@@ -175,16 +177,6 @@ def _session_of(sample: zenoh.Sample) -> str | None:
 NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
 
 
-class SenderStates(Protocol):
-    """Receiver of liveliness of senders, by links."""
-
-    def mark_alive(self, at: Index) -> None: ...
-
-    def mark_lost(self, at: Index, t: float) -> None: ...
-
-    def discard_poses(self, at: Index) -> None: ...
-
-
 class ModelledInbox:
     """Poses of several robots through the modelled channel, and their liveliness; polled."""
 
@@ -199,7 +191,7 @@ class ModelledInbox:
         keys: Keys,
         links: Mapping[str, Index],  # links of each sender
         conditions: Conditions,  # effects of the modelled channel on each link (E)
-        states: SenderStates,
+        states: NeighbourStates | Centre,
         *,
         reach: messages.Vector,
         rate: float,

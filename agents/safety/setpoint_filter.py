@@ -12,7 +12,7 @@ from agents.arrays import Array, Mask, Rows, clamp, every, norm, some, span
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.calls import call
 
 OUTSIDE_M = 0.25  # [m] outside the arena: no longer under control
 ABSURD = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
@@ -105,7 +105,8 @@ class SetpointFilter:
         self._limit(safe, here, yaw, age)
         avoided = no_row
         if avoidance is not None:
-            wished = _after_avoidance(safe, *avoidance)
+            restrain, own, near = avoidance[0].restrain, *avoidance[1:]
+            wished = call("avoidance", restrain, safe.copy(), own, near, shape=safe.shape, each="a setpoint per row")
             other = np.asarray((wished != safe).any(axis=1) & np.isfinite(wished).all(axis=1))
             other &= ~(invalid | not_finite)
             if some(other):
@@ -170,17 +171,3 @@ class SetpointFilter:
             v = v * np.where(amount > most, most / np.maximum(amount, ROUNDING), 1.0).min(axis=1)
         twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
         return twist
-
-
-def _after_avoidance(setpoint: Array, avoidance: Avoidance, own: OwnState, nearby: Nearby) -> Array:
-    """Setpoints (N, 4) after avoidance."""
-    name = type(avoidance).__name__
-    try:
-        wished = np.asarray(avoidance.restrain(setpoint.copy(), own, nearby), dtype=float)
-    except FAILURES as error:
-        raise PluginError(f"the avoidance {name} failed: {type(error).__name__}: {error}") from error
-    if wished.shape != setpoint.shape:
-        raise PluginError(
-            f"`restrain` of the avoidance {name} must give a setpoint per row, {setpoint.shape}, not {wished.shape}"
-        )
-    return wished

@@ -135,7 +135,7 @@ def preflight(
 
     import msgspec
 
-    from agents.runtime.command_line import Interrupts
+    from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions, Supervision
     from experiments.real_time.conductor.emergency import Emergency
@@ -149,7 +149,7 @@ def preflight(
     chosen(read, options.cases)
     folder, emergency = new_folder(read, out, "preflight"), Emergency()
     try:
-        with Interrupts() as interrupted:
+        with interrupts() as interrupted:
             found = check_robots(
                 read,
                 folder,

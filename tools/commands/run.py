@@ -275,21 +275,21 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     Returns:
         The run, none if it was ended at once; the reason of an emergency stop, else empty; the exit code.
     """
-    from agents.runtime.command_line import Interrupts
+    from agents.runtime.command_line import interrupts
     from experiments.real_time.conductor.conduct import Supervision, conduct
     from experiments.real_time.conductor.emergency import Emergency
     from experiments.run import read_back
     from tools.progress import shown
 
     emergency = Emergency()
-    with Interrupts() as interrupted:
+    with interrupts() as interrupted:
         try:
             user = Supervision(shown(quiet=quiet), interrupted, emergency, tell=warn)
             runs = [read_back(folder, *conduct(read, folder, options, user))]
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
-    return runs, emergency.words, STOPPED if emergency else 130 if interrupted.asked else 0
+    return runs, emergency.words, STOPPED if emergency else 130 if interrupted() else 0
 
 
 def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:

@@ -46,7 +46,7 @@ def chaos(
     """Run an experiment again and again while faults befall it, and say what did not hold."""
     import msgspec
 
-    from agents.runtime.command_line import Interrupts
+    from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder
     from tools.reliability import chaos_report
@@ -70,7 +70,7 @@ def chaos(
     waiting, barren = list(planned), 0
     outcomes: list[FaultResult] = []
     ends: list[RoundResult] = []
-    with Interrupts() as interrupted:
+    with interrupts() as interrupted:
         setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted, say)
         while waiting and not interrupted() and barren < BARREN:
             flown = ChaosRound(setting, take_round(waiting, experiment.duration_s), len(ends) + 1)
@@ -87,7 +87,7 @@ def chaos(
     else:
         _print(result)
         print(f"report: {page}")
-    if interrupted.asked:
+    if interrupted():
         return 130
     return 1 if result.violations or len(outcomes) < faults else 0
 

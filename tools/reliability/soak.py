@@ -28,7 +28,7 @@ def soak(
     as_json: AsJson = False,
 ) -> int:
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
-    from agents.runtime.command_line import Interrupts
+    from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder
     from tools.progress import print_findings
@@ -43,7 +43,7 @@ def soak(
     folder = new_folder(read, out)
     read.keep(folder / SOURCE)
     request = Request(str(folder / SOURCE), str(folder), name, changes, bodies)
-    with Interrupts() as interrupted:
+    with interrupts() as interrupted:
         soaked = sample(
             experiment,
             request,

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from agents.runtime.command_line import Interrupts
+from agents.runtime.command_line import interrupts
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def hang_up():
 
 def test_the_first_asks_and_the_second_insists(hang_up):
     hang_up(signal.SIG_DFL)
-    with Interrupts() as interrupted:
+    with interrupts() as interrupted:
         assert not interrupted()
         signal.raise_signal(signal.SIGHUP)
         assert interrupted()
@@ -28,7 +28,7 @@ def test_the_first_asks_and_the_second_insists(hang_up):
 
 def test_who_was_started_by_nohup_outlives_its_terminal(hang_up):
     hang_up(signal.SIG_IGN)
-    with Interrupts() as interrupted:
+    with interrupts() as interrupted:
         signal.raise_signal(signal.SIGHUP)
         assert not interrupted()
         signal.raise_signal(signal.SIGINT)
