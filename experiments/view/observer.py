@@ -57,8 +57,8 @@ class Observer:
     world: messages.WorldState | None
     scans: dict[str, messages.Ranges]  # last range readings, while they are asked for
 
-    def __init__(self, session: zenoh.Session, keys: Keys, clock: Clock | None = None) -> None:
-        self._session, self._keys, self._clock = session, keys, clock or Clock()
+    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session, self._keys, self._clock = session, keys, Clock()
         self._experiments = pubsub.pose_subscriber(session, keys.experiment, 4)
         self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
         self._poses = pubsub.subscriber(session, keys.pose("*"), DEPTH)

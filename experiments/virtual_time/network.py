@@ -85,7 +85,6 @@ class CentreLog:
     followed: PoseTable  # goals that robots acted on (`arrival`), with the same `extra`
     received: PoseTable  # poses, as the central controller received them
     lost_poses: Index  # (R,) of each robot, from the common start to the end of the experiment
-    lost_goals: Index  # (R,) to each robot
 
 
 class VirtualCentre:
@@ -113,11 +112,6 @@ class VirtualCentre:
         )
         self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
         self._seq: Index = np.zeros(rows, dtype=np.intp)
-
-    def _counted(self, channel: VirtualChannel, rows: Index) -> Index:
-        counts = np.zeros(len(self._seq), dtype=np.intp)
-        counts[rows] = channel.lost
-        return counts
 
     def transmit(self, t: float, poses: PoseTable, start: float) -> None:
         """Robots transmit their poses to the central controller; see `VirtualChannel.send`."""
@@ -159,12 +153,13 @@ class VirtualCentre:
 
     def logged(self, begin: float) -> CentreLog:
         """The log, with times since the common start at `begin` [s]."""
+        lost = np.zeros(len(self._seq), dtype=np.intp)
+        lost[self._poses_of] = self._poses.lost
         return CentreLog(
             sent=_goals(self._sent, begin),
             followed=_goals(self._followed, begin),
             received=_joined(self._received, begin),
-            lost_poses=self._counted(self._poses, self._poses_of),
-            lost_goals=self._counted(self._goals, self._goals_of),
+            lost_poses=lost,
         )
 
 

@@ -117,7 +117,7 @@ def world() -> Iterator[Target]:
     def make():
         net.forget()
         process = WorldProcess(experiment, Population(experiment), net.session, Event(), ownership=OwnershipCheck([]))  # type: ignore[arg-type]
-        process._exchange.utc = time.time()
+        process.exchange.utc = time.time()
         t = 0.0
 
         def take(data: bytes) -> None:

@@ -55,8 +55,10 @@ class CaseResult:
     lost: tuple[str, ...]
 
 
-class Conductor:
-    """Runs one case."""
+class CaseRun:
+    """A case with its processes, and its network as this process sees it."""
+
+    _view: NetworkView
 
     def __init__(self, context: CaseContext, show: Show) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
@@ -75,8 +77,22 @@ class Conductor:
         self._progress = Progress(
             context.case, "starting", None, experiment.duration_s, self._robots, clock=self._clock
         )
-        self._starting: set[str] = set()
         self._processes = CaseProcesses(context)
+
+    def _join(self, stack: ExitStack) -> None:
+        """Join the network; `stack` leaves it."""
+        self._view = NetworkView(stack, self._context, self._progress)
+        stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
+
+    def _show_progress(self) -> None:
+        """Show the progress, with new output of processes on other machines."""
+        now = self._clock.utc()
+        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
+        self._show(self._progress)
+
+
+class Conductor(CaseRun):
+    """Runs one case."""
 
     def run(self) -> CaseResult:
         """Run the case to its end, or until the user interrupts it; the robots are down in any case.
@@ -92,6 +108,7 @@ class Conductor:
             self._processes.prepare()
             with ExitStack() as stack:
                 self._join(stack)
+                self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
                 self._adopt()
                 self._processes.start()
                 if self._await_phase("ready", self._patience(), recorder=True):
@@ -282,11 +299,6 @@ class Conductor:
 
     # ------------------------------------------------------------------ what happens meanwhile
 
-    def _join(self, stack: ExitStack) -> None:
-        self._view = NetworkView(stack, self._context, self._progress)
-        stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
-        self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
-
     def _update(self) -> None:
         """Receive all since the last update."""
         now, report = self._clock.utc(), self._view.report
@@ -301,12 +313,11 @@ class Conductor:
             elif death.kind == "lost":
                 self._robots[death.source].alive = False
                 self._changes.mark_lost(death.source)
-        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
         for name, view in self._robots.items():
             if view.left_because == "lost" and view.alive and view.status is not None and now - view.status.stamp < 1.0:
                 self._come_back(name, view)
         self._changes.advance()
-        self._show(self._progress)
+        self._show_progress()
 
     def _miss(self, name: str) -> None:
         """Report an adopted robot whose token has vanished for good."""

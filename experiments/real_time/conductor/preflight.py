@@ -19,20 +19,18 @@ import msgspec
 
 from agents.body.interface import UNANSWERED
 from agents.body.kinds import TELLO
-from agents.clock import Clock
-from agents.network import messages, pubsub
-from agents.network.keys import Keys
+from agents.network import messages
 from agents.protocols import tello
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
-from experiments.file.document import Document, write_json
+from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, embody, staged
+from experiments.real_time.conductor.conductor import CaseRun
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from experiments.real_time.conductor.orders import start_lead_s
 from experiments.real_time.conductor.preflight_checks import DRIVE_M, HOP_M, Check, Observed, RobotChecks, Tried
-from experiments.real_time.conductor.run_view import OUTPUT, NetworkView, Progress, RobotView, Show
+from experiments.real_time.conductor.run_view import Show
 from experiments.real_time.hosts.launcher import LAND_S
 
 PREFLIGHT: Final = "preflight"  # name of the case, in files and on the console
@@ -110,19 +108,13 @@ def alone(experiment: Experiment) -> Experiment:
     )
 
 
-class Inspector:
+class Inspector(CaseRun):
     """Checks the robots of one case, see `check_robots`."""
 
     def __init__(self, context: CaseContext, show: Show, trials: Trials) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
-        self._context, self._show, self._trials = context, show, trials
-        self._experiment = experiment = context.experiment
-        context.file.write_bytes(write_json(experiment))
-        self._keys = Keys(experiment.network.realm)
-        self._clock = context.launcher.clock = Clock()
-        self._robots = {name: RobotView() for name in experiment.robots}
-        self._progress = Progress(PREFLIGHT, "starting", None, DRIVE_S, self._robots, clock=self._clock)
-        self._processes = CaseProcesses(context)
+        super().__init__(context, show)
+        self._trials = trials
         self._ended: dict[str, str] = {}  # last words of processes that have ended
         self._states: dict[str, list[messages.State]] = {}  # of the robots that are observed
 
@@ -319,13 +311,6 @@ class Inspector:
 
     # ------------------------------------------------------------------ parts of the above
 
-    def _join(self, stack: ExitStack) -> None:
-        self._view = NetworkView(stack, self._context, self._progress)
-        states = pubsub.subscriber(self._view.session, self._keys.state("*"), 4096)
-        self._telemetry = pubsub.Inbox(states, messages.State, keys=self._keys, robots=self._robots)
-        stack.callback(states.undeclare)
-        stack.callback(self._context.emergency.listen(self._view.session, self._keys).close)
-
     def _phase(self, text: str) -> None:
         self._progress.phase = text
         self._view.report("phase", "conductor", text)
@@ -334,7 +319,7 @@ class Inspector:
     def _update(self) -> None:
         """Take in what has happened since the last update."""
         self._view.update()
-        for state in self._telemetry.read():
+        for state in self._view.states:
             if state.robot in self._states:
                 self._states[state.robot].append(state)
         for death in self._processes.deaths():
@@ -344,9 +329,7 @@ class Inspector:
                 )
             else:
                 self._view.report(death.kind, death.source, death.text)
-        now = self._clock.utc()
-        self._progress.events += [messages.Event(now, OUTPUT, place, line) for place, line in self._processes.output()]
-        self._show(self._progress)
+        self._show_progress()
 
     def _wait(self, limit_s: float, true: Callable[[], bool]) -> bool:
         """Wait until something is true; False at the limit, or if the user or an emergency stop ends the checks."""

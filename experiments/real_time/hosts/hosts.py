@@ -55,9 +55,8 @@ def run_script(
         failed: Before the reason if it fails.
     """
     assert host.address is not None
-    text, *words = map(str, script)
     try:
-        command = ssh.script(host.address, text, words)
+        command = ssh.command(host.address, ["sh", "-c", *map(str, script)])
         done = subprocess.run(command, input=given, capture_output=True, check=False, timeout=limit_s)
     except subprocess.TimeoutExpired:
         raise HostError(f"{name}: {late}") from None

@@ -55,11 +55,6 @@ def command(address: str, words: Sequence[str], options: Sequence[str] = ()) -> 
     return ["ssh", "-T", *settings, *options, "--", address, f"exec {shlex.join(words)}"]
 
 
-def script(address: str, text: str, words: Sequence[str]) -> list[str]:
-    """The command line that runs a text in the plain shell of another machine, with words from $0 on."""
-    return command(address, ["sh", "-c", text, *words])
-
-
 def explained(address: str, zenpark: str, output: str) -> str:
     """Cause and remedy of a failed ssh, by its output."""
     for pattern, cause, remedy in _TROUBLE:

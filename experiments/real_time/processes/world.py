@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -72,7 +72,7 @@ class WorldProcess:
         self._keys = Keys(experiment.network.realm)
         self._engine = registry.split(experiment.world.engine)[0]
         self._dt = 1.0 / experiment.rates.body_hz
-        self._exchange = Exchange(experiment, population, session, ownership, endpoints)
+        self.exchange = Exchange(experiment, population, session, ownership, endpoints)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -81,13 +81,9 @@ class WorldProcess:
         self._carried = [name for name, here in names if here]
         self._farewell = Farewell(session, self._keys, self._carried, lost)
 
-    def find(self, there: Set[str]) -> list[str]:
-        """Places simulated robots that are on the network at the poses of their states; returns their names."""
-        return self._exchange.restore_positions(there)
-
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
-        exchange, pace, dt = self._exchange, self._pace, self._dt
+        exchange, pace, dt = self.exchange, self._pace, self._dt
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         zero = time.monotonic()
@@ -123,14 +119,14 @@ class WorldProcess:
             changed |= self._obey(query, order)
         if self._lost.is_set() and self.paused:
             self.paused, changed = False, True  # robots that must land cannot wait
-        self._exchange.receive(t)
+        self.exchange.receive(t)
         if not self.paused:
-            self._exchange.apply_commands(t)
+            self.exchange.apply_commands(t)
             self._population.advance()
             self._pace.ticks += 1
         if self._ownership.settle(self._session, self._ended):
             return
-        self._exchange.publish(t)
+        self.exchange.publish(t)
         if changed:
             self._report(t)
 
@@ -144,7 +140,7 @@ class WorldProcess:
                 self._carry_out(order)
             except Refused as refusal:
                 reason = str(refusal)
-                self._exchange.refuse("world", f"{order.order}: {reason}")
+                self.exchange.refuse("world", f"{order.order}: {reason}")
             reply = messages.WorldReply(not reason, self.paused, round(self._population.time, 6), reason)
             query.reply(self._keys.world_order, messages.encode(reply), encoding=messages.JSON)
             return not reason
@@ -158,10 +154,10 @@ class WorldProcess:
             self.paused = False
         else:
             population.reset(order.name)
-            self._exchange.restart()
+            self.exchange.restart()
 
     def _report(self, t: float) -> None:
-        population, exchange = self._population, self._exchange
+        population, exchange = self._population, self.exchange
         state = messages.WorldState(
             stamp=exchange.utc + t,
             engine=self._engine,
@@ -217,7 +213,7 @@ def serve(launch: WorldLaunch) -> int:
         own = joint.ownership
         world = WorldProcess(experiment, population, joint.session, lost, ownership=own, endpoints=endpoints)
         joint.declared.append(world)
-        back = world.find(there)
+        back = world.exchange.restore_positions(there)
         print(_ready(experiment, population, endpoints, back), flush=True)
         world.run(over)
     return 0
