@@ -11,6 +11,7 @@ from contextlib import redirect_stdout
 from functools import partial
 from io import StringIO
 from itertools import product
+from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ import zenoh
 from agents.arrays import Array, norm
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.drawing import DARK, LIGHT, Look, SceneDrawing, Shown, light
+from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
 from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer, RobotReport
@@ -125,11 +126,15 @@ def close_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-class ShowFolder:
-    """Check boxes for parts that are drawn on demand, and the camera."""
+class Page:
+    """A page: panel, camera, check boxes for parts that are drawn on demand, and the drawing of one case."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server, self.shown, self.camera = server, Shown(), Camera(server)
+    drawing: SceneDrawing
+
+    def __init__(self, server: viser.ViserServer, *, dark: bool) -> None:
+        self._server, self.look = server, DARK if dark else LIGHT
+        self.panel, self.shown, self.camera = Panel(server), Shown(), Camera(server)
+        self._plotted = self._tabled = -inf
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
             for name, text in (
@@ -145,17 +150,26 @@ class ShowFolder:
         if len(stage.names) > MANY:
             self._boxes["goals"].value = self.shown.goals = False
 
-    def draw_anew(self, former: SceneDrawing | None, stage: Stage, look: Look, panel: Panel) -> SceneDrawing:
-        """Drawing of a case in place of the one before, with its panel, and the camera on its arena."""
+    def begin(self, stage: Stage) -> None:
+        """Another case: its drawing in place of the one before, its panel, and the camera on its arena."""
         with self._server.atomic():
-            if former is not None:
-                former.remove()
-            drawing = SceneDrawing(self._server, stage, look)
+            if hasattr(self, "drawing"):
+                self.drawing.remove()
+            self.drawing = SceneDrawing(self._server, stage, self.look)
             self.fit(stage)
-            drawing.shown = self.shown
-            panel.set_stage(stage)
+            self.drawing.shown = self.shown
+            self.panel.set_stage(stage)
             self.camera.show(stage.size)
-        return drawing
+        self._plotted = self._tabled = -inf
+
+    def refresh(self, now: float, plot: Callable[[], object], tabulate: Callable[[], object]) -> None:
+        """Plots and tables at `now` [s, monotonic], if they are due."""
+        if now - self._plotted >= PLOT_S:
+            self._plotted = now
+            plot()
+        if now - self._tabled >= TABLE_S:
+            self._tabled = now
+            tabulate()
 
     def _set(self, name: str, event: viser.GuiEvent[Any]) -> None:
         setattr(self.shown, name, event.target.value)
@@ -175,16 +189,12 @@ class LiveView:
             acting: Orders of the page; None for an observer, which sees no buttons.
         """
         self._server, self._session, self._watched, self._acting = server, session, watched, acting
-        self._look = DARK if dark else LIGHT
         self.observer = Observer(session, Keys(watched.realm))
-        self._panel = Panel(server)
-        self._show = ShowFolder(server)
-        self._drawing: SceneDrawing | None = None
-        self._tabled = self._plotted = 0.0
+        self._page = Page(server, dark=dark)
         self._trailed: object = None
-        self._errors = LinkTracker(self.observer.stage)
         if acting is not None:
             acting.build(server)
+        self._begin()
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Draws while a page is open, until `ended`."""
@@ -192,8 +202,7 @@ class LiveView:
         while not ended():
             begun = time.monotonic()
             pages = bool(self._server.get_clients())
-            changed = self.observer.update()
-            if changed or self._drawing is None:
+            if self.observer.update():
                 self._begin()
             if pages:
                 self.draw(begun)
@@ -203,35 +212,30 @@ class LiveView:
     def _begin(self) -> None:
         """Another case."""
         stage = self.observer.stage
-        self._drawing = self._show.draw_anew(self._drawing, stage, self._look, self._panel)
+        self._page.begin(stage)
         self._errors = LinkTracker(stage)
         if self._acting is not None:
             self._acting.set_stage(stage)
 
     def draw(self, now: float) -> None:
         """Draws what is known now [s, monotonic]."""
-        assert self._drawing is not None
-        observer, moment = self.observer, self.observer.moment()
-        observer.watch_ranges(wanted=self._show.shown.ranges)
+        observer, page, moment = self.observer, self._page, self.observer.moment()
+        observer.watch_ranges(wanted=page.shown.ranges)
         moved, self._trailed = moment.trail is not self._trailed, moment.trail
         with self._server.atomic():
-            self._drawing.draw(moment, trails=moved, scans=observer.scans)
+            page.drawing.draw(moment, trails=moved, scans=observer.scans)
         if self._acting is not None:
             self._acting.follow(moment, [name for name, report in observer.robots.items() if report.alive])
-        if now - self._plotted >= PLOT_S:
-            self._plotted = now
-            self._plot(now, moment)
-        if now - self._tabled >= TABLE_S:
-            self._tabled = now
-            self._tabulate(moment)
+        page.refresh(now, partial(self._plot, now, moment), partial(self._tabulate, moment))
 
     def _plot(self, now: float, moment: Moment) -> None:
         rates = np.array([self.observer.robots[name].rate for name in self.observer.stage.names])
-        self._panel.history.add(now, self._errors.of_robots(moment.error), rates)
-        self._panel.show_plots()
+        panel = self._page.panel
+        panel.history.add(now, self._errors.of_robots(moment.error), rates)
+        panel.show_plots()
 
     def _tabulate(self, moment: Moment) -> None:
-        observer, stage = self.observer, self.observer.stage
+        observer, stage, panel = self.observer, self.observer.stage, self._page.panel
         errors = self._errors.of_robots(moment.error)
         rows = [
             _row(name, observer.robots[name], Condition(int(moment.condition[k])), known(errors[k]))
@@ -245,12 +249,12 @@ class LiveView:
         elif not phase:
             phase = "waiting for robots" if not stage.names else "not started"
         duration = stage.experiment.duration_s if stage.experiment is not None else 0.0
-        self._panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
-        self._panel.show_robots(rows)
+        panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
+        panel.show_robots(rows)
         net, names = stage.links, stage.names
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
-        self._panel.show_links(moment.error, [observer.robots[names[i]].delay.get(names[j]) for i, j in ends])
-        self._panel.show_events(list(observer.events), start)
+        panel.show_links(moment.error, [observer.robots[names[i]].delay.get(names[j]) for i, j in ends])
+        panel.show_events(list(observer.events), start)
 
 
 def _row(name: str, report: RobotReport, condition: Condition, error: float | None) -> Row:

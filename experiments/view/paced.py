@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from math import inf, isnan, nan
 from typing import TYPE_CHECKING, Final
 
@@ -13,10 +14,9 @@ import numpy as np
 from agents.decision.lifecycle import RUNNING
 from agents.network.messages import Event
 from experiments.definition.experiment import Experiment
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
-from experiments.view.live import FRAME_S, TABLE_S, ShowFolder
-from experiments.view.panel import PLOT_S, Panel, Row, known
+from experiments.view.live import FRAME_S, Page
+from experiments.view.panel import PLOT_S, Row, known
 from experiments.view.replay import CONDITION_OF, Clock, add_transport
 from experiments.virtual_time.simulation import Instant
 
@@ -32,13 +32,12 @@ class PacedView:
 
     def __init__(self, server: viser.ViserServer, *, pace: float, dark: bool) -> None:
         """`pace`: simulated seconds in one second, at first."""
-        self._server, self._look = server, DARK if dark else LIGHT
+        self._server = server
         self.clock = Clock(-inf, inf, -inf)
         self.clock.speed, self.clock.playing = pace, True
         with server.gui.add_folder("Virtual time", order=5.0):
             add_transport(server, self.clock, ("+1", "+1 s"))
-        self._panel, self._show = Panel(server), ShowFolder(server)
-        self._drawing: SceneDrawing | None = None
+        self._page = Page(server, dark=dark)
         self._opened = time.monotonic()
 
     def begin(self, case: str, experiment: Experiment) -> Callable[[Instant], object]:
@@ -50,8 +49,8 @@ class PacedView:
         self._sent, self._sent_at = [deque[float]() for _ in stage.names], np.full(rows, -inf)
         self._events: list[Event] = []
         self._incidents = 0
-        self._drawn = self._plotted = self._tabled = self._waited = -inf
-        self._drawing = self._show.draw_anew(self._drawing, stage, self._look, self._panel)
+        self._drawn = self._waited = -inf
+        self._page.begin(stage)
         self.clock.t = -inf
         return self.watch
 
@@ -117,24 +116,19 @@ class PacedView:
         )
 
     def _draw(self, instant: Instant, now: float) -> None:
-        assert self._drawing is not None
         moment = self._moment(instant)
         with self._server.atomic():
-            self._drawing.draw(moment, still=not self.clock.playing)
+            self._page.drawing.draw(moment, still=not self.clock.playing)
         errors = self._tracker.of_robots(moment.error)
-        history = self._panel.history
+        panel = self._page.panel
+        history = panel.history
         if not history.time or instant.now - history.time[-1] >= PLOT_S:
             history.add(instant.now, errors, np.array([float(len(each)) for each in self._sent]))
-        if now - self._plotted >= PLOT_S:
-            self._plotted = now
-            self._panel.show_plots()
-        if now - self._tabled >= TABLE_S:
-            self._tabled = now
-            self._tabulate(instant, moment)
+        self._page.refresh(now, panel.show_plots, partial(self._tabulate, instant, moment))
 
     def _tabulate(self, instant: Instant, moment: Moment) -> None:
         errors = self._tracker.of_robots(moment.error)
-        battery = instant.state.battery
+        battery, panel = instant.state.battery, self._page.panel
         rows = [
             Row(
                 name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
@@ -144,7 +138,7 @@ class PacedView:
         ]  # fmt: skip
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
-        self._panel.show_head(self._case, phase, moment.time, self._experiment.duration_s, where)
-        self._panel.show_robots(rows)
-        self._panel.show_links(moment.error, [None] * len(moment.error))
-        self._panel.show_events(self._events, 0.0)
+        panel.show_head(self._case, phase, moment.time, self._experiment.duration_s, where)
+        panel.show_robots(rows)
+        panel.show_links(moment.error, [None] * len(moment.error))
+        panel.show_events(self._events, 0.0)

@@ -16,11 +16,11 @@ from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
 from agents.network.messages import EMERGENCY, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing
+from experiments.scene.drawing import SceneDrawing
 from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
 from experiments.scene.tracks import LOST_S, Track, Tracks
-from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, ShowFolder
-from experiments.view.panel import HISTORY_S, PLOT_S, History, Panel, Row, known
+from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
+from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known
 
 if TYPE_CHECKING:
     import viser
@@ -196,24 +196,22 @@ class ReplayView:
         self._drawn: object = None
         self._tabled = -inf
         self._build_controls()
-        self._panel = Panel(server)
-        self._show = ShowFolder(server)
+        self._page = page = Page(server, dark=dark)
         self._shown = -1
-        look = DARK if dark else LIGHT
         self._drawings = []
         sizes = [film.stage.size for film in films]
         pitch = GAP * max(float(size[0]) for size in sizes)
         with server.atomic():
             for k, film in enumerate(films):
-                drawing = SceneDrawing(server, film.stage, look, root=f"/case{k}")
+                drawing = SceneDrawing(server, film.stage, page.look, root=f"/case{k}")
                 drawing.offset = ((k - 0.5 * (len(films) - 1)) * pitch, 0.0, 0.0)
-                self._show.fit(film.stage)
-                drawing.shown = self._show.shown
+                page.fit(film.stage)
+                drawing.shown = page.shown
                 if len(films) > 1:
                     drawing.name(film.tracks.case)
                 self._drawings.append(drawing)
         largest = np.max(sizes, axis=0)
-        self._show.camera.show(largest + np.array([pitch * (len(films) - 1), 0.0, 0.0]))
+        page.camera.show(largest + np.array([pitch * (len(films) - 1), 0.0, 0.0]))
         self._histories = [film.history() for film in films]
         self._choose(0)
 
@@ -232,7 +230,7 @@ class ReplayView:
     def draw(self) -> None:
         """Draws the present time, if it is not drawn already."""
         t = self.clock.t
-        shown = tuple(vars(self._show.shown).values())
+        shown = tuple(vars(self._page.shown).values())
         if (t, shown, self.clock.playing) == self._drawn:
             return
         self._drawn = (t, shown, self.clock.playing)
@@ -270,11 +268,11 @@ class ReplayView:
     def _choose(self, number: int) -> None:
         """Shows table and plots of one case."""
         self._shown = number
-        self._panel.set_stage(self._films[number].stage)
+        self._page.panel.set_stage(self._films[number].stage)
         self._drawn = None
 
     def _tabulate(self, t: float) -> None:
-        film, history, panel = self._films[self._shown], self._histories[self._shown], self._panel
+        film, history, panel = self._films[self._shown], self._histories[self._shown], self._page.panel
         tracks = film.tracks
         if abs(self._slider.value - t) > 0.5 * STEP_S:
             self._slider.value = round(t, 2)

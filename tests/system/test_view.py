@@ -248,8 +248,7 @@ def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> 
 
 
 def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
-    from experiments.scene.drawing import LIGHT, SceneDrawing  # noqa: PLC0415 - viser may be missing
-    from experiments.view.live import ShowFolder, close_server, open_server  # noqa: PLC0415
+    from experiments.view.live import Page, close_server, open_server  # noqa: PLC0415 - viser may be missing
 
     crowd = document.loads(
         'title = "a hundred"\nduration_s = 9.0\narena = { size = [12.0, 12.0, 3.0] }\n'
@@ -263,10 +262,8 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     ).cases()["default"]
     crowd_stage = Stage.of_experiment(crowd)
     server = open_server(int(free_endpoint(preferred_port=0).rpartition(":")[2]), "many", dark=False)
-    drawing, show = SceneDrawing(server, crowd_stage, LIGHT), ShowFolder(server)
-    show.fit(crowd_stage)
-    drawing.shown = show.shown
-    show.camera.show(crowd_stage.size)
+    shown = Page(server, dark=False)
+    shown.begin(crowd_stage)
     over = threading.Event()
     moment = Moment.unknown(crowd_stage)
     grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
@@ -281,7 +278,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
             ages = 0.1 * (step - 3.0 * np.arange(30))
             moment.trail = grid[:, None] + 0.2 * np.sin(ages)[None, :, None]
             with server.atomic():
-                drawing.draw(moment, trails=step % 6 == 0)
+                shown.drawing.draw(moment, trails=step % 6 == 0)
 
     moving = threading.Thread(target=move)
     moving.start()
