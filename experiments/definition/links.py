@@ -56,6 +56,11 @@ def link_pairs(text: str) -> tuple[tuple[str, str], ...]:
     return ((second, first),) if sign == ">" else ((second, first), (first, second))
 
 
+def pairs_or_none(text: str) -> tuple[tuple[str, str], ...]:
+    """The same; none if it reads otherwise, which is reported where links are checked."""
+    return link_pairs(text) if _LINK.fullmatch(text) else ()
+
+
 def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
     """Every possible link, in the robots' order: by receiver, then sender.
 

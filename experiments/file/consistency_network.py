@@ -11,7 +11,7 @@ from agents.network.endpoints import Endpoint
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment, LinkChannel
 from experiments.definition.link_conditions import link_effects
-from experiments.definition.links import link_pairs
+from experiments.definition.links import pairs_or_none
 from experiments.definition.plan import Plan
 from experiments.file.problems import Fault, Path, after_the_end, shown, unknown_robot
 
@@ -139,7 +139,7 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
         path = (*AT, text)
         yield from _link(experiment, there, text, path, on_key=True)
         yield from _bursts(link_effects(channel, own), path, own)
-        for pair in _pairs(text):
+        for pair in pairs_or_none(text):
             if pair in given:
                 message = f"the link {pair[1]} > {pair[0]} has its settings by '{given[pair]}' already"
                 yield Fault(path, message, "keep one of the two", on_key=True)
@@ -154,19 +154,11 @@ def channel_faults(experiment: Experiment) -> Iterator[Fault]:
             yield from unknown_robot((*where, "robots", k), robot, experiment.robots)
 
 
-def _pairs(text: str) -> tuple[tuple[str, str], ...]:
-    """Pairs of a link as `links.link_pairs`; none where the error is reported elsewhere."""
-    try:
-        return link_pairs(text)
-    except ValueError:
-        return ()
-
-
 def _link(
     experiment: Experiment, there: set[tuple[str, str]] | None, text: str, path: Path, *, on_key: bool = False
 ) -> Iterator[Fault]:
     """Faults of a text that names a link on which poses are sent; `there` are all of those, if known."""
-    both = _pairs(text)
+    both = pairs_or_none(text)
     if not both:
         yield Fault(path, f"{text!r} is no link", FORM, on_key=on_key)
         return

@@ -14,11 +14,12 @@ from typing import Any, Final
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import link_pairs
+from experiments.definition.links import link_pairs, pairs_or_none
 from experiments.file.problems import DocumentError, Fault, Path, refusal
 from experiments.file.structure import group_of, parameters
 
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
+_KEY: Final = re.compile(rf"(?:{_PART.pattern})++(?<!\.)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 SHAPE: Final = "shape"  # a link with its target from [formation.shape]
 _TARGETS: Final = frozenset({"distance", "offset", "bearing"})
@@ -185,7 +186,7 @@ def _needed_target(law: object) -> str:
 
 def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -> float | list[float]:
     """Distance [m], offset [m] or bearing of a link between places."""
-    if not _ends(text):
+    if not pairs_or_none(text):
         return 1.0 if word == "distance" else [1.0, 0.0]
     second, first = link_pairs(text)[0]
     places = []
@@ -240,29 +241,14 @@ def _as_table(value: object, path: Path) -> object:
 
 def _same_link(text: str, links: Mapping[str, Any]) -> str:
     """The key under which a document already has this link, or `text`."""
-    ends = _ends(text)
-    return text if text in links or not ends else next((key for key in links if _ends(key) == ends), text)
-
-
-def _ends(link: str) -> set[tuple[str, str]]:
-    """Its pairs; none if it cannot be read, which is reported where links are checked."""
-    try:
-        return set(link_pairs(link))
-    except ValueError:
-        return set()
+    ends = {*pairs_or_none(text)}
+    return text if text in links or not ends else next((key for key in links if {*pairs_or_none(key)} == ends), text)
 
 
 def _path(key: str) -> Path:
     """The parts of a dotted key; empty if it is none."""
-    path: list[str] = []
-    at = 0
-    while at < len(key):
-        match = _PART.match(key, at)
-        if match is None:
-            return ()
-        path.append(next(part for part in match.groups() if part is not None).strip())
-        at = match.end()
-    return () if key.rstrip().endswith(".") or "" in path else tuple(path)
+    parts = [next(filter(None, groups), "").strip() for groups in _PART.findall(key)]
+    return tuple(parts) if all(parts) and _KEY.fullmatch(key) else ()
 
 
 def _typed(text: str) -> object:

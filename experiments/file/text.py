@@ -22,10 +22,7 @@ _REMEDIES: Final = (
     ("Unterminated string", "a text lacks its closing quotes"),
     ("Illegal character", "a text lacks its closing quotes, or holds a character that cannot be typed"),
     ("Expected newline", "one key = value in a line; text stands in quotes, a comment begins with #"),
-    (
-        "Expected ']",
-        "a header is [table], or [[timeline]] with two brackets; names are letters, digits and _",
-    ),
+    ("Expected ']", "a header is [table], or [[timeline]] with two brackets; names are letters, digits and _"),
     ("Invalid initial character", "a key is letters, digits, _ and -, or stands in quotes"),
     ("Unescaped '\\'", "write a backslash twice, or use single quotes"),
 )
