@@ -180,6 +180,11 @@ class _Operation(Struct, frozen=True):
     world: str = ""
 
 
+class _Kind(Struct, frozen=True):
+    type: str = "formation"  # of the experience
+    mode: str = "distributed"  # of the architecture
+
+
 @dataclass(frozen=True)
 class Entry:
     """A value of a YAML file, with the file and the path of its key."""
@@ -220,7 +225,7 @@ class Entry:
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
-    """PyYAML's safe loader, which refuses a key that stands twice."""
+    """PyYAML's safe loader, which refuses a key that stands twice, and drops keys that hold nothing; keys are text."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
         keys = set()
@@ -230,7 +235,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
                     None, None, f"'{key.value}' stands twice in its table", key.start_mark
                 )
             keys.add(str(key.value))
-        return super().construct_mapping(node, deep)
+        made = super().construct_mapping(node, deep)
+        return {str(key): value for key, value in made.items() if value is not None}
 
 
 def load(file: str, text: str) -> Entry:
@@ -251,19 +257,7 @@ def load(file: str, text: str) -> Entry:
     if not isinstance(value, dict):
         hint = "an experiment of Robotic Park has sections such as Operation and Robots"
         raise refusal(file, "is no table of sections", hint)
-    return Entry(file, "", _without_empty(value, {}))
-
-
-def _without_empty(value: Any, done: dict[int, Any]) -> Any:  # noqa: ANN401 - whatever YAML holds
-    """A value without keys that hold nothing; keys are text. A table that stands in several places stays one."""
-    if isinstance(value, list):
-        return [_without_empty(each, done) for each in value]
-    if not isinstance(value, dict):
-        return value
-    if id(value) not in done:
-        made = done[id(value)] = {}
-        made.update({str(key): _without_empty(each, done) for key, each in value.items() if each is not None})
-    return done[id(value)]
+    return Entry(file, "", value)
 
 
 def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> Park:
@@ -284,18 +278,18 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
 
 def _sections(root: Entry, notes: list[str]) -> Park:
     """The format since December 2023."""
-    operation, architecture, listed = (root.get(key) for key in ("Operation", "Architecture", "Robots"))
-    if not root.has("Robots") or not listed.tables():
-        message = "has none" if root.has("Robots") else "'Robots' is missing"
-        hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
-        raise (listed if root.has("Robots") else root).refused(message, hint)
-    given, entries = operation.typed(_Operation), listed.tables()
+    hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
+    if not root.has("Robots"):
+        raise root.refused("'Robots' is missing", hint)
+    given, entries = root.get("Operation").typed(_Operation), root.get("Robots").tables()
+    if not entries:
+        raise root.get("Robots").refused("has none", hint)
     if given.tool and given.mode != "physical":
         tool = f"{given.tool} {given.world}".strip()
         notes.append(f"Operation: the simulator and its world ({tool}); twins are zenpark's own, in an empty arena")
-    if (kind := root.get("Experience").value.get("type", "formation")) != "formation":
+    if (kind := root.get("Experience").typed(_Kind).type) != "formation":
         notes.append(f"Experience: type {kind}; only formations are known")
-    mode = str(architecture.value.get("mode", "distributed"))
+    mode = root.get("Architecture").typed(_Kind).mode
     central = mode.lower() == CENTRAL
     if central and mode != CENTRAL:
         notes.append(f"Architecture: {mode}; their launcher starts a centre for '{CENTRAL}' alone, and for this"

@@ -300,6 +300,7 @@ def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
         ("type: distance", "type: bearing", "Robot01.task.type: Invalid enum value 'bearing'", 0),
         ("upperLimit: 0.1", "upperLimit: -0.2", "no step lies between", 0),
         ("Robots:\n", "Robots: none\nElse:\n", "Robots: Expected `object`, got `str`", 0),
+        ("Architecture:\n", "Architecture: none\nElse:\n", "Architecture: Expected `object`, got `str`", 0),
         ("Robots:\n", "Robotss:\n", "'Robots' is missing", 0),
         ("  mode: virtual ", " \tmode: virtual ", "", 3),
         ("tool: Webots", "tool: 'Webots", "", None),
