@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,29 +23,17 @@ from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 
 
-class VirtualChannel:
-    """The modelled channel for the links of all repetitions, each with random numbers of its own.
-
-    Attributes:
-        instant: A pose sent on a tick is received, or lost, before the decisions on it.
-    """
+class VirtualChannel(channel_model.Channel):
+    """The modelled channel for the links of all repetitions, each with random numbers of its own."""
 
     def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
         """`links` of all repetitions, those of the first seed first; each `stream` has random numbers of its own."""
-        self._channel = channel_model.Channel(
-            link_conditions.virtual_conditions(experiment, links, seeds, stream=stream)
-        )
-        self.instant = self._channel.instant
+        super().__init__(link_conditions.virtual_conditions(experiment, links, seeds, stream=stream))
         self._sender, self._rows = links.sender, len(experiment.robots) * len(seeds)
         self._names = tuple(experiment.robots)
         self._encoding: messages.Encoding = experiment.network.encoding
 
-    @property
-    def lost(self) -> Index:
-        """(E,) samples that did not get through; none before the common start."""
-        return self._channel.dropped
-
-    def send(self, t: float, poses: PoseTable, start: float) -> None:
+    def transmit(self, t: float, poses: PoseTable, start: float) -> None:
         """Transmits poses at `t` [s], whose `link` is the row of the sender.
 
         `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
@@ -55,13 +44,9 @@ class VirtualChannel:
         at = np.flatnonzero(which >= 0)
         if not len(at):
             return
-        if self._channel.limited:
+        if self.limited:
             poses = replace(poses, bytes=self._sizes(EPOCH + (t - start if t >= start else 0.0), poses))
-        self._channel.send(replace(poses.take(which[at]), link=at), start=start)
-
-    def due(self, t: float) -> PoseTable | None:
-        """Poses that have arrived by `t` [s], in order of arrival."""
-        return self._channel.due(t)
+        self.send(replace(poses.take(which[at]), link=at), start=start)
 
     def _sizes(self, stamp: float, poses: PoseTable) -> Index:
         """(K,) bytes of the payloads of poses, as a real network carries them."""
@@ -92,9 +77,6 @@ class VirtualCentre:
     between robots.
 
     Phases and the common start are the conductor's, and known at once, as they are to the robots.
-
-    Attributes:
-        centre: The decision.
     """
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
@@ -114,8 +96,8 @@ class VirtualCentre:
         self._seq: Index = np.zeros(rows, dtype=np.intp)
 
     def transmit(self, t: float, poses: PoseTable, start: float) -> None:
-        """Robots transmit their poses to the central controller; see `VirtualChannel.send`."""
-        self._poses.send(t, poses, start)
+        """Robots transmit their poses to the central controller; see `VirtualChannel.transmit`."""
+        self._poses.transmit(t, poses, start)
 
     def deliver(self, t: float, agent: Agent) -> None:
         """Delivers at `t` [s]: poses to the central controller, goals to the robots."""
@@ -148,13 +130,13 @@ class VirtualCentre:
             rows, self._seq[rows], now, now, goals.goal, np.zeros((len(rows), 3)), goals.yaw,
             extra=goals.pose_stamp[:, None],
         )  # fmt: skip
-        self._goals.send(t, sent, start)
+        self._goals.transmit(t, sent, start)
         self._sent.append(replace(sent, velocity=np.zeros((len(rows), 0))))
 
     def logged(self, begin: float) -> CentreLog:
         """The log, with times since the common start at `begin` [s]."""
         lost = np.zeros(len(self._seq), dtype=np.intp)
-        lost[self._poses_of] = self._poses.lost
+        lost[self._poses_of] = self._poses.dropped
         return CentreLog(
             sent=_goals(self._sent, begin),
             followed=_goals(self._followed, begin),
@@ -219,7 +201,7 @@ class VirtualNetwork:
         position, velocity = transmission.position[rows], transmission.velocity[rows]
         poses = PoseTable(rows, self._seq[rows], now, now, position, velocity, yaw[rows])
         self._sent.append(_bare(rows, poses.seq, now, now) if self._lean else poses)
-        self._channel.send(t, poses, start)
+        self._channel.transmit(t, poses, start)
         if self._centre is not None:
             self._centre.transmit(t, poses, start)
 
@@ -232,19 +214,11 @@ class VirtualNetwork:
         if self._centre is not None:
             self._centre.deliver(t, self._agent)
 
-    def sent(self, begin: float) -> PoseTable:
-        """Poses of all rows, which `link` holds; times since the common start at `begin` [s]."""
-        return _joined(self._sent, begin)
-
-    def received(self, begin: float) -> PoseTable:
-        """Poses that arrived on the links of all repetitions; likewise."""
-        return _joined(self._received, begin)
-
-    @property
-    def lost(self) -> Index:
-        """(E,) samples lost on each link, from the common start to the end of the experiment."""
-        return self._channel.lost
-
-    def centre_log(self, begin: float) -> CentreLog | None:
-        """Messages of the central controller; None if each robot decides for itself."""
-        return None if self._centre is None else self._centre.logged(begin)
+    def logged(self, begin: float) -> dict[str, Any]:
+        """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
+        return {
+            "sent": _joined(self._sent, begin),
+            "received": _joined(self._received, begin),
+            "lost": self._channel.dropped,
+            "centre": None if self._centre is None else self._centre.logged(begin),
+        }

@@ -163,9 +163,6 @@ def simulate(
         names=names,
         seeds=tuple(seeds),
         lean=lean,
-        sent=network.sent(begin),
-        received=network.received(begin),
-        lost=network.lost,
         decisions=agent.decisions,
         updates=agent.updates,
         interventions=interventions,
@@ -175,7 +172,7 @@ def simulate(
         airborne=conductor.airborne_at - begin,
         ended=tick * dt - begin,
         waited=conductor.waited,
-        centre=network.centre_log(begin),
         incidents=tuple(each._replace(time=each.time - begin) for each in agent.hazards.incidents),
+        **network.logged(begin),
         **columns,
     )

@@ -95,7 +95,6 @@ class TwinLaunch(Launch, frozen=True, kw_only=True):
     """Protocol twins of some robots."""
 
     names: Annotated[list[str], msgspec.Meta(title="ROBOT")]
-    faults: Annotated[str, msgspec.Meta(title="JSON", description="such as '{\"loss\": 0.05}'")] = "{}"
 
 
 def stand_in(launch: TwinLaunch) -> int:
@@ -107,9 +106,7 @@ def stand_in(launch: TwinLaunch) -> int:
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise refusal(launch.file, f"{', '.join(names)} cannot share a protocol twin", hint)
-    request = DeviceRequest(
-        bodies.body_request(experiment, names, [experiment.seed], endpoints), _faults(launch.faults)
-    )
+    request = DeviceRequest(bodies.body_request(experiment, names, [experiment.seed], endpoints), Faults())
     return _serve(words.pop(), request, experiment, endpoints, lifeline=launch.lifeline)
 
 
@@ -143,9 +140,9 @@ def by_hand(
     }
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
-    request = DeviceRequest(
-        bodies.body_request(experiment, list(robots), [experiment.seed], endpoints), _faults(faults), by_hand=True
-    )
+    injected = msgspec.convert(structure.parse_object("--faults", faults, Faults), Faults)
+    body = bodies.body_request(experiment, list(robots), [experiment.seed], endpoints)
+    request = DeviceRequest(body, injected, by_hand=True)
     return _serve(word, request, experiment, connect, identity=identity)
 
 
@@ -177,10 +174,6 @@ def _serve(
         declared.append(process)
         process.run(over)
     return 0
-
-
-def _faults(text: str) -> Faults:
-    return msgspec.convert(structure.parse_object("--faults", text, Faults), Faults)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ class Talk:
         if len(speak):
             self.seq[speak] += 1
             position = np.stack([np.arange(self.rows), np.full(self.rows, t), self.seq], axis=1).astype(float)
-            self.channel.send(t, sent(speak, self.seq[speak], t, position[speak]), self.start)
+            self.channel.transmit(t, sent(speak, self.seq[speak], t, position[speak]), self.start)
         self.tick += 1
 
     def run(self, ticks, speak):
@@ -120,8 +120,8 @@ def test_the_share_that_is_lost(loss):
     talk = Talk(Parameters(loss=loss)).run(5000, [0, 1]).run(2, [])
     _, got = talk.all()
     arrived = np.bincount(got.link, minlength=4)
-    np.testing.assert_array_equal(arrived + talk.channel.lost, 5000)
-    np.testing.assert_allclose(talk.channel.lost / 5000, loss, atol=0.025)
+    np.testing.assert_array_equal(arrived + talk.channel.dropped, 5000)
+    np.testing.assert_allclose(talk.channel.dropped / 5000, loss, atol=0.025)
     together = np.isin(got.seq[got.link == 1], got.seq[got.link == 2]).mean()  # links lose independently
     assert together == pytest.approx(1.0 - loss, abs=0.03)
 
@@ -129,9 +129,9 @@ def test_the_share_that_is_lost(loss):
 def test_everything_or_nothing():
     everything = Talk(Parameters(loss=1.0)).run(50, [0, 1, 2])
     assert everything.heard == []
-    assert everything.channel.lost.tolist() == [50] * 4
+    assert everything.channel.dropped.tolist() == [50] * 4
     nothing = Talk(Parameters(loss=0.0, jitter_s=0.001)).run(50, [0])
-    assert not nothing.channel.lost.any()
+    assert not nothing.channel.dropped.any()
 
 
 @settings(max_examples=20)
@@ -149,7 +149,7 @@ def test_repetitions_have_the_luck_that_they_would_have_alone(seed):
         for moment in speak[:, 3 * copy : 3 * copy + 3]:
             alone.step(np.flatnonzero(moment))
         mine = got.link // 4 == copy
-        np.testing.assert_array_equal(together.channel.lost[4 * copy : 4 * copy + 4], alone.channel.lost)
+        np.testing.assert_array_equal(together.channel.dropped[4 * copy : 4 * copy + 4], alone.channel.dropped)
         if not alone.heard:
             assert not mine.any()
             continue
@@ -163,7 +163,7 @@ def test_repetitions_have_the_luck_that_they_would_have_alone(seed):
 def test_a_network_without_links():
     talk = Talk(Parameters(loss=0.5, jitter_s=0.1), net=links([], [], []), names="A").run(10, [0])
     assert talk.heard == []
-    assert talk.channel.lost.shape == (0,)
+    assert talk.channel.dropped.shape == (0,)
 
 
 def test_nothing_is_lost_before_the_start_nor_waits_for_a_busy_link():
@@ -171,7 +171,7 @@ def test_nothing_is_lost_before_the_start_nor_waits_for_a_busy_link():
     _, got = talk.all()
     np.testing.assert_allclose(got.arrival - got.stamp, 0.001)
     assert got.stamp.max() == pytest.approx(0.49)
-    assert talk.channel.lost.tolist() == [0, 10, 10, 0]
+    assert talk.channel.dropped.tolist() == [0, 10, 10, 0]
 
 
 def test_before_the_start_is_known_nothing_is_lost():
@@ -204,7 +204,7 @@ def test_links_differ_by_name():
     assert set(got.link.tolist()) == {2, 3}
     np.testing.assert_allclose(delay[got.link == 2], 0.05)
     np.testing.assert_allclose(delay[got.link == 3], 0.01)
-    assert talk.channel.lost.tolist() == [20, 20, 0, 0]
+    assert talk.channel.dropped.tolist() == [20, 20, 0, 0]
 
 
 def test_the_default_is_what_it_was():
@@ -219,9 +219,9 @@ def test_what_goes_along_arrives_with_its_pose():
     for k in range(100):
         place = np.full((2, 3), float(k))
         poses = sent(np.array([0, 1]), np.full(2, k), 0.02 * k, place)
-        channel.send(0.02 * k, replace(poses, extra=place[:, :2] + 0.5), 0.0)
+        channel.transmit(0.02 * k, replace(poses, extra=place[:, :2] + 0.5), 0.0)
     got = channel.due(10.0)
-    assert len(got.link) == 400 - channel.lost.sum() < 300
+    assert len(got.link) == 400 - channel.dropped.sum() < 300
     np.testing.assert_array_equal(got.extra, got.position[:, :2] + 0.5)
 
 
@@ -229,7 +229,7 @@ def test_streams_have_their_own_luck():
     gone = []
     for stream in ("", "goals"):
         channel = VirtualChannel(crowd(Parameters(loss=0.5)), NET, [1], stream=stream)
-        gone.append(channel._channel.lost(np.zeros(2000, dtype=np.intp), np.arange(2000)))
+        gone.append(channel.lost(np.zeros(2000, dtype=np.intp), np.arange(2000)))
     assert (gone[0] & gone[1]).mean() == pytest.approx(0.25, abs=0.04)
 
 
