@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, RobotView, Shown
@@ -131,9 +130,7 @@ class Bar:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -184,9 +181,8 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def print_findings(findings: Sequence[Finding]) -> None:
-    """Print the verdict of a page, a line for each finding."""
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """The verdict of a page, a line for each finding."""
     from experiments.report.page import MARKS
 
-    for finding in findings:
-        print(f"{MARKS[finding.mark]} {finding.text}")
+    return [f"{MARKS[finding.mark]} {finding.text}" for finding in findings]

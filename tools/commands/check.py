@@ -24,6 +24,7 @@ from tools.commands.options import (
     check_bodies,
     example,
     print_json,
+    print_result,
     warn,
 )
 
@@ -131,8 +132,6 @@ def preflight(
     as_json: AsJson = False,
 ) -> int:
     """Check the robots of an experiment before the first flight; motors turn with --hop, --stop and --sticks only."""
-    import sys
-
     import msgspec
 
     from agents.runtime.command_line import interrupts
@@ -179,11 +178,7 @@ def preflight(
 
 def _print_checks(found: Sequence[RobotChecks]) -> None:
     """A table for each robot: a line for each check, and what to do about each that is not green."""
-    import shutil
-    import sys
-
-    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
-    lines = []
+    width, lines = _width(), []
     for robot in found:
         lines += ["", f"{robot.robot}  {robot.kind}  {robot.body}"]
         for check in robot.checks:
@@ -191,8 +186,19 @@ def _print_checks(found: Sequence[RobotChecks]) -> None:
             lines += textwrap.wrap(check.found, width, initial_indent=head, subsequent_indent=" " * len(head))
             if check.remedy:
                 lines += textwrap.wrap(check.remedy, width, initial_indent=" " * 21 + "→ ", subsequent_indent=" " * 23)
-    encoding = sys.stdout.encoding or "utf-8"
-    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
+    _print_text("\n".join(lines))
+
+
+def _width() -> int:
+    """Columns of print: those of the terminal, if it is not wide."""
+    import shutil
+
+    return min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
+
+
+def _print_text(text: str) -> None:
+    encoding = sys.stdout.encoding or "utf-8"  # a terminal may know neither ticks nor Greek
+    print(text.encode(encoding, "replace").decode(encoding))
 
 
 def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
@@ -201,12 +207,9 @@ def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figur
 
 
 def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
-    import shutil
-    import sys
-
     from experiments.check.check import MARK, ORDER
 
-    width = min(WIDEST, shutil.get_terminal_size((WIDEST, 24)).columns)
+    width = _width()
     lines = [f"{given.path}: {given.experiment.title}", ""]
     for each in found:
         lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
@@ -218,8 +221,7 @@ def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str
     lines += ["", *_rows(numbers), ""]
     count = {severity: sum(each.severity == severity for each in found) for severity in ORDER}
     lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
-    encoding = sys.stdout.encoding or "utf-8"  # a terminal may know neither ticks nor Greek
-    print("\n".join(lines).encode(encoding, "replace").decode(encoding))
+    _print_text("\n".join(lines))
 
 
 def _counted(count: int, what: str) -> str:
@@ -393,14 +395,10 @@ def import_(
     from experiments.authoring.robotic_park.convert import convert
 
     path, notes = convert(file, target, duration, poses)
-    if as_json:
-        print_json({"file": path, "notes": notes})
-        return
-    print(f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
-    if notes:
-        print("Not carried over, or not as it was:")
-        for note in notes:
-            print(textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    "))
+    lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
+    lines += ["Not carried over, or not as it was:"] * bool(notes)
+    lines += [textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    ") for note in notes]
+    print_result({"file": path, "notes": notes}, *lines, as_json=as_json)
 
 
 @app.command(name="list", epilog=example("list", "list --json"))
@@ -419,16 +417,17 @@ def list_(as_json: AsJson = False) -> None:
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
     }
-    if as_json:
-        found = {title.lower().replace(" ", "_"): registry.names(group) for title, group in plugins.items()}
-        print_json({"experiments": [{"name": name, "title": title} for name, title in catalogue.names()], **found})
-        return
-    width = max(len(name) for name, _ in catalogue.names())
-    print("Experiments (./zenpark run NAME, ./zenpark new NAME):")
-    for name, title in catalogue.names():
-        print(f"  {name:<{width}}  {title}")
-    for title, group in plugins.items():
-        print(f"{title}: {', '.join(registry.names(group))}")
+    experiments = catalogue.names()
+    found = {title: registry.names(group) for title, group in plugins.items()}
+    width = max(len(name) for name, _ in experiments)
+    print_result(
+        {"experiments": [{"name": name, "title": title} for name, title in experiments]}
+        | {title.lower().replace(" ", "_"): names for title, names in found.items()},
+        "Experiments (./zenpark run NAME, ./zenpark new NAME):",
+        *(f"  {name:<{width}}  {title}" for name, title in experiments),
+        *(f"{title}: {', '.join(names)}" for title, names in found.items()),
+        as_json=as_json,
+    )
 
 
 @app.command(epilog=example("schema > zenpark.schema.json"))

@@ -143,6 +143,14 @@ def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, st
     print(msgspec.json.format(text, indent=2).decode())
 
 
+def print_result(result: Any, *lines: str, as_json: bool) -> None:  # noqa: ANN401 - as `print_json`
+    """Print what a command has done: as JSON for scripts, as lines for people."""
+    if as_json:
+        print_json(result)
+    else:
+        print("\n".join(lines))
+
+
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:
     """Endpoints as given on the command line, with the certificates of a lab where one is named.
 

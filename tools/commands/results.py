@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from tools import completion
-from tools.commands.options import AsJson, example, print_json
+from tools.commands.options import AsJson, example, print_json, print_result
 
 if TYPE_CHECKING:
     from experiments.recording.run_folder import PastRun
@@ -96,10 +96,8 @@ def report(
         raise RecordingError(
             f"{target}: cannot be written: {error.strerror}; choose another place with --out"
         ) from None
-    if as_json:
-        print_json({"report": page, "runs": [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read]})
-    else:
-        print(page)
+    found = [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read] if as_json else []
+    print_result({"report": page, "runs": found}, str(page), as_json=as_json)
     return 0
 
 
@@ -164,10 +162,8 @@ def _report_sweep(
         rows = [*(row for row in rows if row.reference), *tried]
     target = Path(out or folder)
     pages.pictures(target, rows, joined=not searched, width=width)
-    if as_json:
-        print_json({"figures": target / "figures", "cells": len(rows)})
-    else:
-        print(target / "figures")
+    figures = target / "figures"
+    print_result({"figures": figures, "cells": len(rows)}, str(figures), as_json=as_json)
     return 0
 
 
@@ -355,10 +351,8 @@ def export(  # noqa: PLR0917 - a command line
         write_video(found.traces, file, speed)
     else:
         write_csv(found.traces, file)
-    if as_json:
-        print_json({"file": file, "cases": list(found.traces)})
-    else:
-        print(f"{file}: {', '.join(found.traces)}")
+    shown = {"file": file, "cases": list(found.traces)}
+    print_result(shown, f"{file}: {', '.join(found.traces)}", as_json=as_json)
 
 
 @app.command(epilog=example("recover runs/first/event.mcap"))
@@ -373,18 +367,13 @@ def recover(
     source = Path(file)
     chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
     found = repair(source, chosen)
-    if as_json:
-        print_json(
-            {
-                "file": source if found.complete else chosen,
-                "was_whole": found.complete,
-                "messages": found.messages,
-                "robots": found.robots,
-            }
-        )
-        return
-    what = f"{found.messages} messages of {', '.join(found.robots) or 'no robot'}"
-    print(f"{source} is whole already: {what}" if found.complete else f"{chosen}: {what}")
+    made = f"{source} is whole already" if found.complete else str(chosen)
+    shown = {"file": source if found.complete else chosen, "was_whole": found.complete}
+    print_result(
+        shown | {"messages": found.messages, "robots": found.robots},
+        f"{made}: {found.messages} messages of {', '.join(found.robots) or 'no robot'}",
+        as_json=as_json,
+    )
 
 
 def write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
@@ -574,8 +563,5 @@ def clean(
         shown.append({"folder": run.folder, "parts": parts, "removed": yes})
         if not as_json:
             print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
-    if as_json:
-        print_json(shown)
-        return 0
-    print(f"runs: {len(chosen)}" + ("" if yes or not chosen else "; --yes does it"))
+    print_result(shown, f"runs: {len(chosen)}" + "; --yes does it" * bool(chosen and not yes), as_json=as_json)
     return 0

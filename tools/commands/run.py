@@ -123,9 +123,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     read = load(origin.file, *origin.changes)
     _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
     _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
-    as_json = show.as_json and not origin.anyway
-    if not sound(read, options.cases, seeds=origin.seeds, as_json=as_json) and not origin.anyway:
-        print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
+    if not sound(read, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
     folder = new_folder(read, show.out)
     try:
@@ -319,14 +317,15 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
             raise refusal(option, "is for real time", "leave out --virtual")
 
 
-def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: bool) -> bool:
-    """Print the warnings and errors of the check of a run of so many seeds; False if there are errors.
+def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool) -> bool:
+    """Print the warnings and errors of the check of a run of so many seeds; False if errors keep it from being run.
 
     Args:
         read: The experiment.
         cases: Names of the cases to be run; all if none is named.
         seeds: How many are run.
-        as_json: Whether errors are on standard output as JSON too.
+        as_json: Whether errors that keep it from being run are on standard output as JSON too.
+        anyway: Whether it is run in spite of errors.
 
     Raises:
         DocumentError: If there is no such case.
@@ -338,10 +337,12 @@ def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: boo
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     for finding in found:
         print(finding, file=sys.stderr)
-    well = all(finding.severity != "error" for finding in found)
-    if as_json and not well:
+    if anyway or all(finding.severity != "error" for finding in found):
+        return True
+    if as_json:
         print_json({"ok": False, "error": "the check found errors", "findings": found})
-    return well
+    print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
+    return False
 
 
 def _command(origin: RunOrigin, options: RunOptions) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, example, print_json
+from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, example, print_result
 
 if TYPE_CHECKING:
     from experiments.sweep.optimise import TuningResult
@@ -66,8 +66,7 @@ def sweep(
     from tools.commands.run import sound
 
     changes = settings or []
-    if not sound(load(file, *changes), seeds=2, as_json=as_json and not anyway) and not anyway:
-        print("zenpark: not run; mend the file (`./zenpark check` says more), or run it --anyway", file=sys.stderr)
+    if not sound(load(file, *changes), seeds=2, as_json=as_json, anyway=anyway):
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimize is None:
@@ -92,10 +91,7 @@ def sweep(
         words += [part for setting in changes for part in ("--set", setting)]
         page = pages.write(found, shlex.join([*words, *(["--optimize", optimize] if optimize else [])]))
         lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
-    if as_json:
-        print_json(table)
-    else:
-        print("\n".join(lines))
+    print_result(table, *lines, as_json=as_json)
     if open_report and page is not None and code != INTERRUPTED:
         webbrowser.open(page.resolve().as_uri())
     return code

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Out, Settings, example, print_json
+from tools.commands.options import AsJson, File, Out, Settings, example, print_result
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
-    from tools.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
+    from tools.reliability.chaos_report import FaultResult, RoundResult
 
 app: Final = typer.Typer()
 
@@ -49,10 +49,12 @@ def chaos(
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder
+    from tools.progress import columns, finding_lines
     from tools.reliability import chaos_report
     from tools.reliability.chaos_report import ChaosResult
-    from tools.reliability.chaos_round import ChaosRound, Setting
+    from tools.reliability.chaos_round import ChaosRound
     from tools.reliability.fault_script import script, take_round
+    from tools.reliability.injection import Setting
 
     changes = [*defaults(load(file).experiment), *(settings or [])]
     read = load(file, *changes)
@@ -82,11 +84,9 @@ def chaos(
     words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
     words += [part for kind in kinds or () for part in ("--kinds", kind)]
     page = chaos_report.write(folder, result, " ".join(words))
-    if as_json:
-        print_json(result)
-    else:
-        _print(result)
-        print(f"report: {page}")
+    table, findings = chaos_report.table(result), chaos_report.findings(result)
+    lines = [*columns([table.head, *(tuple(map(str, row.cells)) for row in table.rows)]), *finding_lines(findings)]
+    print_result(result, *lines, f"report: {page}", as_json=as_json)
     if interrupted():
         return 130
     return 1 if result.violations or len(outcomes) < faults else 0
@@ -117,12 +117,3 @@ def _kinds(given: Sequence[str]) -> list[str]:
             hint = f"{did_you_mean(word, FAULTS)} there are: {', '.join(FAULTS)}"
             raise refusal(f"--kinds {word}", "no such fault", hint)
     return words or list(FAULTS)
-
-
-def _print(result: ChaosResult) -> None:
-    from tools.progress import columns, print_findings
-    from tools.reliability import chaos_report
-
-    made = chaos_report.table(result)
-    print("\n".join(columns([made.head, *(tuple(map(str, row.cells)) for row in made.rows)])))
-    print_findings(chaos_report.findings(result))

@@ -7,36 +7,24 @@ reach their routers through cables (`tools.reliability.cables`).
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import os
-import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from agents.arrays import Array
-from agents.body.kinds import KINDS
 from agents.network import messages
 from agents.network import session as network
-from agents.network.endpoints import free_endpoint
-from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from experiments.real_time.hosts.launcher import Launcher
-from tools.reliability.cables import Cables
 from tools.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
 from tools.reliability.fault_script import Fault, Round
-from tools.reliability.injection import Injector
+from tools.reliability.injection import Setting, SpoiltRun
 from tools.reliability.observer import Observer
-from tools.reliability.run_process import Request, WatchedRun
-from tools.reliability.spoilt_process import Switch
+from tools.reliability.run_process import WatchedRun
 
 POLL_S: Final = 0.02
 BEGIN_S: Final = 100.0  # to the common start
@@ -49,27 +37,12 @@ NOTICE_S: Final = 1.0  # after which it must have stopped
 FEWEST: Final = 3  # running robots with which a round goes on
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
 LEAD_S: Final = 1.0  # the start is announced not longer before
-LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
 DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
 NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
 REFUSED: Final = 2  # exit code of a process whose name is taken
 LANDED_S: Final = 40.0  # after the launcher's death or the end everything is gone
 LAST_BREATH_S: Final = 5.0  # from when a process cannot be found any more to when its exit code is known
 END_S: Final = 60.0  # and no round takes longer than this after its time
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Settings of all rounds."""
-
-    file: Path  # the experiment
-    case: str  # its case
-    experiment: Experiment  # the same, changes applied
-    folder: Path  # where each round gets a folder
-    changes: Sequence[str]  # as behind `--set`
-    seed: int  # of nonsense, which the script leaves open
-    interrupted: Callable[[], bool]  # by the user
-    say: Callable[[str], None]
 
 
 class _Over(Exception):
@@ -88,7 +61,7 @@ class _ActiveFault:
     events: int  # that had happened before
     incidents: dict[str, int]  # number of the last incident of each robot before
     note: str = ""
-    utc: float = field(default_factory=time.time)
+    utc: float = 0.0  # [s] by the wall clock, when it was done
     lifted: float = 0.0
     held_at: Array | None = None
     restarted: float | None = None
@@ -125,57 +98,30 @@ class ChaosRound:
 
     def run(self) -> RoundResult:
         """Run the round to its end; no process is left behind."""
-        setting, stage = self._setting, self._script.stage
+        setting = self._setting
         folder = setting.folder / f"round-{self._number:03}"
-        switches = folder / "switches"
-        switches.mkdir(parents=True)
-        experiment = setting.experiment
-        groups = {name: robot.process or name for name, robot in experiment.robots.items()}
-        routers = [free_endpoint(preferred_port=0) for _ in range(2 if stage == "two routers" else 1)]
-        recording = folder / f"{setting.case}.mcap"
-        own = [*setting.changes, f"network.listen={json.dumps(routers)}", f"network.routers={len(routers)}"]
-        if stage == "motion capture":
-            flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
-            own += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
-            own.append('positioning="vicon-twin"')
-        Switch(switches / "lease").write(LEASE_S if stage == "patient router" else 0.0)
         nearest, missed = math.inf, 0.0
         with ExitStack() as stack:
-            cables = stack.enter_context(Cables())
-            laid = {group: {end: cables.lay(group, end) for end in routers} for group in dict.fromkeys(groups.values())}
-            launcher = stack.enter_context(Launcher(folder / "logs"))
-            request = Request(str(setting.file), str(folder), setting.case, own, "world", laid, str(switches))
-            watched = self._watched = WatchedRun(launcher, request)
-            stack.callback(_sweep, watched)
+            run = self._run = SpoiltRun(stack, setting, self._script, folder, [setting.seed, self._number])
             try:
-                with network.open_session(routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
-                    self._observer = Observer(session, experiment)
-                    self._injector = Injector(
-                        watched,
-                        launcher,
-                        cables,
-                        self._observer,
-                        folder=switches,
-                        random=np.random.default_rng([setting.seed, self._number]),
-                        groups=groups,
-                        recording=recording,
-                    )
+                with network.open_session(run.routers, name="chaos", wait_s=BEGIN_S) as session:  # routers wait for it
+                    self._observer = Observer(session, setting.experiment)
                     with contextlib.suppress(_Over):
                         self._follow()
-                    self._injector.release()
                     nearest, missed = self._observer.invariants.nearest, self._missed_share()
             except network.Unreachable as error:
-                self._wrong.append(f"it never began: {error}; {watched.process.tail()}")
+                self._wrong.append(f"it never began: {error}; {run.watched.process.tail()}")
             if self._now is not None:  # put back: its recovery was not observed before the run ended
                 active = self._now
                 self._wrong += [f"{active.fault.kind} {active.victim}: {text}" for text in active.violations]
                 self._left.insert(0, active.fault)
-            gone_s = self._finish()
+            run.release()
+            gone_s = self._finish(run.watched)
         if self._started is not None:
-            self._wrong += recording_faults(recording, self.outcomes, disk_full=self._disk_full)
+            self._wrong += recording_faults(run.recording, self.outcomes, disk_full=self._disk_full)
         for each in self._wrong:
             setting.say(f"round {self._number}: {each}")
-        kept = folder.name if recording.exists() else ""
+        kept = folder.name if run.recording.exists() else ""
         return RoundResult(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
 
     # ------------------------------------------------------------------ the run
@@ -209,12 +155,12 @@ class ChaosRound:
 
     def _poll(self) -> float:
         """Wait a moment, and take in what has happened; return the time since the common start [s]."""
-        if not (self._watched.process.alive or self._conductor_dead):
+        if not (self._run.watched.process.alive or self._conductor_dead):
             raise _Over
         time.sleep(POLL_S)
         self._observer.update()
         now = time.monotonic()
-        for event in self._watched.news():
+        for event in self._run.watched.news():
             self._events.append(event)
             if event.kind == "start":
                 self._started = now + max(0.0, min(LEAD_S, event.stamp - time.time()))
@@ -264,7 +210,7 @@ class ChaosRound:
         observer.orders.clear()
         last = {name: status.incidents[-1].seq for name, status in observer.status.items() if status.incidents}
         active = self._now = _ActiveFault(fault, victim, time.monotonic(), t, running, len(self._events), last)
-        active.note = self._injector.begin(fault, victim)
+        active.note, active.utc = self._run.begin(fault, victim, observer.session), time.time()
         if fault.kind == "kill":
             self._dead[victim] = active.begun
         self._disk_full |= fault.kind == "disk"
@@ -273,7 +219,7 @@ class ChaosRound:
             t = self._poll()
             if fault.kind in ("freeze", "partition"):
                 self._check_held(active)
-        self._injector.end(fault)
+        self._run.end(fault)
         active.lifted = time.monotonic()
         well, why = self._settle(partial(self._not_recovered, active), t + HEAL_S + fault.properties.heals_s)
         if why:
@@ -378,10 +324,8 @@ class ChaosRound:
                 return f"the loss of {victim} is not reported"
             self._off.add(victim)
             active.restarted = time.monotonic()
-            self._injector.restart(victim)
-        if (
-            why := self._injector.answer.reason or self._injector.answer.refused.get(victim)
-        ) and not self._run_is_over():
+            self._run.restart(victim, self._observer.session)
+        if (why := self._run.answer.reason or self._run.answer.refused.get(victim)) and not self._run_is_over():
             active.add_violation(f"{victim} is not let in again: {why}")
             return ""
         if victim not in self._observer.alive:
@@ -397,7 +341,7 @@ class ChaosRound:
         return ""
 
     def _after_double(self, active: _ActiveFault, live: Set[str]) -> str:
-        victim, second = active.victim, self._injector.second
+        victim, second = active.victim, self._run.second
         assert second is not None
         for order in self._observer.orders:
             if order.robot == victim and not self._run_is_over():
@@ -465,9 +409,9 @@ class ChaosRound:
 
     # ------------------------------------------------------------------ the end
 
-    def _finish(self) -> float:
+    def _finish(self, watched: WatchedRun) -> float:
         """End the run if it has not ended; return the time until all its processes had ended [s]."""
-        watched, began = self._watched, time.monotonic()
+        began = time.monotonic()
         if watched.process.alive:
             watched.close()
         deadline = began + LANDED_S
@@ -490,10 +434,3 @@ class ChaosRound:
         statuses = [status for name, status in self._observer.status.items() if name not in stopped and status.ticks]
         ticks, missed = (sum(getattr(status, what) for status in statuses) for what in ("ticks", "missed"))
         return round(missed / (ticks + missed), 4) if ticks else 0.0
-
-
-def _sweep(watched: WatchedRun) -> None:
-    """Kill what is left of the run, whatever happened."""
-    for pid in watched.processes():
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)

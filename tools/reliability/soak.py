@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, Bodies, Case, Out, Settings, example, print_json
+from tools.commands.options import AsJson, Bodies, Case, Out, Settings, example, print_result
 
 app: Final = typer.Typer()
 
@@ -31,7 +31,7 @@ def soak(
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.recording.run_folder import SOURCE, new_folder
-    from tools.progress import print_findings
+    from tools.progress import finding_lines
     from tools.reliability import soak_verdict
     from tools.reliability.run_process import Request
     from tools.reliability.soak_sampler import sample
@@ -53,12 +53,8 @@ def soak(
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)
     page = soak_verdict.write(folder, soaked, findings, f"./zenpark soak {file} --minutes {minutes:g}")
-    if as_json:
-        found = [{"mark": finding.mark, "text": finding.text} for finding in findings]
-        print_json({"run": folder, "passed": well, "findings": found})
-    else:
-        print_findings(findings)
-        print(f"report: {page}")
+    shown = {"run": folder, "passed": well, "findings": findings}
+    print_result(shown, *finding_lines(findings), f"report: {page}", as_json=as_json)
     if soaked.interrupted:
         return 130
     return 0 if well else 1
