@@ -72,7 +72,8 @@ class Drone:
         self.trajectories = Trajectories(self.memories)
         self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
         self._start()
-        self._answer: dict[int, Callable[[int, bytes], None]] = {
+        # answer to a packet on the same port and channel, or None
+        self._answer: dict[Port, Callable[[int, bytes], bytes | None]] = {
             Port.LINK: self._link,
             Port.PLATFORM: self._platform,
             Port.SUPERVISOR: self._supervisor,
@@ -111,9 +112,10 @@ class Drone:
 
     def receive(self, port: int, channel: int, data: bytes) -> None:
         """Process one packet."""
-        answer = self._answer.get(port)
-        if answer is not None and (self.on or (port == Port.LINK and channel == 3)):
-            answer(channel, data)
+        if port in self._answer and (self.on or (port == Port.LINK and channel == 3)):
+            answer = self._answer[Port(port)](channel, data)
+            if answer is not None:
+                self.send(Port(port), channel, answer)
 
     def console(self, text: str) -> None:
         """Send text on the console port."""
@@ -128,29 +130,26 @@ class Drone:
 
     # ------------------------------------------------------------------ connection
 
-    def _link(self, channel: int, data: bytes) -> None:
-        if channel == 0:  # echo
-            self.send(Port.LINK, 0, data)
-        elif channel == 1:
-            self.send(Port.LINK, 1, crtp.GREETING)
-        elif channel == 3 and not data:
-            self.send(Port.LINK, 3, b"")
-        elif channel == 3 and data[0] == crtp.NRF:
-            self.send(Port.LINK, 3, data[:2] + (crtp.ADDRESS if data[1] == PowerSwitch.RESET_BEGIN else b""))
-            if data[1] != PowerSwitch.RESET_BEGIN:
-                self.on = data[1] in (PowerSwitch.ON, PowerSwitch.RESET)
-                self.flock.restart(self.row)
-                self._start()
+    def _link(self, channel: int, data: bytes) -> bytes | None:
+        if channel == 3 and data[:1] == bytes((crtp.NRF,)):
+            if data[1] == PowerSwitch.RESET_BEGIN:
+                return data[:2] + crtp.ADDRESS
+            self.on = data[1] in (PowerSwitch.ON, PowerSwitch.RESET)
+            self.flock.restart(self.row)
+            self._start()
+            return data[:2]
+        answers = {0: data, 1: crtp.GREETING, 3: None if data else b""}  # 0: echo
+        return answers.get(channel)
 
-    def _platform(self, channel: int, data: bytes) -> None:
-        if channel == 1 and data[0] == 0:
-            self.send(Port.PLATFORM, 1, b"\0" + struct.pack("<I", crtp.VERSION))
-        elif channel == 1 and data[0] == 1:
-            self.send(Port.PLATFORM, 1, b"\1twin")
-        elif channel == 0 and data[0] == Platform.ARM:
-            self.send(Port.PLATFORM, 0, data[:1] + self._arm(on=bool(data[1])))
-        elif channel == 0 and data[0] == Platform.RECOVER:
-            self.send(Port.PLATFORM, 0, data[:1] + self._recover())
+    def _platform(self, channel: int, data: bytes) -> bytes | None:
+        command = channel, data[0]
+        if command == (crtp.VERSIONS, 0):
+            return b"\0" + struct.pack("<I", crtp.VERSION)
+        if command == (crtp.VERSIONS, crtp.FIRMWARE):
+            return b"\1twin"
+        if command == (0, Platform.ARM):
+            return data[:1] + self._arm(on=bool(data[1]))
+        return data[:1] + self._recover() if command == (0, Platform.RECOVER) else None
 
     def _arm(self, *, on: bool) -> bytes:
         """Arm or disarm; returns success and state."""
@@ -161,84 +160,83 @@ class Drone:
         done = self.flock.supervisor.recover(self.row)
         return bytes((done, done))
 
-    def _supervisor(self, channel: int, data: bytes) -> None:
-        command, answer = data[0], bytes((data[0] | Safety.ANSWER,))
-        supervisor = self.flock.supervisor
-        if channel == 0 and command == Safety.ASK:
-            self.send(Port.SUPERVISOR, 0, answer + struct.pack("<H", self.flock.info(self.row)))
-        elif channel == 1 and command == Safety.ARM:
-            self.send(Port.SUPERVISOR, 1, answer + self._arm(on=bool(data[1])))
-        elif channel == 1 and command == Safety.RECOVER:
-            self.send(Port.SUPERVISOR, 1, answer + self._recover())
-        elif channel == 1 and command == Safety.STOP:
-            supervisor.stop(self.row)
-        elif channel == 1 and command == Safety.WATCHDOG:
-            supervisor.reset_watchdog(self.row, self.flock.t)
+    def _supervisor(self, channel: int, data: bytes) -> bytes | None:
+        command, answer = (channel, data[0]), bytes((data[0] | Safety.ANSWER,))
+        if command == (0, Safety.ASK):
+            return answer + struct.pack("<H", self.flock.info(self.row))
+        if command == (1, Safety.ARM):
+            return answer + self._arm(on=bool(data[1]))
+        if command == (1, Safety.RECOVER):
+            return answer + self._recover()
+        if command == (1, Safety.STOP):
+            self.flock.supervisor.stop(self.row)
+        elif command == (1, Safety.WATCHDOG):
+            self.flock.supervisor.reset_watchdog(self.row, self.flock.t)
+        return None
 
     # ------------------------------------------------------------------ parameters, logs, memories
 
-    def _table(self, port: Port, table: Table, data: bytes, limits: bytes = b"") -> None:
+    @staticmethod
+    def _table(table: Table, data: bytes, limits: bytes = b"") -> bytes | None:
         if data[0] == Toc.INFO:
-            self.send(port, 0, crtp.TOC_INFO.pack(Toc.INFO, len(table.items), table.crc) + limits)
-        elif data[0] == Toc.ITEM:
+            return crtp.TOC_INFO.pack(Toc.INFO, len(table.items), table.crc) + limits
+        if data[0] == Toc.ITEM:
             (number,) = crtp.IDENT.unpack_from(data, 1)
-            self.send(port, 0, data[:3] + table.items[number] if number < len(table.items) else data[:1])
+            return data[:3] + table.items[number] if number < len(table.items) else data[:1]
+        return None
 
-    def _param(self, channel: int, data: bytes) -> None:
+    def _param(self, channel: int, data: bytes) -> bytes | None:
         table = self.parameters
         if channel == 0:
-            self._table(Port.PARAM, table, data)
-            return
+            return self._table(table, data)
         if channel == 3:
-            self._param_misc(data)
-            return
+            return self._set_by_name(data) if data[0] == Misc.SET_BY_NAME else self._param_misc(data)
         (number,) = crtp.IDENT.unpack_from(data)
         if number >= len(table.variables):
-            self.send(Port.PARAM, channel, data[:2] + bytes((Status.UNKNOWN,)))
-            return
+            return data[:2] + bytes((Status.UNKNOWN,))
         variable = table.variables[number]
-        if channel == 1:
-            self.send(Port.PARAM, 1, data[:2] + b"\0" + pack(variable.type, self.values[number]))
-        elif not variable.flags & READ_ONLY:  # a write to a constant is never answered
-            (value,) = _numbers(PACKINGS[variable.type], data[2:])
-            self.send(Port.PARAM, 2, data)
-            self._set(number, value)
+        if channel == crtp.PARAM_READ:
+            return data[:2] + b"\0" + pack(variable.type, self.values[number])
+        if variable.flags & READ_ONLY:
+            return None  # a write to a constant is never answered
+        (value,) = _numbers(PACKINGS[variable.type], data[2:])
+        self._set(number, value)
+        return data
 
-    def _param_misc(self, data: bytes) -> None:
-        variables = self.parameters.variables
-        if data[0] == Misc.SET_BY_NAME:
-            group, name, rest = data[1:].split(b"\0", 2)
-            number = self.parameters.number.get(f"{group.decode()}.{name.decode()}")
-            status = Status.UNKNOWN
-            if number is not None and PARAMETER_CODES[variables[number].type] == rest[0]:
+    def _set_by_name(self, data: bytes) -> bytes:
+        group, name, rest = data[1:].split(b"\0", 2)
+        number = self.parameters.number.get(f"{group.decode()}.{name.decode()}")
+        status = Status.UNKNOWN
+        if number is not None:
+            kind = self.parameters.variables[number].type
+            if PARAMETER_CODES[kind] == rest[0]:
                 status = Status.OK
-                self._set(number, _numbers(PACKINGS[variables[number].type], rest[1:])[0])
-            self.send(Port.PARAM, 3, data[: len(group) + len(name) + 3] + bytes((status,)))
-            return
+                self._set(number, _numbers(PACKINGS[kind], rest[1:])[0])
+        return data[: len(group) + len(name) + 3] + bytes((status,))
+
+    def _param_misc(self, data: bytes) -> bytes | None:
+        variables = self.parameters.variables
         command, number = crtp.ITEM.unpack_from(data)
         known = data[: crtp.ITEM.size]
         if number >= len(variables):
-            self.send(Port.PARAM, 3, known + bytes((Status.UNKNOWN,)))
-            return
+            return known + bytes((Status.UNKNOWN,))
         variable = variables[number]
         extended = bytes((1 if variable.flags & EXTENDED else 0,))
         default = pack(variable.type, variable.value)
-        if command == Misc.EXTENDED:
-            self.send(Port.PARAM, 3, known + extended)
-        elif command == Misc.EXTENDED_2:
-            self.send(Port.PARAM, 3, known + b"\0" + extended)
-        elif command == Misc.DEFAULT_2:
-            self.send(Port.PARAM, 3, known + b"\0" + default)
-        elif command == Misc.STORE:
+        if command == Misc.STORE:
             self.stored[number] = self.values[number]
-            self.send(Port.PARAM, 3, known + b"\0")
         elif command == Misc.CLEAR:
             self.stored.pop(number, None)
-            self.send(Port.PARAM, 3, known + b"\0")
-        elif command == Misc.STORED:
-            kept = self.stored.get(number)
-            tail = b"\0" + default if kept is None else b"\1" + default + pack(variable.type, kept)
-            self.send(Port.PARAM, 3, known + tail)
+        kept = self.stored.get(number)
+        answers = {
+            Misc.EXTENDED: extended,
+            Misc.EXTENDED_2: b"\0" + extended,
+            Misc.DEFAULT_2: b"\0" + default,
+            Misc.STORE: b"\0",
+            Misc.CLEAR: b"\0",
+            Misc.STORED: b"\0" + default if kept is None else b"\1" + default + pack(variable.type, kept),
+        }
+        return known + answers[command] if command in answers else None
 
     def _set(self, number: int, value: float) -> None:
         """Set a parameter and apply its effect."""
@@ -256,30 +254,29 @@ class Drone:
         elif name in TOLD and value:
             self.console(TOLD[name])
 
-    def _log(self, channel: int, data: bytes) -> None:
+    def _log(self, channel: int, data: bytes) -> bytes | None:
         if channel == 0:
-            self._table(Port.LOG, self._log_table, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
-        elif channel == 1:
-            block = data[1] if len(data) > 1 else 0
-            status = self.logs.execute(data[0], block, data[2:], self.flock.t)
-            self.send(Port.LOG, 1, bytes((data[0], block, status)))
+            return self._table(self._log_table, data, bytes((crtp.LOG_BLOCKS, crtp.LOG_VARIABLES)))
+        if channel != 1:
+            return None
+        block = data[1] if len(data) > 1 else 0
+        return bytes((data[0], block, self.logs.execute(data[0], block, data[2:], self.flock.t)))
 
-    def _memory(self, channel: int, data: bytes) -> None:
-        kinds, memories = self.memories.kinds, self.memories
+    def _memory(self, channel: int, data: bytes) -> bytes | None:
+        memories = self.memories
         if channel == 0:
             if data[0] == 1:
-                self.send(Port.MEMORY, 0, bytes((1, memories.count)))
-            elif data[0] == 2 and (listed := memories.listed(data[1])) is not None:
-                self.send(Port.MEMORY, 0, crtp.MEMORY_INFO.pack(2, data[1], *listed))
-            return
+                return bytes((1, memories.count))
+            listed = memories.listed(data[1]) if data[0] == 2 else None
+            return None if listed is None else crtp.MEMORY_INFO.pack(2, data[1], *listed)
         number, address = crtp.MEMORY.unpack_from(data)
         head, rest = data[: crtp.MEMORY.size], data[crtp.MEMORY.size :]
         read: bytes | None = b""
         if channel == 1:
             read = memories.read_number(number, address, rest[0])
-        elif number >= len(kinds) or not memories.write(kinds[number], address, rest):
+        elif number >= len(memories.kinds) or not memories.write(memories.kinds[number], address, rest):
             read = None
-        self.send(Port.MEMORY, channel, head + bytes((Status.IO if read is None else Status.OK,)) + (read or b""))
+        return head + (bytes((Status.IO,)) if read is None else bytes((Status.OK,)) + read)
 
     # ------------------------------------------------------------------ motion
 
@@ -317,8 +314,8 @@ class Drone:
             x, y, z = (crtp.MM * value for value in values[:3])
             self._command(target=(x, y, z), heading=crtp.yaw_of(values[9]))
 
-    def _high_level(self, _channel: int, data: bytes) -> None:
-        self.send(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),)))
+    def _high_level(self, _channel: int, data: bytes) -> bytes:
+        return data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),))
 
     def _plan(self, command: int, group: int, data: bytes) -> Status:
         flock, row, planner = self.flock, self.row, self.flock.planner
@@ -350,10 +347,11 @@ class Drone:
 
     def _climb(self, command: int, pose: Array, data: bytes) -> Status:
         height, yaw, keep, span = _numbers(crtp.CLIMB, data)
-        planner = self.flock.planner
-        climb = planner.takeoff if command == HighLevel.TAKEOFF else planner.land
         yaw = float(pose[3]) if keep else yaw
-        return climb(self.row, self.flock.t, pose, height=height, yaw=yaw, span=span)
+        landing = command == HighLevel.LAND
+        return self.flock.planner.climb(
+            self.row, self.flock.t, pose, height=height, yaw=yaw, span=span, landing=landing
+        )
 
     def _go_to(self, _: int, pose: Array, data: bytes) -> Status:
         relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
@@ -389,11 +387,11 @@ class Drone:
 
     # ------------------------------------------------------------------ position
 
-    def _location(self, channel: int, data: bytes) -> None:
+    def _location(self, channel: int, data: bytes) -> bytes | None:
         flock, row = self.flock, self.row
         if channel == 0:
             flock.estimator.add_external(row, flock.t, _numbers(crtp.VECTOR, data))
-            return
+            return None
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
             x, y, z, *_ = _numbers(crtp.POSE, rest)
@@ -403,16 +401,12 @@ class Drone:
                 flock.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))
         elif kind == Location.STORE_LIGHTHOUSE:
             flock.memories[row].stored = struct.unpack_from("<HH", rest)
-            self.send(Port.LOCATION, 1, bytes((Location.STORE_LIGHTHOUSE, 1)))
+            return bytes((Location.STORE_LIGHTHOUSE, 1))
         elif kind == Location.STOP:
             flock.supervisor.stop(row)
         elif kind == Location.WATCHDOG:
             flock.supervisor.reset_watchdog(row, flock.t)
-
-    @property
-    def planned(self) -> Plan:
-        """State of the planner."""
-        return Plan(self.flock.planner.plan[self.row])
+        return None
 
 
 def _numbers(packing: struct.Struct, data: bytes) -> tuple[Any, ...]:

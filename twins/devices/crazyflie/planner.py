@@ -72,20 +72,19 @@ class Planner:
         self._coefficients = np.zeros((rows, 4, ORDER + 1))
         self._rest: list[list[Piece]] = [[] for _ in range(rows)]  # pieces after the current one
 
-    def takeoff(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
-        """Plan a vertical motion to `height` [m]; refused unless idle."""
-        if self.plan[row] != Plan.IDLE:
-            return Status.REFUSED
-        self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
-        self.plan[row] = Plan.FLYING
-        return Status.OK
+    def climb(
+        self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float, landing: bool
+    ) -> Status:
+        """Plan a vertical motion to `height` [m]: a landing with motors off at its end, or a take-off.
 
-    def land(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> Status:
-        """Plan a vertical motion to `height` [m], then motors off; refused while landing."""
-        if self.plan[row] == Plan.LANDING:
+        A take-off is refused unless idle, a landing while landing.
+        """
+        if self.plan[row] == Plan.LANDING if landing else self.plan[row] != Plan.IDLE:
             return Status.REFUSED
-        self._vertical(row, t, pose, height=height, yaw=yaw, span=span)
-        self.plan[row] = Plan.LANDING
+        span, zero = max(span, SHORTEST), np.zeros(4)
+        goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
+        self._start(row, t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
+        self.plan[row] = Plan.LANDING if landing else Plan.FLYING
         return Status.OK
 
     def go_to(
@@ -200,11 +199,6 @@ class Planner:
         if elapsed >= self._span[row]:
             speed, acceleration = np.zeros(4), np.zeros(4)
         return pose, speed, acceleration
-
-    def _vertical(self, row: int, t: float, pose: Array, *, height: float, yaw: float, span: float) -> None:
-        span, zero = max(span, SHORTEST), np.zeros(4)
-        goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
-        self._start(row, t, [(span, polynomial(span, (pose, zero, zero), (goal, zero, zero)))])
 
     def _start(self, row: int, t: float, pieces: Sequence[Piece]) -> None:
         (self._span[row], self._coefficients[row]), *self._rest[row] = pieces

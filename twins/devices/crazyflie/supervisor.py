@@ -136,22 +136,15 @@ class Supervisor:
 
     def info(self, row: int) -> Info:
         """Flags of a row, without those of the planner."""
-        state = State(self.state[row])
-        info = Info(0)
-        if state == State.DISARMED and not self.tumbled[row]:
-            info |= Info.CAN_BE_ARMED
-        if self.armed(row):
-            info |= Info.ARMED
-        if self.may_fly[row]:
-            info |= Info.CAN_FLY
-        if self._auto[row]:
-            info |= Info.AUTO_ARM
-        if state in (State.FLYING, State.LEVEL):
-            info |= Info.FLYING
-        if self.tumbled[row]:
-            info |= Info.TUMBLED
-        if state == State.LOCKED:
-            info |= Info.LOCKED
-        if state == State.CRASHED:
-            info |= Info.CRASHED
-        return info
+        state, tumbled = self.state[row], self.tumbled[row]
+        flags = {
+            Info.CAN_BE_ARMED: state == State.DISARMED and not tumbled,
+            Info.ARMED: self.armed(row),
+            Info.CAN_FLY: self.may_fly[row],
+            Info.AUTO_ARM: self._auto[row],
+            Info.FLYING: state in (State.FLYING, State.LEVEL),
+            Info.TUMBLED: tumbled,
+            Info.LOCKED: state == State.LOCKED,
+            Info.CRASHED: state == State.CRASHED,
+        }
+        return Info(sum(flag for flag, holds in flags.items() if holds))

@@ -42,7 +42,7 @@ def test_polynomial_meets_both_ends(begin, end, span):
 def test_chained_plans_are_smooth():
     """A new goal in the middle of a plan: position and velocity do not jump."""
     planner = Planner(1)
-    planner.takeoff(0, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0)
+    planner.climb(0, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=2.0, landing=False)
     for t, goal in ((1.0, [1.0, 0.5, 1.2, 1.0]), (1.7, [-0.5, 0.2, 0.8, -2.9]), (2.1, [0.0, 0.0, 1.0, 2.9])):
         before = [planner.goal(t - h)[0] for h in (2e-4, 1e-4)]
         planner.go_to(0, t, np.zeros(4), np.zeros(3), goal=np.array(goal), span=1.5, relative=False, linear=False)
@@ -58,7 +58,7 @@ def test_chained_plans_are_smooth():
 def test_relative_and_linear_plans():
     planner = Planner(2)
     for row in range(2):
-        planner.takeoff(row, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0)
+        planner.climb(row, 0.0, np.zeros(4), height=1.0, yaw=0.0, span=1.0, landing=False)
     goal, at = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
     planner.go_to(0, 2.0, at, np.zeros(3), goal=goal, span=2.0, relative=True, linear=True)
     assert planner.goal(2.5)[0] == pytest.approx([0.25, 0.0, 1.0, 0.0])

@@ -394,7 +394,7 @@ def test_nature_is_that_of_the_other_twin():
     asked = request("crazyflie", ["x"], disturbance=nature)
     flock, plain = Flock(asked, Faults()), TwinBody(asked)
     plain.takeoff(np.array([0]), np.array([0.5]))
-    flock.planner.takeoff(0, 0.0, np.zeros(4), height=0.5, yaw=0.0, span=1.25)
+    flock.planner.climb(0, 0.0, np.zeros(4), height=0.5, yaw=0.0, span=1.25, landing=False)
     noise = []
     for tick in range(1, 401):
         flock.advance(0.01 * tick)
