@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array
-from experiments.metrics.results import INDICES, Approach, CaseMetrics, RobotMetrics, ShadowMetrics
+from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 
 _NESTED: Final = ("phases", "near", "near_arena", "shadow")
@@ -77,15 +77,11 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
         row: dict[str, object] = {field: getattr(robot, field) for field in _PLAIN}
         for k, phase in enumerate(robot.phases, start=2):
             row |= {f"phase{k}_{what}": getattr(phase, what) for what in ("acquired_s", "residual", "worst")}
-        row |= _flat_approach("near", robot.near) | _flat_approach("near_arena", robot.near_arena)
+        for what, near in (("near", robot.near), ("near_arena", robot.near_arena)):
+            if near is not None:
+                row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
         row |= _flat_shadow(robot.shadow) if robot.shadow else {}
         yield {"seed": case.seed, "case": case.case, "in_mean": int(robot.robot not in out), **row}
-
-
-def _flat_approach(what: str, near: Approach | None) -> dict[str, float | str]:
-    if near is None:
-        return {}
-    return {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:

@@ -15,6 +15,7 @@ from experiments.metrics.statistics import Spread
 from experiments.recording import version
 
 if TYPE_CHECKING:
+    from jinja2 import Template
     from matplotlib.figure import Figure
 
 NONE: Final = "–"
@@ -77,9 +78,6 @@ class Finding:
     text: str
 
 
-TEMPLATE: Final = "report.html.jinja"
-
-
 @dataclass(frozen=True)
 class PageFigure:
     """An SVG drawing to stand in the page, with its number and caption."""
@@ -123,6 +121,15 @@ class Section:
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
+def template(name: str) -> Template:
+    """A template of this folder, which escapes what it is given."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return pages.get_template(name)
+
+
 def render(
     target: Path,
     *,
@@ -141,16 +148,7 @@ def render(
         foot: Code and versions of this process if left out.
         replay: HTML of an embedded replay, trusted as it is, shown right after the findings; none if left out.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415 - for pages alone
-
-    pages = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = pages.get_template(TEMPLATE).render(
+    page = template("report.html.jinja").render(
         title=title,
         source=source,
         facts=facts,

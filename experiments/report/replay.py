@@ -13,7 +13,7 @@ from agents.arrays import Array
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
 from experiments.report import trajectories
-from experiments.report.page import inline
+from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
 from experiments.scene.stage import FAIR_M, GOOD_M, Stage
@@ -24,30 +24,6 @@ STEP_S: Final = 0.1  # between two samples
 NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
 QUIET: Final = ("robot", "says", "clock", "router")  # kinds of events that are not on the slider
 SCRIPT: Final = Path(__file__).with_name("replay.js")
-LINKS: Final = "Links: green within {good:g} cm of their target, amber within {fair:g} cm, red beyond."
-PAGE: Final = """<h2>Replay</h2>
-<style>
-.film canvas {{ width: 100%; height: min(60vh, 26rem); display: block; touch-action: none; cursor: grab; }}
-.film .bar {{ display: flex; gap: .6rem; align-items: center; flex-wrap: wrap; }}
-.film .slide {{ flex: 1; min-width: 12rem; position: relative; }}
-.film input {{ width: 100%; margin: 0; }}
-.film .marks {{ position: relative; height: .6rem; margin: 0 .5rem; }}
-.film .marks i {{ position: absolute; width: .3rem; height: .6rem; background: #d55e00; cursor: pointer; }}
-.film output {{ min-width: 4em; text-align: right; }}
-figure.still svg, .still figcaption {{ max-width: none; }}
-@media print {{ .film {{ display: none; }} .still[hidden] {{ display: block; }} }}
-</style>
-<figure class="still">{still}<figcaption>{label}, at {at:g} s of the run. {links}</figcaption></figure>
-<div class="film" id="film" hidden><canvas tabindex="0" aria-label="{label}"></canvas>
-<div class="bar"><button type="button">Play</button><div class="slide"><div class="marks"></div>
-<input type="range" step="0.01" aria-label="Time"></div><output></output>
-<select aria-label="Speed"><option value="0.25">¼×</option><option value="0.5">½×</option>
-<option value="1" selected>1×</option><option value="2">2×</option><option value="5">5×</option>
-<option value="10">10×</option></select></div>
-<p class="said" aria-live="off"></p>
-<small>Drag to turn, Ctrl and wheel to come closer. {links}</small></div>
-<script>{script}(document.getElementById("film"), {film});</script>
-"""
 
 
 def embedded(traces: Sequence[Trace]) -> str:
@@ -58,10 +34,16 @@ def embedded(traces: Sequence[Trace]) -> str:
     content = _replay_data(first)
     film = json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
     label = "Replay of " + ", ".join(trace.case for trace in first)
-    script = SCRIPT.read_text("utf-8").replace("</", "<\\/").strip()
-    at, links = content["still"], LINKS.format(good=100 * GOOD_M, fair=100 * FAIR_M)
-    still = _still_picture(first, at, f"{label}, at {at:g} s")
-    return PAGE.format(label=_plain(label), links=links, at=at, still=still, script=script, film=film)
+    at = f"{content['still']:g}"
+    return template("replay.html.jinja").render(
+        label=label,
+        at=at,
+        still=_still_picture(first, content["still"], f"{label}, at {at} s"),
+        good=f"{100 * GOOD_M:g}",
+        fair=f"{100 * FAIR_M:g}",
+        script=SCRIPT.read_text("utf-8").replace("</", "<\\/").strip(),
+        film=film,
+    )
 
 
 def _still_picture(traces: Sequence[Trace], at: float, label: str) -> str:
@@ -71,10 +53,6 @@ def _still_picture(traces: Sequence[Trace], at: float, label: str) -> str:
     figure, show = trajectories.film(traces)
     show(at)
     return inline(svg(figure), "still-", label)
-
-
-def _plain(text: str) -> str:
-    return "".join(letter for letter in text if letter.isalnum() or letter in " ,-_.")
 
 
 def _replay_data(traces: Sequence[Trace]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from typing import Any, Final, Generic, TypeVar
 
@@ -134,48 +135,42 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Numbers of the formation as a whole, a table for each unit; without rows of what did not occur in any case."""
     phases = range(max(len(case.starts_s) for case in cases))
     several = max(map(len, by_case(cases).values())) > 1
-    ends = {k: f"Worst link{_phase_end(cases, k, len(phases))}" for k in phases}
-    lengths: list[Line] = [(ends[k], lambda case, k=k: _worst(case, k), 100.0) for k in phases]  # type: ignore[misc]
-    lengths += [
-        ("Belief error, RMS", attrgetter("belief_rms"), 100.0),
-        ("Belief error, largest", attrgetter("belief_max"), 100.0),
-        ("Closest robots, between centres", attrgetter("closest"), 100.0),
-        (
-            "Closest robots, between surfaces",
-            lambda case: None if case.near is None else case.near.gap,
-            100.0,
-        ),
-        ("Closest to the arena", lambda case: None if case.near_arena is None else case.near_arena.gap, 100.0),
-        ("Farthest outside the arena", attrgetter("excursion"), 100.0),
-    ]
+
+    def phased(field: str, scale: float) -> list[Line]:
+        """A line for each phase."""
+
+        def value(case: CaseMetrics, k: int) -> float | None:
+            values = getattr(case, field)
+            return values[k] if k < len(values) else None
+
+        return [(_phase(cases, k).strip() or "from the start", partial(value, k=k), scale) for k in phases]
+
     units: dict[str, list[Line]] = {
-        "Acquired by all followers [s]": [
-            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _value_at(case.acquired_s, k), 1.0)  # type: ignore[misc]
-            for k in phases
+        "Acquired by all followers [s]": phased("acquired_s", 1.0),
+        "Distances [cm]": [
+            *((f"Worst link{_phase_end(cases, k, len(phases))}", partial(_worst, k=k), 100.0) for k in phases),
+            ("Belief error, RMS", _value("belief_rms"), 100.0),
+            ("Belief error, largest", _value("belief_max"), 100.0),
+            ("Closest robots, between centres", _value("closest"), 100.0),
+            ("Closest robots, between surfaces", _value("near.gap"), 100.0),
+            ("Closest to the arena", _value("near_arena.gap"), 100.0),
+            ("Farthest outside the arena", _value("excursion"), 100.0),
         ],
-        "Distances [cm]": lengths,
-        "Net rotation [mrad/s]": [
-            (_phase(cases, k).strip() or "from the start", lambda case, k=k: _value_at(case.rotation_rad_s, k), 1000.0)  # type: ignore[misc]
-            for k in phases
-        ],
+        "Net rotation [mrad/s]": phased("rotation_rad_s", 1000.0),
         "Delay of poses [ms]": [
             ("mean", lambda case: _delay(case, mean_delay), 1000.0),
-            (
-                "longest",
-                lambda case: _delay(case, lambda links: _known(max, (each.delay_max for each in links))),
-                1000.0,
-            ),
+            ("longest", lambda case: _delay(case, lambda links: _known(max, (e.delay_max for e in links))), 1000.0),
         ],
         "Share of all ticks [%]": [
-            ("Changed by safety", attrgetter("intervened_share"), 100.0),
-            ("Changed by avoidance", attrgetter("avoided_share"), 100.0),
-            ("Missed deadlines", attrgetter("missed_share"), 100.0),
+            ("Changed by safety", _value("intervened_share"), 100.0),
+            ("Changed by avoidance", _value("avoided_share"), 100.0),
+            ("Missed deadlines", _value("missed_share"), 100.0),
         ],
         "Collisions": [("Number", lambda case: float(len(case.collisions)), 1.0)],
         "Hardest impulse [mN s]": [
             ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
-        "Cost (a number without unit)": [("J2", attrgetter("j2"), 1.0)],
+        "Cost (a number without unit)": [("J2", _value("j2"), 1.0)],
     }
     tables = [
         replace(_table_by_case(unit, cases, lines), note=EXTREMES if several and unit in EXTREME_UNITS else "")
@@ -186,9 +181,9 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         for field, label in TROUBLES
     ]
     tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
-    if any(case.belief for case in cases):  # a formation that was never acquired is a result
-        return tables[0], *(shown for table in tables[1:] if (shown := _occurred(table)).rows)
-    return tuple(shown for table in tables if (shown := _occurred(table)).rows)
+    formed = any(case.belief for case in cases)  # a formation that was never acquired is a result
+    shown = [table if formed and table is tables[0] else _occurred(table) for table in tables]
+    return tuple(table for table in shown if table.rows)
 
 
 def _occurred(table: Table) -> Table:
@@ -209,27 +204,24 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
     grouped = by_case(cases)
     reference, first = next(iter(grouped.items()))
 
-    def centre(name: str) -> Callable[[CaseMetrics], float | None]:
-        return lambda case: getattr(case.guidance, name, None)
-
     table = _table_by_case(
         "Architecture",
         cases,
         [
-            ("Messages of the network", attrgetter("network_messages"), 1.0),
+            ("Messages of the network", _value("network_messages"), 1.0),
             ("of them poses of robots", lambda case: sum(robot.messages for robot in case.robots), 1.0),
-            ("of them goals of the centre", centre("goals"), 1.0),
-            ("Deliveries", attrgetter("deliveries"), 1.0),
-            ("Payload [kB]", attrgetter("network_bytes"), 0.001),
-            ("Goals per second", centre("goals_hz"), 1.0),
-            ("Goals that were lost", centre("goals_lost"), 1.0),
-            ("Poses that the centre never got", centre("poses_lost"), 1.0),
-            ("Delay, mean [ms]", centre("delay_mean_s"), 1000.0),
-            ("Delay, 95 % are below [ms]", centre("delay_p95_s"), 1000.0),
-            ("Delay, longest [ms]", centre("delay_max_s"), 1000.0),
-            ("Load of the centre, mean [% of a core]", centre("load"), 100.0),
-            ("Load of the centre, busiest second [% of a core]", centre("load_max"), 100.0),
-            ("Decisions that came too late", centre("missed"), 1.0),
+            ("of them goals of the centre", _value("guidance.goals"), 1.0),
+            ("Deliveries", _value("deliveries"), 1.0),
+            ("Payload [kB]", _value("network_bytes"), 0.001),
+            ("Goals per second", _value("guidance.goals_hz"), 1.0),
+            ("Goals that were lost", _value("guidance.goals_lost"), 1.0),
+            ("Poses that the centre never got", _value("guidance.poses_lost"), 1.0),
+            ("Delay, mean [ms]", _value("guidance.delay_mean_s"), 1000.0),
+            ("Delay, 95 % are below [ms]", _value("guidance.delay_p95_s"), 1000.0),
+            ("Delay, longest [ms]", _value("guidance.delay_max_s"), 1000.0),
+            ("Load of the centre, mean [% of a core]", _value("guidance.load"), 100.0),
+            ("Load of the centre, busiest second [% of a core]", _value("guidance.load_max"), 100.0),
+            ("Decisions that came too late", _value("guidance.missed"), 1.0),
         ],
     )
     rows = [Row(("Decides", *(architecture_of(runs[0]) for runs in grouped.values()))), *table.rows]
@@ -464,32 +456,16 @@ def collision_table(cases: Sequence[CaseMetrics]) -> Table:
 
 def clocks_table(traces: Sequence[Trace]) -> Table:
     """Clock offsets of other machines from the conductor's, and the error left in the stamps."""
-    rows = [
-        Row(
-            (
-                *(trace.case, offset.host, ", ".join(offset.robots)),
-                *(f"{1e3 * offset.first:+.3f}", f"{1e3 * offset.last:+.3f}", f"{1e3 * offset.uncertainty:.3f}"),
-                ""
-                if offset.drift is None
-                else f"{1e6 * offset.drift:+.1f} ± {2e6 * offset.uncertainty / offset.over:.1f}",
-                *(f"{1e3 * (offset.last - offset.first):+.3f}", f"{1e3 * offset.worst:.3f}"),
-            )
-        )
-        for trace in traces
-        for offset in trace.clocks
-    ]
-    heading = (
-        "Case",
-        "Host",
-        "Robots",
-        "Offset before [ms]",
-        "after [ms]",
-        "± [ms]",
-        "Drift [ppm]",
-        "Added [ms]",
-        "Left [ms]",
-    )
-    return Table(heading, tuple(rows), words=True)
+    rows = []
+    for case, offset in ((trace.case, offset) for trace in traces for offset in trace.clocks):
+        drift = ""
+        if offset.drift is not None:
+            drift = f"{1e6 * offset.drift:+.1f} ± {2e6 * offset.uncertainty / offset.over:.1f}"
+        before = (f"{1e3 * offset.first:+.3f}", f"{1e3 * offset.last:+.3f}", f"{1e3 * offset.uncertainty:.3f}")
+        left = (f"{1e3 * (offset.last - offset.first):+.3f}", f"{1e3 * offset.worst:.3f}")
+        rows.append(Row((case, offset.host, ", ".join(offset.robots), *before, drift, *left)))
+    head = ("Case", "Host", "Robots", "Offset before [ms]", "after [ms]", "± [ms]", "Drift [ppm]")
+    return Table((*head, "Added [ms]", "Left [ms]"), tuple(rows), words=True)
 
 
 def events_tables(traces: Sequence[Trace]) -> tuple[Table, tuple[str, Table] | None]:
@@ -541,8 +517,10 @@ def _known(what: Callable[[Iterable[Any]], float], values: Iterable[float | None
     return what(known) if known else None
 
 
-def _value_at(values: Sequence[float | None], k: int) -> float | None:
-    return values[k] if k < len(values) else None
+def _value(path: str) -> Callable[[CaseMetrics], float | None]:
+    """A field of a case, or one of what stands there; None where nothing stands there."""
+    outer, _, inner = path.partition(".")
+    return lambda case: getattr(getattr(case, outer), inner, None) if inner else getattr(case, outer)
 
 
 def _worst(case: CaseMetrics, k: int) -> float | None:

@@ -73,34 +73,48 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
         low, high = scenery.around(trace.experiment, low, high)
     size = np.maximum(high - low, 0.4)
     low, high = 0.5 * (low + high) - 0.56 * size, 0.5 * (low + high) + 0.56 * size
-    columns = min(2, len(panels))
-    rows = math.ceil(len(panels) / columns)
-    panel = min((width - 0.5) / columns * float(size[1] / size[0]), min(0.62 * width, 3.6) if overlaid else 3.2) + 0.25
     things = scenery.legend([trace.experiment for trace in traces])
-    figure = Drawing(figsize=(width, panel * rows + 0.7 + 0.17 * bool(things[1])), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, shown in zip(grid.flat, panels, strict=False):
+    tallest = min(0.62 * width, 3.6) if overlaid else 3.2
+    figure, grid = _plane(len(panels), width, (low, high), tallest, 0.7 + 0.17 * bool(things[1]))
+    for axes, shown in zip(grid, panels, strict=True):
         scenery.from_above(axes, shown[0].experiment)
         for k, trace in enumerate(shown):
             _draw_from_above(axes, trace, thinned(trace, len(traces)), case_line(k) if overlaid else None)
-        axes.set_aspect("equal")
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
         axes.set_title("" if overlaid else plain(shown[0].case), pad=3.0)
         axes.spines[["left", "bottom"]].set_visible(False)
         axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.yaxis.set_major_locator(MaxNLocator(5))
-    for axes in list(grid.flat)[len(panels) :]:
-        axes.set_visible(False)
     if overlaid:
-        grid[0, 0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
+        grid[0].set(xlabel="$x$ [m]", ylabel="$y$ [m]")
         entries = _case_entries(traces) | _end_entries()
         legend_above(figure, ([*entries.values(), *things[0]], [*entries, *things[1]]), columns=6)
     else:
-        figure.supxlabel("$x$ [m]", fontsize=8)
-        figure.supylabel("$y$ [m]", fontsize=8)
+        _label_plane(figure)
         robot_legend(figure, traces, things)
     return figure
+
+
+def _plane(
+    count: int, width: float, limits: tuple[Array, Array], tallest: float, more: float
+) -> tuple[Figure, list[Axes]]:
+    """A figure of views from above within `limits` [m], side by side, none higher than `tallest` and `more` around."""
+    low, high = limits
+    columns = min(2, count)
+    rows = math.ceil(count / columns)
+    shape = float((high - low)[1] / (high - low)[0])
+    panel = min((width - 0.5) / columns * shape, tallest) + 0.25
+    figure = Drawing(figsize=(width, panel * rows + more), layout="constrained")
+    grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.set_visible(False)
+    for axes in grid[:count]:
+        axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return figure, grid[:count]
+
+
+def _label_plane(figure: Figure) -> None:
+    figure.supxlabel("$x$ [m]", fontsize=8)
+    figure.supylabel("$y$ [m]", fontsize=8)
 
 
 def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
@@ -145,13 +159,9 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     links (dashed where the shape misses their targets by more than the tolerance).
     """
     cases = list(analyses.items())
-    x, y, _ = cases[0][1].experiment.arena.size
-    columns = min(2, len(cases))
-    rows = math.ceil(len(cases) / columns)
-    panel = min((WIDTH - 0.5) / columns * y / x, 3.2) + 0.25
-    figure = Drawing(figsize=(WIDTH, panel * rows + 0.4), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for axes, (name, known) in zip(grid.flat, cases, strict=False):
+    half = 0.53 * np.array(cases[0][1].experiment.arena.size[:2])
+    figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.4)
+    for axes, (name, known) in zip(grid, cases, strict=True):
         experiment, motion = known.experiment, known.prediction.position
         scenery.from_above(axes, experiment)
         target = motion[-1] if known.shape is None else _laid_upon(known.shape.position, motion[-1])
@@ -166,15 +176,10 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
             axes.plot(*target[row, :2], "o", ms=3.5, mec="none", color=colour, zorder=3)
-            axes.annotate(robot, target[row, :2], (3, 3), textcoords="offset points", fontsize=5, color=colour)
-        axes.set_aspect("equal")
-        axes.set_xlim(-0.53 * x, 0.53 * x)
-        axes.set_ylim(-0.53 * y, 0.53 * y)
+            at = (target[row, 0], target[row, 1])
+            axes.annotate(robot, at, (3, 3), textcoords="offset points", fontsize=5, color=colour)
         axes.set_title(plain(name), pad=3.0)
-    for axes in list(grid.flat)[len(cases) :]:
-        axes.set_visible(False)
-    figure.supxlabel("$x$ [m]", fontsize=8)
-    figure.supylabel("$y$ [m]", fontsize=8)
+    _label_plane(figure)
     return figure
 
 

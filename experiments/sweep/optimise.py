@@ -198,8 +198,7 @@ def tune(
                 for cell in search.again(best, mine):
                     plan.setdefault((cell.case, cell.digest), cell)
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
-            if not runner.run_missing(final, seeds, lambda _done, _of: None):
-                raise KeyboardInterrupt
+            runner.run_missing(final, seeds)
             reported = runner.rows(final, seeds)
     return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes))
 
@@ -226,21 +225,20 @@ class _Search:
         return self.cells({axis: words_of(row.parameters[axis.path]) for axis in axes}, row.case)
 
     def choose(self, runner: SweepRunner, rows: Sequence[CellRow], axes: Sequence[Axis]) -> CellRow:
-        """The best point of the search, on seeds that took no part in it; raises KeyboardInterrupt on Ctrl-C."""
+        """The best point of the search, on seeds that took no part in it."""
         fresh = self.tuning[len(searched(self.tuning)) :]
         ranked = sorted(rows, key=self.wish.rank)
         looked_at: list[CellRow] = []
         for begin in range(0, min(ROUNDS * ROUND, len(ranked)), ROUND):
             pairs = [self.again(row, axes) for row in ranked[begin : begin + ROUND]]
-            if not runner.run_missing([cell for pair in pairs for cell in pair], fresh, lambda _done, _of: None):
-                raise KeyboardInterrupt
+            runner.run_missing([cell for pair in pairs for cell in pair], fresh)
             looked_at += [runner.rows(pair, fresh)[-1] for pair in pairs]
             if any(self.wish.rank(row) < BROKEN for row in looked_at):
                 break
         return min(looked_at, key=self.wish.rank)
 
     def run(self, cma: Any, runner: SweepRunner, case: str, axes: Sequence[Axis], progress: Progress) -> list[CellRow]:  # noqa: ANN401
-        """The cells tried for a case, each once; raises KeyboardInterrupt on Ctrl-C."""
+        """The cells tried for a case, each once."""
         first, more = EVALUATIONS
         most = first + more * len(axes)
         options = {"bounds": [0.0, 1.0], "seed": 1, "tolx": FINE, "maxfevals": most, "verbose": -9, "verb_log": 0}
@@ -255,8 +253,7 @@ class _Search:
             fresh = [values for values in dict.fromkeys(wanted) if values not in known]
             cells = {values: self.cells(dict(zip(axes, values, strict=True)), case) for values in fresh}
             plan = [cell for pair in cells.values() for cell in pair]
-            if not runner.run_missing(plan, searched(self.tuning), lambda _done, _of: None):
-                raise KeyboardInterrupt
+            runner.run_missing(plan, searched(self.tuning))
             for values, pair in cells.items():
                 known[values] = runner.rows(pair, searched(self.tuning))[-1]
             strategy.tell(points, [self.wish.rank(known[values]) for values in wanted])

@@ -16,6 +16,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -109,10 +110,11 @@ def sweep(
         notes = store.changed_since(origin(read, [cell.experiment for cell in plan]))
         with workers(scheduler, processes) as crew:
             runner = SweepRunner(store, crew)
-            whole = runner.run_missing(plan, seeds, progress)
+            with suppress(KeyboardInterrupt):  # what is done is kept
+                runner.run_missing(plan, seeds, progress)
         rows = runner.rows(plan, seeds)
         failures = runner.failures(plan, seeds)
-        missing = 0 if whole else sum(len(runner.missing(cell, seeds)) for cell in _distinct(plan))
+        missing = sum(len(runner.missing(cell, seeds)) for cell in _distinct(plan))
     return SweepResult(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
 
 
@@ -123,12 +125,14 @@ class SweepRunner:
     store: Store
     crew: Workers
 
-    def run_missing(self, plan: Sequence[Cell], seeds: Sequence[int], progress: Progress) -> bool:
-        """Does what is missing; False after Ctrl-C, which keeps what is done."""
+    def run_missing(
+        self, plan: Sequence[Cell], seeds: Sequence[int], progress: Progress = lambda _done, _of: None
+    ) -> None:
+        """Does what is missing; Ctrl-C keeps what is done."""
         lacking = [(cell, self.missing(cell, seeds)) for cell in _distinct(plan)]
         total = sum(len(cell_seeds) for _, cell_seeds in lacking)
         if not total:
-            return True
+            return
         piece = max(1, math.ceil(total / (SHARE * self.crew.count())))
         works = [
             Work(
@@ -143,14 +147,10 @@ class SweepRunner:
         ]
         done = 0
         progress(0, total)
-        try:
-            for work, outcome in self.crew.done(works):
-                self.store.add(work.cell, work.code, outcome)
-                done += len(work.seeds)
-                progress(done, total)
-        except KeyboardInterrupt:
-            return False
-        return True
+        for work, outcome in self.crew.done(works):
+            self.store.add(work.cell, work.code, outcome)
+            done += len(work.seeds)
+            progress(done, total)
 
     def missing(self, cell: Cell, seeds: Sequence[int]) -> list[int]:
         """Seeds of a cell that are still to be done."""
