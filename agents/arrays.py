@@ -61,7 +61,6 @@ class Columns(msgspec.Struct, frozen=True):
         return len(msgspec.structs.astuple(self)[0])
 
     def take(self, which: Index | Mask) -> Self:
-        """Some of the rows."""
         kept: list[Any] = [None if column is None else column[which] for column in msgspec.structs.astuple(self)]
         return type(self)(*kept)
 
@@ -93,6 +92,5 @@ class PoseTable(Columns, frozen=True):
 
 
 def no_poses() -> PoseTable:
-    """A table without rows."""
     none, rows = np.zeros(0), np.zeros(0, dtype=np.intp)
     return PoseTable(rows, rows, none, none, np.zeros((0, 3)), np.zeros((0, 3)), none, rows)

@@ -62,7 +62,6 @@ class Claims:
 
 
 def _lock(path: Path, name: str, address: str) -> int:
-    """The open and locked file."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:

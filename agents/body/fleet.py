@@ -89,7 +89,6 @@ class Fleet:
         return inspect(body, int(self._place[row]))
 
     def close(self) -> None:
-        """Closes every body."""
         call_all(body.close for _, body in self._parts)
 
     def _split(self, rows: Index) -> list[tuple[Body, Index]]:

@@ -35,7 +35,6 @@ class ControlView(View):
         law: Callable[[], Array],  # computes the offset (N, 3) as it would be now [m]
         errors: Callable[[], tuple[Array, Array]],  # computes error (N,) [m] and energy (N,) [m²]
     ) -> None:
-        """View of rows (N) with active `links` (L)."""
         self.t, self.position, self.velocity, self.last_event, self.start = t, position, velocity, last_event, start
         self.predictor, self._anchored = HOLD, anchored
         self.links, self._last, self.now, self._law, self._errors = links, last, now, law, errors
@@ -73,7 +72,6 @@ class ControlUpdates:
     last_event: LastEvent  # last computation of each row
 
     def __init__(self, trigger: Trigger, rows: int, links: Links) -> None:
-        """Start with all `links` (E) of the rows."""
         self.last_event = LastEvent.none(rows)
         self._trigger, self._state = trigger, trigger.state(rows)
         self._apart, self._rate = np.zeros((2, len(links), 3))

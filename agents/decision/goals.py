@@ -179,7 +179,6 @@ class GoalComputer:
         return both[:, 0], both[:, 1]
 
     def control_view(self, t: float, position: Array, velocity: Array, start: Array) -> ControlView:
-        """View of the control trigger; see `decide`."""
         assert self._updating is not None
         neighbours, predictor, active = self.neighbours, self._assignment.predictor, self.neighbours.active
         receiver = neighbours.links.receiver

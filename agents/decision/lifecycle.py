@@ -123,7 +123,6 @@ class Lifecycle:
 
     @property
     def all_running(self) -> bool:
-        """Whether every row runs the experiment."""
         return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
 
     def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> BodyCommands | None:

@@ -32,7 +32,6 @@ class Perception:
     """Collects the inputs of `Avoidance`."""
 
     def __init__(self, assignment: Assignment) -> None:
-        """Perceive for the rows of an assignment with an avoidance."""
         assert assignment.avoidance is not None
         kinds, robot_kinds, links = assignment.kinds, assignment.robot_kinds, assignment.links
         self._limits, self._avoids = assignment.limits, assignment.avoids
@@ -158,7 +157,6 @@ class Perception:
         return known
 
     def _near_points(self, t: float, state: BodyState, aware: Mask) -> Nearby:
-        """End points of readings that are near."""
         points = self._points
         row = points.row
         up = points.height - state.position[row, 2]

@@ -174,7 +174,6 @@ class Inbox(Generic[M]):
                     yield message, sample
 
     def close(self) -> None:
-        """Ends the subscription."""
         self._subscription.undeclare()
 
 
@@ -224,7 +223,6 @@ class ImmediateSubscriber:
         return self.waiting.popleft() if self.waiting else None
 
     def close(self) -> None:
-        """Ends the subscription."""
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]
 
     def _receive(self, sample: zenoh.Sample) -> None:
@@ -278,7 +276,6 @@ class Orders(Generic[M]):
                     query.reply_err(reason.encode(), encoding="text/plain")
 
     def close(self) -> None:
-        """Accepts no more orders."""
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -297,7 +294,6 @@ class LastValue:
         self._queryable = session.declare_queryable(key, self._queries.callback)  # as long as it is referenced
 
     def hold(self, payload: bytes) -> None:
-        """Stores the value to answer with."""
         self._payload = payload
 
     def answer(self) -> int:

@@ -55,7 +55,6 @@ def check_state(state: State, *, now: float, reach: Vector) -> None:
 
 
 def check_position(measured: Position, *, now: float, reach: Vector) -> None:
-    """Refuses an impossible measured position."""
     _refuse_stamp(measured.stamp, now)
     _refuse_place(measured.position, reach)
     if measured.yaw is not None and not abs(measured.yaw) <= MAX_YAW:
@@ -74,7 +73,6 @@ def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> Non
 
 
 def check_ranges(ranges: Ranges, *, now: float) -> None:
-    """Refuses an impossible sweep of range sensors."""
     _refuse_stamp(ranges.stamp, now)
     if not 1 <= len(ranges.distance) <= MAX_RAYS:
         raise Malformed(f"{len(ranges.distance)} rays; a sweep has 1 to {MAX_RAYS}")

@@ -34,7 +34,6 @@ class Participant:
         self._entities = 0
 
     def number(self) -> int:
-        """The number of the next entity."""
         self._entities += 1
         return self._entities - 1
 
@@ -66,7 +65,6 @@ class Node:
         return Subscriber(self, kind, key, token, depth)
 
     def announce(self, role: Role, topic: str, kind: str, quality: str) -> tuple[str, str]:
-        """The token and the key of a new endpoint."""
         it = self.participant
         full = ros2.absolute(self.namespace, topic)
         key = ros2.topic_key(it.style, full, kind, domain=it.domain, types=it.types)
@@ -77,7 +75,6 @@ class Node:
         return ros2.endpoint_token(it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest), key
 
     def close(self) -> None:
-        """Undeclares the token of the node; its endpoints are closed on their own."""
         if self._token is not None:
             self._token.undeclare()  # type: ignore[no-untyped-call]
 
@@ -114,7 +111,6 @@ class Publisher:
         )
 
     def close(self) -> None:
-        """Leaves the graph."""
         if self._token is not None:
             self._token.undeclare()  # type: ignore[no-untyped-call]
         self._publisher.undeclare()  # type: ignore[no-untyped-call]
@@ -150,7 +146,6 @@ class Subscriber:
         return last
 
     def close(self) -> None:
-        """Leaves the graph."""
         if self._token is not None:
             self._token.undeclare()  # type: ignore[no-untyped-call]
         self._subscriber.undeclare()  # type: ignore[no-untyped-call]

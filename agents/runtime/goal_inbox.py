@@ -55,7 +55,6 @@ class GoalInbox:
 
     @property
     def malformed(self) -> int:
-        """Goals that were refused."""
         return sum(inbox.malformed for inbox in self._inboxes)
 
     def receive(self, t: float, utc: float) -> None:

@@ -267,7 +267,6 @@ class Runtime:
         self._declare_tokens()
 
     def _declare_tokens(self) -> None:
-        """Declares the tokens by which neighbours know that these robots are alive."""
         with self._tokens_lock:
             for row, name in enumerate(self._names):
                 if row not in self._retired and row not in self._tokens:
@@ -298,7 +297,6 @@ class Runtime:
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _receive(self, t: float) -> None:
-        """Receives all since the last tick."""
         agent = self.agent
         health = agent.health
         health.offline_since = self._cut_off_since(t)
@@ -351,7 +349,6 @@ class Runtime:
         )
 
     def _obey(self, row: int, query: zenoh.Query, order: messages.Order, t: float) -> None:
-        """Carries out one order to one row, and replies."""
         key = self._setup.keys.order(self._names[row])
         with query:
             waits = self.agent.lifecycle.phase[row] == Phase.AIRBORNE
@@ -375,7 +372,6 @@ class Runtime:
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
 
     def _inspect(self, row: int, t: float) -> messages.Inspection:
-        """Facts about the device of a row, with its last state."""
         known, state = inspect(self._body, row), self._state
         if state is None:
             return known
@@ -519,7 +515,6 @@ class Runtime:
             self._body.command(actions.setpoint)
 
     def _send_pose(self, row: int, transmission: Transmission, yaw: float, t: float) -> None:
-        """Sends a row's pose to its neighbours."""
         self._counts.sent[row] += 1
         pose = messages.pose(
             self._names[row],

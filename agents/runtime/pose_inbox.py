@@ -91,7 +91,6 @@ class NeighbourSubscription:
 
     @property
     def malformed(self) -> int:
-        """Samples that were refused."""
         return self._poses.malformed
 
     def new_poses(self, now: float) -> Iterable[ReceivedPose]:
@@ -211,7 +210,6 @@ class ModelledInbox:
 
     @property
     def malformed(self) -> int:
-        """Samples that were refused."""
         return sum(sender.malformed for sender in self.senders)
 
     def receive(self, t: float, utc: float, start: Callable[[], Array], own: Collection[str] = ()) -> PoseTable | None:

@@ -38,7 +38,6 @@ class RangeInbox:
     """The newest sweep of each of some rows, as received on their keys `ranges`."""
 
     def __init__(self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int]) -> None:
-        """Subscribes for `rows` of the robots `names`."""
         self._scans: list[RangeScan | None] = [None] * len(names)
         self._inboxes = {
             row: pubsub.Inbox(pubsub.subscriber(session, keys.ranges(names[row]), 4), messages.Ranges, keys=keys)
@@ -48,7 +47,6 @@ class RangeInbox:
 
     @property
     def malformed(self) -> int:
-        """Payloads that were refused."""
         return sum(inbox.malformed for inbox in self._inboxes.values())
 
     @property

@@ -134,7 +134,6 @@ def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop
 
 
 def _register(endpoints: Sequence[str]) -> Path | None:
-    """The register of the lab that endpoints belong to."""
     folder = lab.lab_of(endpoints)
     return None if folder is None else folder / lab.REGISTER
 
@@ -164,7 +163,6 @@ def _launched(launch: RouterLaunch) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line of the router process."""
     explained = (EndpointError, OSError, msgspec.MsgspecError)
     return command_line.run("zenpark router", RouterLaunch, _launched, explained, arguments)
 

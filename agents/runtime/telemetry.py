@@ -75,7 +75,6 @@ class Telemetry:
         # goals received by each row since the last state, removed here; None: no row is guided
         receipts: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
-        """Declares the publishers."""
         self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
         self._encoding = encoding
         names = self._names = agent.assignment.names
@@ -224,7 +223,6 @@ class Telemetry:
                 publisher.put(messages.encode(repeated, self._encoding))
 
     def _dropped_of(self, row: int) -> dict[str, int]:
-        """Samples for a row that the modelled channel dropped, by neighbour."""
         assignment = self._agent.assignment
         dropped = self._neighbours.dropped
         at = np.flatnonzero((dropped > 0) & (assignment.links.receiver == row))

@@ -69,7 +69,6 @@ class Watchdog:
             self._thread.start()
 
     def end(self) -> None:
-        """Stops watching."""
         self._over.set()
         if self._thread is not None:
             self._thread.join()

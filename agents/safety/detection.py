@@ -185,7 +185,6 @@ class Detector:
         yield Observation(Cause.STANDSTILL, waits, lambda _: text)
 
     def _position_and_arena(self, now: Situation) -> Iterator[Observation]:
-        """Position, and the arena."""
         t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
         def age(row: int) -> str:
@@ -237,7 +236,6 @@ class Detector:
         yield Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
 
     def _silent_devices(self, t: float, heard: Array) -> Iterator[Observation]:
-        """Rows whose devices do not answer."""
         silent = t - heard > self._limits.own_silence_s
         yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
 
@@ -247,7 +245,6 @@ class Detector:
         yield Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
 
     def _separation_of_robots(self, now: Situation, limit: float) -> Iterator[Observation]:
-        """Separation from other robots at their extrapolated places."""
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit
         if not some(near):
@@ -275,7 +272,6 @@ class Detector:
             yield Observation(Cause.ALONE, alone, lambda row: names(row) or "none was received")
 
     def _lagging(self, neighbours: NeighbourStates, behind: Array) -> Iterator[Observation]:
-        """Neighbours whose clocks lag."""
         links, robots = self._assignment.links, self._assignment.robots
         late = (behind > 0.0) & (neighbours.poses.lost_since == np.inf)
 
