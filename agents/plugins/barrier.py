@@ -35,26 +35,10 @@ class Barrier(Avoidance, frozen=True):
     and by a smaller α (`steering`), so that they have turned in time. Where not all inequalities can be kept, the
     largest violation is made as small as it can be.
 
-    Guarantee: for u that obeys, s' ≥ −α s: s stays positive once it is, and h ≥ s. So no two robots touch if
-
-    - they begin apart, and both keep their half, by received poses or by range readings (a thing known from readings
-      only may be a robot that sees this one, and gets half as well); or the other one stands still; or it moves with
-      the received velocity, and this one is quick enough to get out of its way (on wheels, it must turn first);
-    - `margin` covers the unmodelled: the other one's motion while a pose or a scan ages (with half each at most
-      α/2·age of the gap, so nothing at the end of an approach; of a robot that does not avoid, its speed times the
-      age), the deviation that a trigger allows (1 cm for a δ of 1 cm), errors of measured positions, the wobble of both
-      (4 standard deviations are 5.7 cm for two drones of 1 cm each), the sweep of the heading of a robot on wheels
-      while its wheels slow down (4 mm), and the arc by which a drone that turns cuts a corner: the vectors n turn;
-    - heights do not change so that something gets beside the robot from above or below within the margin, and no wall
-      of the arena is in the way of backing off.
-
-    Moving things without received poses (an obstacle on a path, a person) are only backed away from, α s fast: enough
-    for drones up to a speed of about α·margin, and for nothing on wheels.
-
-    Arrival is not guaranteed. Against deadlocks of robots that meet head-on, the share `right` of the barred velocity
-    is given back to the right: all pass each other on the same side. A robot that comes faster than this one can flee
-    is dodged to the side of its way on which this one is. A trap, such as a corner of walls or a knot of robots that
-    all want to get past one another, is not planned around.
+    For u that obeys, s' ≥ −α s: s stays positive once it is, and h ≥ s, so that no two robots touch under the
+    conditions that docs/plugins.md names. Arrival is not guaranteed. Against deadlocks of robots that meet head-on, the
+    share `right` of the barred velocity is given back to the right: all pass each other on the same side. A robot that
+    comes faster than this one can flee is dodged to the side of its way on which this one is.
 
     Barrier functions: Ames et al., European Control Conference 2019; shared between robots: Wang, Ames and Egerstedt,
     IEEE Transactions on Robotics 33(3), 2017.
