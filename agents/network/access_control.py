@@ -132,23 +132,16 @@ def rules(rights: Rights, register: Register) -> dict[str, Any]:
 
 
 def _rules(name: str, grant: Grant, realm: str) -> Iterator[dict[str, Any]]:
-    """The rules of one identity; kinds of messages on the same keys in one."""
-    keys: dict[tuple[Flow, str], set[str]] = {}
-    for flow, kinds, on in _messages(grant, realm):
-        for kind in kinds:
-            keys.setdefault((flow, kind), set()).update(on)
-    together: dict[tuple[Flow, tuple[str, ...]], list[str]] = {}
-    for (flow, kind), several in keys.items():
-        if several:
-            together.setdefault((flow, tuple(sorted(several))), []).append(kind)
-    for number, ((flow, same), messages) in enumerate(together.items()):
-        yield {
-            "id": f"{name}-{number}",
-            "permission": "allow",
-            "flows": [flow],
-            "messages": messages,
-            "key_exprs": list(same),
-        }
+    """The rules of one identity."""
+    for number, (flow, kinds, keys) in enumerate(_messages(grant, realm)):
+        if keys:
+            yield {
+                "id": f"{name}-{number}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": list(kinds),
+                "key_exprs": list(dict.fromkeys(keys)),
+            }
 
 
 def _passed(name: str, rights: Rights) -> Iterator[dict[str, Any]]:
