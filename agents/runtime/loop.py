@@ -9,12 +9,12 @@ import gc
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import ceil, floor, isfinite
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -25,12 +25,15 @@ from agents.arrays import Index, some
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
-from agents.clock import uptime
+from agents.clock import Clock, uptime
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import TOLD_TO_END, Phase
 from agents.decision.transmission import Transmission
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
+from agents.network.access_control import Rights
+from agents.network.channel_model import Conditions
+from agents.network.keys import Keys
 from agents.network.name_ownership import ANSWER_S, NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
@@ -40,13 +43,37 @@ from agents.runtime.lifeline import Lifeline
 from agents.runtime.orders import LAND, STOP, carry_out
 from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox, replace_rows
-from agents.runtime.setup import Setup
 from agents.runtime.telemetry import Counts, Telemetry
-from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
+from agents.runtime.watchdog import AGAIN_S, DOWN_S, SILENCE_S, Watchdog
 from agents.safety.detection import SLOWEST
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
+
+Ranging = Literal["body", "world", "far"]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Settings of a robot process."""
+
+    keys: Keys  # key expressions of the realm
+    endpoints: Sequence[str]  # routers, or the members of a mesh
+    encoding: messages.Encoding  # of sent payloads
+    state_hz: float  # [1/s] rate of telemetry
+    lifeline: bool  # whether standard input is a lifeline
+    located: Sequence[bool]  # rows with a position measured from outside
+    # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
+    # key, received by the body itself ("far"). Left out: the bodies.
+    ranging: Sequence[Ranging] = ()
+    # effects of the modelled channel on received poses, by link; None: none
+    conditions: Conditions | None = None
+    goal_conditions: Conditions | None = None  # on received goals, by guided row
+    clock: Clock = field(default_factory=Clock)  # of the experiment
+    once: bool = False  # the process ends when its robots are down after an experiment
+    rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
+    # [s] without a tick after which the watchdog lands the robots
+    loop_silence_s: float = SILENCE_S
 
 
 class Runtime:

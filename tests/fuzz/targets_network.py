@@ -17,8 +17,7 @@ from agents.body.interface import BodyRequest, Disturbance
 from agents.body.kinds import KINDS
 from agents.network import messages as wire
 from agents.network.name_ownership import OwnershipCheck
-from agents.runtime.loop import Runtime
-from agents.runtime.setup import Setup
+from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document

@@ -31,8 +31,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import end
 from agents.plugins import registry
 from agents.runtime import command_line
-from agents.runtime.loop import Runtime
-from agents.runtime.setup import Ranging, Setup
+from agents.runtime.loop import Ranging, Runtime, Setup
 from experiments.definition import bodies, link_conditions, mesh
 from experiments.definition.endpoints import router_endpoints
 from experiments.definition.experiment import Experiment, Robot

@@ -9,8 +9,7 @@ from agents.body.fleet import assemble
 from agents.body.measured_positions import MeasuredPositions
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime.loop import Runtime
-from agents.runtime.setup import Setup
+from agents.runtime.loop import Runtime, Setup
 from agents.safety.detection import clock_text
 from experiments.definition import bodies
 from experiments.definition.experiment import Formation, Robot

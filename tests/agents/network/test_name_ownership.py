@@ -16,8 +16,7 @@ from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, claim, keep
-from agents.runtime.loop import Runtime
-from agents.runtime.setup import Setup
+from agents.runtime.loop import Runtime, Setup
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair

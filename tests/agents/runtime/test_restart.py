@@ -13,9 +13,8 @@ from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime.loop import Runtime
+from agents.runtime.loop import Runtime, Setup
 from agents.runtime.orders import carry_out
-from agents.runtime.setup import Setup
 from experiments.definition.experiment import Formation, Leg, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair

@@ -11,8 +11,7 @@ from agents.body.interface import BodyState, call_all
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime import loop
-from agents.runtime.loop import Runtime
-from agents.runtime.setup import Setup
+from agents.runtime.loop import Runtime, Setup
 from experiments.definition.experiment import Arena, Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
