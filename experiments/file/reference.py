@@ -106,10 +106,10 @@ def matching(asked: str) -> list[Entry]:
     """
     if asked in KINDS:
         return [_kind(KINDS[asked])]
-    parts = [part for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part]
-    found = [entry for entry in entries() if parts and _fits(_split(entry.key), parts)]
-    if not found and parts:
-        ends = [entry for entry in entries() if any(_fits(end, parts) for end in _ends(_split(entry.key)))]
+    sought = "".join(f".{part}" for part in re.split(r"[.()\[\]]+", asked.strip().strip('"')) if part)
+    found = [entry for entry in entries() if sought and re.fullmatch("".join(_patterns(entry)), sought)]
+    if not found and sought:
+        ends = [entry for entry in entries() if _has_end(entry, sought)]
         found = sorted(ends, key=lambda entry: len(entry.words))
     tables = tuple(f"{entry.key}{sign}" for entry in found for sign in ".(")
     return found + [each for each in entries() if each.key.startswith(tables) and each not in found]
@@ -182,24 +182,18 @@ def _split(key: str) -> list[str]:
     return [part for part in re.split(r"\.|(\([^)]*\))", key) if part]
 
 
-def _ends(pattern: Sequence[str]) -> list[Sequence[str]]:
-    """The ends of a split key that begin with a word or a plug-in."""
-    return [pattern[k:] for k in range(1, len(pattern)) if not pattern[k].isupper()]
+def _patterns(entry: Entry) -> list[str]:
+    """Pattern of each part of a key: words as they are; names, and plug-ins in the place of their kind, if given."""
+    return [
+        r"(\.[^.]+)?" if part.isupper() else rf"(\.{re.escape(part[1:-1])})?" if part[0] == "(" else rf"\.{part}"
+        for part in _split(entry.key)
+    ]
 
 
-def _fits(whole: Sequence[str], parts: Sequence[str]) -> bool:
-    """Whether the parts name a split key: literal words all, names and plug-ins matched or skipped."""
-
-    def match(pattern: Sequence[str], rest: Sequence[str]) -> bool:
-        if not pattern:
-            return not rest
-        first, *later = pattern
-        if first.isupper() or first.startswith("("):
-            right = bool(rest) and (first.isupper() or first.strip("()") == rest[0])
-            return match(later, rest) or (right and match(later, rest[1:]))
-        return bool(rest) and rest[0] == first and match(later, rest[1:])
-
-    return match(whole, parts)
+def _has_end(entry: Entry, sought: str) -> bool:
+    """Whether a key ends with `sought`, from a word or a plug-in on."""
+    parts, patterns = _split(entry.key), _patterns(entry)
+    return any(re.fullmatch("".join(patterns[k:]), sought) for k in range(1, len(parts)) if not parts[k].isupper())
 
 
 def _walk(
