@@ -36,6 +36,16 @@ _WORDS: Final = {
     "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a table",
 }  # fmt: skip
+_GROUPS: Final[dict[Path, str]] = {  # entry-point group of each choice of a plug-in; `*` is any name or number
+    ("trigger",): registry.TRIGGERS,
+    ("formation", "update"): registry.TRIGGERS,
+    ("prediction",): registry.PREDICTORS,
+    ("formation", "law"): registry.LAWS,
+    ("timeline", "*", "plan"): registry.PLANNERS,
+    ("arena", "obstacles", "*", "plan"): registry.PLANNERS,
+    ("avoidance",): registry.AVOIDANCES,
+    ("world", "engine"): registry.ENGINES,
+}
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
 
@@ -66,22 +76,7 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
 
 def group_of(path: Path) -> str | None:
     """Entry-point group of the plug-in choice at a path; None if no choice stands there."""
-    match path:
-        case ("trigger",) | ("formation", "update"):
-            group = registry.TRIGGERS
-        case ("prediction",):
-            group = registry.PREDICTORS
-        case ("formation", "law"):
-            group = registry.LAWS
-        case ("timeline", int(), "plan") | ("arena", "obstacles", str(), "plan"):
-            group = registry.PLANNERS
-        case ("avoidance",):
-            group = registry.AVOIDANCES
-        case ("world", "engine"):
-            group = registry.ENGINES
-        case _:
-            return None
-    return group
+    return _GROUPS.get(path if len(path) < 3 else (*path[:-2], "*", path[-1]))
 
 
 def plugin_files(experiment: Experiment) -> set[pathlib.Path]:

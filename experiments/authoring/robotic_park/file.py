@@ -48,6 +48,7 @@ FORM: Final = "write name_d, name_x_y_z or origin_R, separated by commas"
 OLDER: Final = {"config_path", "communication", "task", "agent_ip", "control_mode"}  # a table with one is a robot
 OLDER_GAIN: Final = 0.25
 OLDER_CLAMP: Final = 0.08  # [m]
+WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # of a Webots world
 
 
 @dataclass(frozen=True)
@@ -486,3 +487,68 @@ def _relation(entry: Entry, part: str, kind: str) -> Relation:
     if len(values) == 1 and values[0] <= 0.0:
         raise entry.refused(f"'{part}' asks for a distance that is not positive", "give metres, such as 0.8")
     return Relation(name, values)
+
+
+def starts_from(file: str) -> dict[str, Pose]:
+    """Starts of robots by name: from an index or experiment (.yaml), or a Webots world (.wbt).
+
+    Raises:
+        DocumentError: If the file cannot be read, or tells no start.
+    """
+    hint = "name an index of robots (.yaml) or a Webots world (.wbt)"
+    try:
+        text = content(Path(file), file)
+    except FileNotFoundError:
+        raise refusal(file, "there is no such file", hint) from None
+    found = (_world if Path(file).suffix.lower() == ".wbt" else _index)(file, text)
+    if not found:
+        raise refusal(file, "tells the start of no robot", hint)
+    return found
+
+
+def _index(file: str, text: str) -> dict[str, Pose]:
+    root = load(file, text)
+    listed = (root.get("Robots") if root.has("Robots") else root).tables()
+    return {
+        str(each.value.get("name", each.name)): pose_of(each.get("pose"), each.value["pose"])
+        for each in listed
+        if each.has("pose") and not isinstance(each.value["pose"], dict)
+    }
+
+
+def _world(file: str, text: str) -> dict[str, Pose]:
+    """Starts in a Webots world: `name` and `translation` of its nodes; the yaw where `rotation` is about z."""
+    found: dict[str, Pose] = {}
+    words = [word for word in WORD.findall(text) if not word.startswith("#")]
+    depth, name, place, yaw = 0, "", [0.0, 0.0, 0.0], 0.0
+    for at, word in enumerate(words):
+        if word in "{[":
+            depth += 1
+            if depth == 1:
+                name = words[at - 2] if at >= 3 and words[at - 3] == "DEF" else ""
+                place, yaw = [0.0, 0.0, 0.0], 0.0
+        elif word in "}]":
+            depth -= 1
+            if depth == 0 and name:
+                flies = kind_of(name) in ("crazyflie", "tello")
+                found[name] = (place[0], place[1], place[2] if flies else yaw)
+        elif depth == 1 and word == "name":
+            name = words[at + 1].strip('"') if at + 1 < len(words) else ""
+        elif depth == 1 and word in ("translation", "rotation"):
+            values = _numbers(file, words[at + 1 : at + (4 if word == "translation" else 5)])
+            if word == "translation":
+                place = values
+            elif abs(values[2]) > 1.0 - 1e-3:
+                yaw = math.copysign(1.0, values[2]) * values[3]
+    return found
+
+
+def _numbers(file: str, words: list[str]) -> list[float]:
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = []
+    if len(found) < 3 or not all(map(math.isfinite, found)):
+        hint = "name another file with --poses"
+        raise refusal(file, f"cannot be read near '{' '.join(words)}'", hint)
+    return [*found, 0.0][:4]

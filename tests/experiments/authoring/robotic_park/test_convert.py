@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.authoring.robotic_park.convert import convert, convert_text
-from experiments.authoring.robotic_park.starts import starts_from
+from experiments.authoring.robotic_park.file import starts_from
 from experiments.check.check import check, figures
 from experiments.definition.plan import Plan
 from experiments.file import document
