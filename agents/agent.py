@@ -26,7 +26,6 @@ from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
 from agents.network.messages import Setpoint
 from agents.plugins.calls import call
-from agents.plugins.triggers import LastEvent, Trigger
 from agents.safety.detection import Detector, RowStatus
 from agents.safety.hazards import Hazards, Outcome
 from agents.safety.landing import Landing
@@ -68,7 +67,9 @@ class Agent:
     neighbours: NeighbourStates  # received poses, and the links that enter the law
     guidance: Guidance | None  # goals of the guided rows; None: no row is guided
     all_guided: bool
+    transmitter: Transmitter
     lifecycle: Lifecycle
+    landing: Landing
     hazards: Hazards
     origins: dict[int, Setpoint]  # of restarted rows, from their start orders
     health: ProcessHealth  # set by the process around the decision
@@ -93,7 +94,7 @@ class Agent:
         self.all_guided = bool(self._guided.all())
         self._holding = StationKeeping(self.goal_computer.ground)
         self.lifecycle = Lifecycle(flies, assignment.hover, assignment.duration)
-        self._transmitter = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
+        self.transmitter = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
         self._setpoint = np.full((rows, 4), np.nan)
         self.health, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
@@ -104,7 +105,7 @@ class Agent:
         self._controller, self._continuity = PositionController(assignment.kinds), Continuity(assignment.kinds)
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
         self._perception = None if assignment.avoidance is None else Perception(assignment)
-        self._landing = Landing(assignment)
+        self.landing = Landing(assignment)
         self.origins = {}
         self._no_row: Mask = np.zeros(rows, dtype=bool)
         self._every_row: Mask = np.ones(rows, dtype=bool)
@@ -112,19 +113,6 @@ class Agent:
         self._now: Situation
 
     # ------------------------------------------------------------------ inputs
-
-    @property
-    def trigger(self) -> Trigger:
-        """Trigger of transmissions; may be replaced by one of the same kind."""
-        return self._transmitter.trigger
-
-    @trigger.setter
-    def trigger(self, trigger: Trigger) -> None:
-        self._transmitter.trigger = trigger
-
-    @property
-    def last_transmission(self) -> LastEvent:
-        return self._transmitter.last_event
 
     def hold(self, row: int) -> str:
         """Order to stay in place; returns the reason of a refusal, empty when accepted."""
@@ -198,16 +186,12 @@ class Agent:
     @property
     def descending(self) -> Mask:
         """Rows (N,) that land or have landed; not those on their way to a landing place."""
-        return np.asarray((self.lifecycle.phase >= LANDING) & ~self._landing.aside)
+        return np.asarray((self.lifecycle.phase >= LANDING) & ~self.landing.aside)
 
     @property
     def state(self) -> BodyState:
         """State of the bodies on this tick, without the positions that jumped."""
         return self._now.state
-
-    def land_here(self) -> None:
-        """The bodies land by other means: rows stop moving aside."""
-        self._landing.land_in_place()
 
     # ------------------------------------------------------------------ the decision
 
@@ -227,8 +211,8 @@ class Agent:
         self._now = Situation(t, state, where, self.neighbours, self.health, jump)
         ready = self._ready(self._now) if life.waiting else self._no_row  # all rows have taken off
         commands = life.advance(t, ready, state.position, state.velocity, state.flying)
-        if commands is not None or self._landing.any_aside:
-            commands = self._landing.filter_commands(self._now, commands, life.phase)
+        if commands is not None or self.landing.any_aside:
+            commands = self.landing.filter_commands(self._now, commands, life.phase)
         self._commands = commands
         assignment = self.assignment
         if life.moved and not self.begun and (life.phase == RUNNING).any():
@@ -243,7 +227,7 @@ class Agent:
         self._asked = question
         error, energy = self.goal_computer.errors(t, state.position)
         self.error = error if where.all_valid else np.where(where.invalid, np.nan, error)
-        return self._transmitter.transmit(
+        return self.transmitter.transmit(
             t, state.position, state.velocity,
             error=error, energy=energy, start=life.start_at, offset=self.offset,
             setpoint=self._setpoint,
@@ -263,9 +247,9 @@ class Agent:
         if self.guidance is not None:
             self._follow(self.guidance, state.position)
         goal, avoided = self.goal, self._no_row
-        aside = self._landing.aside
-        if self._landing.any_aside:
-            goal = np.where(aside[:, None], self._landing.place, goal)
+        aside = self.landing.aside
+        if self.landing.any_aside:
+            goal = np.where(aside[:, None], self.landing.place, goal)
         age, where = t - state.time, self._now.where
         avoidance = self.assignment.avoidance
         if avoidance is None or self._perception is None:
@@ -334,7 +318,7 @@ class Agent:
             self.goal[:, 2],
             self._setpoint,
             self._not_finite,
-            self._landing,
+            self.landing,
         )
         for incident in self.hazards.update(now.t, self._detector.detect(now, rows), active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land

@@ -315,7 +315,7 @@ class Runtime:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""
         for row in np.flatnonzero(self.agent.lifecycle.active).tolist():
             self.agent.lifecycle.land(row, why)
-        self.agent.land_here()
+        self.agent.landing.land_in_place()  # the body lands by other means
         self._declare_tokens()
 
     def _hold_after_suspend(self, slept: float) -> None:

@@ -79,7 +79,7 @@ def _start(agent: Agent, row: int, order: Order, t: float, utc: float) -> str:
 
 def _parameter(agent: Agent, order: Order) -> Answer:
     """Reads or changes the clamp, the tracking gain or a number of the trigger, for all robots of this process."""
-    of_trigger = {f"trigger.{field}": field for field in agent.trigger.__struct_fields__}
+    of_trigger = {f"trigger.{field}": field for field in agent.transmitter.trigger.__struct_fields__}
     name = order.name or ""
     if name not in of_trigger and name not in OWN:
         return f"no parameter '{name}'; known: {', '.join(sorted([*of_trigger, *OWN]))}", None
@@ -89,7 +89,11 @@ def _parameter(agent: Agent, order: Order) -> Answer:
         refusal = _set(agent, name, of_trigger.get(name), order.value)
         if refusal:
             return refusal, None
-    value = getattr(agent.trigger, of_trigger[name]) if name in of_trigger else getattr(agent.goal_computer, name)
+    value = (
+        getattr(agent.transmitter.trigger, of_trigger[name])
+        if name in of_trigger
+        else getattr(agent.goal_computer, name)
+    )
     return ("", float(value)) if isinstance(value, int | float) else (f"'{name}' is not set", None)
 
 
@@ -100,8 +104,8 @@ def _set(agent: Agent, name: str, of_trigger: str | None, value: float | None) -
         setattr(agent.goal_computer, name, value)
         return ""
     try:
-        changed = {**msgspec.structs.asdict(agent.trigger), of_trigger: value}
-        agent.trigger = msgspec.convert(changed, type(agent.trigger))
+        changed = {**msgspec.structs.asdict(agent.transmitter.trigger), of_trigger: value}
+        agent.transmitter.trigger = msgspec.convert(changed, type(agent.transmitter.trigger))
     except msgspec.ValidationError as error:
         return f"'{name}' cannot be {value:g}: {error}"
     return ""

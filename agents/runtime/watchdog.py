@@ -11,8 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from agents.arrays import Index
 from agents.body.interface import Body
@@ -26,7 +25,7 @@ HUNG: Final = 70  # exit code of a process whose loop hung for good
 
 
 class Watchdog:
-    """Watches a loop that calls `beat` on every turn, from `start` to `end` or inside a `with`, repeatedly if wanted.
+    """Watches a loop that calls `beat` on every turn, from `start` to `end`, repeatedly if wanted.
 
     After `silence_s` without a beat it orders the body to land and raises the alarm, and after `down_s` more it cuts
     the motors and ends the process. Each call has a thread of its own: it may hang as the loop does.
@@ -77,15 +76,6 @@ class Watchdog:
     def call_for_help(self, why: str) -> None:
         """Raises the alarm without waiting for it to be sent."""
         self._call_in_thread("alarm", partial(self._alarm, why))
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.end()
 
     def _watch(self) -> None:
         period = self._silence_s / LOOKS

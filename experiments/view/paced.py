@@ -75,7 +75,7 @@ class PacedView:
 
     def _count(self, instant: Instant) -> None:
         """Transmissions and incidents since the last call."""
-        at = instant.agent.last_transmission.time
+        at = instant.agent.transmitter.last_event.time
         for row in np.flatnonzero(at > self._sent_at).tolist():
             self._sent[row].append(float(at[row]))
         self._sent_at = at.copy()

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 
 import numpy as np
 import psutil
@@ -57,6 +58,14 @@ class Kennel:
             end=self.ends.append,
         )
 
+    @contextmanager
+    def watched(self):
+        self.dog.start()
+        try:
+            yield
+        finally:
+            self.dog.end()
+
     def beat_for(self, seconds: float) -> None:
         end, pause = time.monotonic() + seconds, threading.Event()
         while time.monotonic() < end:
@@ -66,7 +75,7 @@ class Kennel:
 
 def test_a_loop_that_goes_round_is_left_alone():
     kennel = Kennel(silence_s=1.0)  # a busy machine may hold up a loop for some tenths
-    with kennel.dog:
+    with kennel.watched():
         kennel.beat_for(2.0)
     assert not kennel.body.orders
     assert not kennel.alarms
@@ -75,7 +84,7 @@ def test_a_loop_that_goes_round_is_left_alone():
 
 def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: Callable[[Callable[[], object]], None]):
     kennel = Kennel(silence_s=0.5)
-    with kennel.dog:
+    with kennel.watched():
         kennel.beat_for(0.05)
         eventually(lambda: kennel.body.count("land"))
         eventually(lambda: kennel.alarms)
@@ -93,7 +102,7 @@ def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: C
 def test_one_that_hangs_for_good_is_told_again_cut_and_ended(stuck: str, eventually):
     kennel = Kennel(down_s=0.8)
     kennel.body.stuck = stuck
-    with kennel.dog:
+    with kennel.watched():
         eventually(lambda: kennel.ends)
     kennel.body.never.set()
     assert kennel.ends == [HUNG]
@@ -108,15 +117,16 @@ from agents.runtime.watchdog import Watchdog
 class Body:
     def land(self, rows): print("landed", flush=True)
     stop = land
-with Watchdog(Body(), None, alarm=print, silence_s=0.5, down_s=0.1) as dog:
-    print("runs", flush=True)
-    pause, left = threading.Event(), 80
-    while left:
-        dog.beat()
-        pause.wait(0.01)
-        left -= len(select.select([sys.stdin], [], [], 0.0)[0])  # from the end of its input on
-    print("over", flush=True)
-    threading.Event().wait()
+dog = Watchdog(Body(), None, alarm=print, silence_s=0.5, down_s=0.1)
+dog.start()
+print("runs", flush=True)
+pause, left = threading.Event(), 80
+while left:
+    dog.beat()
+    pause.wait(0.01)
+    left -= len(select.select([sys.stdin], [], [], 0.0)[0])  # from the end of its input on
+print("over", flush=True)
+threading.Event().wait()
 """
 
 

@@ -231,7 +231,7 @@ def test_a_run_ends_beside_and_says_so():
     while swarm.phase("F") != DONE:
         assert swarm.since < 15.0
         swarm.step()
-        waited |= bool(agent._landing.aside[row])
+        waited |= bool(agent.landing.aside[row])
     gap = np.hypot(*(swarm.row("F", "truth")[:2] - swarm.row("G", "truth")[:2]))
     assert waited
     assert gap > 0.09
