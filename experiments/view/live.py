@@ -6,8 +6,8 @@ Runs in a process of its own: a slow browser, or a view that dies, touches no ro
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
 from itertools import product
@@ -42,8 +42,9 @@ PHONE: Final = 0.7  # width over height of a page whose panel is below, not besi
 ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
 
 
-def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
-    """A page that is reached from this machine alone, without a button that would share it.
+@contextmanager
+def served(port: int, *, dark: bool) -> Iterator[viser.ViserServer]:
+    """Serve a page that is reached from this machine alone, without a button that would share it.
 
     Args:
         port: Preferred; the next free one is taken if it is not free.
@@ -51,7 +52,7 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
     import viser  # noqa: PLC0415 - an extra
 
     with redirect_stdout(StringIO()):  # its own banner
-        server = viser.ViserServer(host=LOOPBACK, port=port, label=title, verbose=False)
+        server = viser.ViserServer(host=LOOPBACK, port=port, label="zenpark", verbose=False)
     server.gui.configure_theme(
         dark_mode=dark,
         show_logo=False,
@@ -61,7 +62,11 @@ def open_server(port: int, title: str, *, dark: bool) -> viser.ViserServer:
     )
     server.gui.main_panel.dock_right()
     light(server)
-    return server
+    try:
+        yield server
+    finally:
+        with redirect_stdout(StringIO()):
+            server.stop()
 
 
 def standpoint(size: Sequence[float] | Array, aspect: float) -> tuple[Array, Array]:
@@ -118,12 +123,6 @@ class Camera:
         place, at = standpoint(self._size, client.camera.aspect)
         self._placed[client.client_id] = place
         client.camera.position, client.camera.look_at = place, at
-
-
-def close_server(server: viser.ViserServer) -> None:
-    """Ends the page."""
-    with redirect_stdout(StringIO()):
-        server.stop()
 
 
 class Page:

@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -248,7 +248,7 @@ def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> 
 
 
 def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
-    from experiments.view.live import Page, close_server, open_server  # noqa: PLC0415 - viser may be missing
+    from experiments.view.live import Page, served  # noqa: PLC0415 - viser may be missing
 
     crowd = document.loads(
         'title = "a hundred"\nduration_s = 9.0\narena = { size = [12.0, 12.0, 3.0] }\n'
@@ -261,7 +261,8 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
         + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(99))
     ).cases()["default"]
     crowd_stage = Stage.of_experiment(crowd)
-    server = open_server(int(free_endpoint(preferred_port=0).rpartition(":")[2]), "many", dark=False)
+    serving = ExitStack()
+    server = serving.enter_context(served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False))
     shown = Page(server, dark=False)
     shown.begin(crowd_stage)
     over = threading.Event()
@@ -293,4 +294,4 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     finally:
         over.set()
         moving.join()
-        close_server(server)
+        serving.close()

@@ -12,7 +12,6 @@ from tools.commands.options import AsJson, example, group, print_json
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
-    from experiments.definition.experiment import Experiment
 
 app: Final = group("Make, renew and revoke the certificates of a lab: robots, people, routers.")
 
@@ -38,12 +37,16 @@ def init(
     as_json: AsJson = False,
 ) -> None:
     """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
+    from agents.network.lab import LabError
     from tools.commands.authority import SERVICES, create
 
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
-    identities |= _robots(given or [], set(SERVICES))
-    known = create(place, identities, hosts=host or [], listening=_listening(given or []), days=days)
+    robots, listening = _members(given or [])
+    if clash := sorted(robots.keys() & identities.keys()):
+        raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
+    identities |= dict.fromkeys(robots, "robot")
+    known = create(place, identities, hosts=host or [], listening=listening, days=days)
     _print(place, known, list(known.identities), as_json=as_json)
     _advise(
         as_json,
@@ -119,40 +122,27 @@ def show(folder: Folder, as_json: AsJson = False) -> int:
     return int(any(datetime.fromisoformat(each.until) < now for each in known.identities.values()))
 
 
-def _cases(each: str) -> list[Experiment] | None:
-    """The cases of an experiment; None if it is a robot that is named."""
+def _members(given: list[str]) -> tuple[dict[str, None], dict[str, list[str]]]:
+    """Robots of experiments and those that are named themselves, in order; addresses at which members listen."""
     from difflib import get_close_matches
 
     from agents.network.lab import LabError
+    from experiments.definition import mesh
     from experiments.file import catalogue, document
 
+    robots: dict[str, None] = {}
+    listening: dict[str, list[str]] = {}
     names = [name for name, _ in catalogue.names()]
-    known = each in names or Path(each).suffix or Path(each).exists()
-    if not known and (meant := get_close_matches(each, names, n=1, cutoff=0.8)):
-        raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")
-    return list(document.read(each).cases().values()) if known else None
-
-
-def _listening(given: list[str]) -> dict[str, list[str]]:
-    """Addresses at which members of meshes listen."""
-    from experiments.definition import mesh
-
-    return {
-        name: at for each in given for case in _cases(each) or () for name, at in mesh.listening_hosts(case).items()
-    }
-
-
-def _robots(given: list[str], taken: set[str]) -> dict[str, Role]:
-    """Robots of experiments, and those that are named themselves."""
-    from agents.network.lab import LabError
-
-    found: dict[str, Role] = {}
     for each in given:
-        cases = _cases(each)
-        found |= {each: "robot"} if cases is None else {robot: "robot" for case in cases for robot in case.robots}
-    if clash := sorted(set(found) & taken):
-        raise LabError(f"{', '.join(clash)}: every lab has an identity of that name; rename the robot")
-    return found
+        if each in names or Path(each).suffix or Path(each).exists():
+            for case in document.read(each).cases().values():
+                robots |= dict.fromkeys(case.robots)
+                listening |= mesh.listening_hosts(case)
+        elif meant := get_close_matches(each, names, n=1, cutoff=0.8):
+            raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")
+        else:
+            robots[each] = None
+    return robots, listening
 
 
 def _advise(as_json: bool, text: str) -> None:

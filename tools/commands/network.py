@@ -114,12 +114,7 @@ def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[
 
 
 @app.command(epilog=example("keys", "keys --connect tcp/192.168.0.10:7447 --json"))
-def keys(
-    connect: Connect = None,
-    as_json: AsJson = False,
-    lab: Lab = None,
-    identity: As = "observer",
-) -> None:
+def keys(connect: Connect = None, as_json: AsJson = False, lab: Lab = None, identity: As = "observer") -> None:
     """Show the members of the network and the keys that they hold."""
     with session("keys", connect, lab, identity) as opened:
         found = members(opened)
@@ -180,10 +175,7 @@ def echo(
     expression = key_expression(key)
     deadline = math.inf if seconds is None else time.monotonic() + seconds
     left = math.inf if count is None else count
-    with (
-        session("echo", connect, lab, identity) as opened,
-        pose_subscriber(opened, expression, DEPTH) as samples,
-    ):
+    with session("echo", connect, lab, identity) as opened, pose_subscriber(opened, expression, DEPTH) as samples:
         while left > 0 and time.monotonic() < deadline:
             for sample in received(samples.handler):
                 deleted = sample.kind == zenoh.SampleKind.DELETE
@@ -273,10 +265,7 @@ def hz(
 
     expression = key_expression(key)
     cadence = Cadence()
-    with (
-        session("hz", connect, lab, identity) as opened,
-        subscriber(opened, expression, DEPTH) as samples,
-    ):
+    with session("hz", connect, lab, identity) as opened, subscriber(opened, expression, DEPTH) as samples:
         if not as_json:
             print(HEADING, flush=True)
         began = printed = time.monotonic()

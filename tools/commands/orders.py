@@ -40,21 +40,9 @@ robot_app: Final = group("Give orders to robots: those of a run that is under wa
 world_app: Final = group("Run a world by hand, and give orders to the one that is running.")
 
 Place = tuple[float, float]
-Names = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME...",
-        help="Robots.",
-        autocompletion=completion.robots,
-    ),
-]
+Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Robots.", autocompletion=completion.robots)]
 NamesOrAll = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[NAME...]",
-        help="Robots. [all]",
-        autocompletion=completion.robots,
-    ),
+    list[str] | None, typer.Argument(metavar="[NAME...]", help="Robots. [all]", autocompletion=completion.robots)
 ]
 
 IDENTITY: Final = "operator"
@@ -201,14 +189,7 @@ for _what, _help in CHANGES.items():
 @robot_app.command(epilog=example("robot replace CF02 --with S1", "robot replace KH01 --body twin --at 0.5 -0.2"))
 @with_options
 def replace(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="NAME",
-            help="A robot of the run.",
-            autocompletion=completion.robots,
-        ),
-    ],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A robot of the run.", autocompletion=completion.robots)],
     *,
     spare: Annotated[str | None, typer.Option("--with", metavar="SPARE", help="A spare of the file.")] = None,
     body: Annotated[str | None, typer.Option(metavar="URI", help="Address of another body.")] = None,

@@ -27,11 +27,7 @@ def agent(
     file: File,
     names: Annotated[
         list[str],
-        typer.Argument(
-            metavar="NAME...",
-            help="The robots of this process.",
-            autocompletion=completion.members,
-        ),
+        typer.Argument(metavar="NAME...", help="The robots of this process.", autocompletion=completion.members),
     ],
     *,
     case: Case = None,

@@ -27,9 +27,7 @@ def report(
     runs: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN...",
-            help="Folders of runs, or that of a sweep.",
-            autocompletion=completion.folders,
+            metavar="RUN...", help="Folders of runs, or that of a sweep.", autocompletion=completion.folders
         ),
     ],
     out: Annotated[
@@ -303,14 +301,7 @@ def _as_json(run: PastRun) -> dict[str, Any]:
 
 @app.command(epilog=example("export runs/first --csv", "export runs/first supplement.zip --bundle"))
 def export(  # noqa: PLR0917 - a command line
-    folder: Annotated[
-        str,
-        typer.Argument(
-            metavar="RUN",
-            help="Folder of a run.",
-            autocompletion=completion.folders,
-        ),
-    ],
+    folder: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run.", autocompletion=completion.folders)],
     target: Annotated[
         str | None, typer.Argument(metavar="FILE", help="FILE.mat, .csv or .zip. [run.mat in the run's folder]")
     ] = None,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from tools import completion
-from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, Seconds, example, print_json, routers
+from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, example, print_json, routers
 
 if TYPE_CHECKING:
     import zenoh
@@ -63,7 +63,6 @@ def view(
     with_run: Annotated[
         bool, typer.Option("--with-run", hidden=True, help="Waits for the run, and ends with it.")
     ] = False,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after this time [s].")] = None,
 ) -> int:
     """Show a run in the browser, in three dimensions: a live one, or a recording."""
     require_viser()
@@ -71,8 +70,6 @@ def view(
 
     ended = threading.Event()
     with on_termination(ended.set):
-        if seconds is not None:
-            threading.Timer(seconds, ended.set).start()
         up = None if run is None else _running_run(Path(run), wait_s=START_S if with_run else 0.0, ended=ended)
         if run is not None and up is None:
             return _replay(Path(run), ended, port=port, dark=dark, open_page=open_page)
@@ -88,7 +85,6 @@ def top(
     realm: Realm = "park",
     lab: Lab = None,
     identity: As = "observer",
-    seconds: Seconds = None,
     as_json: AsJson = False,
 ) -> int:
     """Show the live table of a run, from any shell; in a pipe and as JSON, the table once."""
@@ -103,7 +99,7 @@ def top(
         with held(opened) as (session, declared):
             table = _Top(session, watched)
             declared.append(table)
-            return table.run(ended, seconds, as_json=as_json)
+            return table.run(ended, as_json=as_json)
 
 
 class _Top:
@@ -117,19 +113,17 @@ class _Top:
         self._watched, self._trends = watched, Trends()
         self._observer = Observer(session, Keys(watched.realm))
 
-    def run(self, ended: threading.Event, seconds: float | None, *, as_json: bool) -> int:
-        """Draws until it is ended, the run is over, or `seconds` [s] are; returns the exit code."""
+    def run(self, ended: threading.Event, *, as_json: bool) -> int:
+        """Draw until it is ended or the run is over; return the exit code."""
         import time
-        from math import inf
 
         from rich.console import Console, Group
         from rich.live import Live
 
         console = Console()
         began, over = time.monotonic(), False
-        limit_s = inf if seconds is None else seconds
         if as_json or not console.is_terminal:
-            while not (over := self._all_reported()) and time.monotonic() - began < min(FIRST_S, limit_s):
+            while not (over := self._all_reported()) and time.monotonic() - began < FIRST_S:
                 if ended.wait(POLL_S):
                     break
             if as_json:
@@ -139,7 +133,7 @@ class _Top:
                 console.print(Group(*self._lines(console.width, len(self._observer.robots) + 20)), soft_wrap=True)
             return int(not over)
         with Live(console=console, auto_refresh=False, screen=True) as live:
-            while not (over or ended.wait(REFRESH_S)) and time.monotonic() - began < limit_s:
+            while not (over or ended.wait(REFRESH_S)):
                 over = self._watched.run is not None and not self._watched.run.alive
                 self._observer.update()
                 live.update(Group(*self._lines(console.width, console.height)), refresh=True)
@@ -200,7 +194,6 @@ def replay(
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
     identity: As = "operator",
-    seconds: Seconds = None,
 ) -> None:
     """Play a recording onto the network, for view, top, echo and other tools; in a terminal Enter pauses it."""
     from agents.network.endpoints import DEFAULT_ENDPOINT
@@ -222,8 +215,6 @@ def replay(
             clock.playing, clock.speed, clock.loop = True, rate, loop
             if sys.stdin.isatty():
                 threading.Thread(target=_pause_on_enter, args=(clock,), daemon=True).start()
-            if seconds is not None:
-                threading.Timer(seconds, ended.set).start()
             print(f"{file}: {clock.end:.1f} s, in the realm {played.keys.realm}", flush=True)
             print(f"messages sent: {played.run(ended, clock, endpoints)}")
 
@@ -278,12 +269,9 @@ def paced(pace: float) -> Iterator[Watch]:
     from experiments.view import live
     from experiments.view.paced import PacedView
 
-    server = live.open_server(PORT, "zenpark", dark=False)
-    try:
+    with live.served(PORT, dark=False) as server:
         _tell(server.get_port(), "virtual time: begins when the page is open", open_page=True, to=sys.stderr)
         yield PacedView(server, pace=pace, dark=False).begin
-    finally:
-        live.close_server(server)
 
 
 def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Run | None:
@@ -312,13 +300,10 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
 
     files = _recordings(folder)
     films = [replaying.Film(tracks.read(file)) for file in files]
-    server = live.open_server(port, "zenpark", dark=dark)
-    page = replaying.ReplayView(server, films, str(folder), dark=dark)
-    _tell(server.get_port(), f"{folder}; Ctrl-C ends it", open_page=open_page)
-    try:
+    with live.served(port, dark=dark) as server:
+        page = replaying.ReplayView(server, films, str(folder), dark=dark)
+        _tell(server.get_port(), f"{folder}; Ctrl-C ends it", open_page=open_page)
         page.run(ended.is_set)
-    finally:
-        live.close_server(server)
     return 0
 
 
@@ -354,16 +339,12 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
     from experiments.view.acting import Acting, may_act
 
     opened = open_session(watched.endpoints, name="view", wait_s=5.0, identity=watched.identity)
-    with held(opened) as (session, declared):
-        server = live.open_server(port, "zenpark", dark=dark)
+    with held(opened) as (session, declared), live.served(port, dark=dark) as server:
         acting = Acting(session, watched) if may_act(watched) else None
         page = live.LiveView(server, session, watched, dark=dark, acting=acting)
         declared.append(page)
         _tell(server.get_port(), f"{watched.words}{'' if with_run else '; Ctrl-C ends it'}", open_page=open_page)
-        try:
-            page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
-        finally:
-            live.close_server(server)
+        page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
 
 
 def _tell(port: int, what: str, *, open_page: bool, to: TextIO | None = None) -> None:

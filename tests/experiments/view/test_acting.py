@@ -39,12 +39,9 @@ def test_a_watched_run_in_virtual_time_is_the_same_to_the_last_bit(monkeypatch):
 
     monkeypatch.setattr(paced, "PAGE_S", 0.0)
     read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
-    server = live.open_server(int(free_endpoint(preferred_port=0).rpartition(":")[2]), "test", dark=True)
-    try:
+    with live.served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
         page = paced.PacedView(server, pace=100.0, dark=True)
         (watched,) = simulate_seeds(read, [1], watch=page.begin)
-    finally:
-        live.close_server(server)
     alone = simulate(read, seed=1)
     for case, trace in alone.traces.items():
         np.testing.assert_array_equal(watched.traces[case].true_position, trace.true_position)
