@@ -7,49 +7,40 @@ clock and the poses that it received, so that all decisions stay its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Columns, Index, Mask, norm
+from agents.arrays import Array, Columns, Mask, norm
 from agents.formation.graph import Links
 
 ROUNDING_S = 1e-6  # decisions are multiples of a period that binary fractions miss by less than this
 
 
+class NewTargets(Columns, frozen=True):
+    """Targets of links (E) after a change; NaN where unchanged."""
+
+    distance: Array  # (E,) [m]
+    relative: Array  # (E, 3) [m]
+    bearing: Array  # (E, 3)
+    rise: Array  # (E,) height of the receiver above the sender [m], which no scale changes
+
+    @classmethod
+    def unchanged(cls, links: int) -> NewTargets:
+        blank = np.full((links, 3), np.nan)
+        return cls(blank[:, 0], blank, blank, np.zeros(links))
+
+
 @dataclass(frozen=True)
 class Change:
-    """Transition of links (E) to other targets, then scaling and turning of the whole shape."""
+    """Transition of links to other targets, then scaling and turning of the whole shape."""
 
     at: float  # begin since the common start [s]
     over: float  # duration [s]; 0: at once
-    distance: Array  # (E,) new [m], NaN where unchanged
-    relative: Array  # (E, 3) new [m], NaN where unchanged
-    bearing: Array  # (E, 3) new, NaN where unchanged
+    to: NewTargets
     scale: float  # of the shape seen from above; heights are kept
     turn: float  # about the vertical, to the left [rad]
-    rise: Array  # (E,) height of the receiver above the sender [m], which no scale changes
-
-    def select(self, which: Index) -> Change:
-        return replace(
-            self,
-            distance=self.distance[which],
-            relative=self.relative[which],
-            bearing=self.bearing[which],
-            rise=self.rise[which],
-        )
-
-    def padded(self, more: int) -> Change:
-        """Change for `more` links behind these, which keep their targets."""
-        blank = np.full((more, 3), np.nan)
-        return replace(
-            self,
-            distance=np.concatenate([self.distance, blank[:, 0]]),
-            relative=np.concatenate([self.relative, blank]),
-            bearing=np.concatenate([self.bearing, blank]),
-            rise=np.concatenate([self.rise, np.zeros(more)]),
-        )
 
 
 def progress(elapsed: Array, at: float, over: float) -> Array:
@@ -68,12 +59,12 @@ def changed_targets(links: Links, changes: Sequence[Change], elapsed: Array) -> 
         if not share.any():
             continue
         grown = 1.0 + share * (change.scale - 1.0)
-        distance = _scaled(_interpolated(distance, change.distance, share), grown, change.rise)
+        distance = _scaled(_interpolated(distance, change.to.distance, share), grown, change.to.rise)
         if relative is not None:
-            relative = _turned(_interpolated(relative, change.relative, share[:, None]), share * change.turn)
+            relative = _turned(_interpolated(relative, change.to.relative, share[:, None]), share * change.turn)
             relative = relative * np.stack([grown, grown, np.ones_like(grown)], axis=1)
         if bearing is not None:
-            bearing = _turned(_toward_unit(bearing, change.bearing, share), share * change.turn)
+            bearing = _turned(_toward_unit(bearing, change.to.bearing, share), share * change.turn)
             if relative is not None and change.scale != 1.0:
                 length = norm(relative)
                 follows = length > 0.0  # false for NaN: a bearing of its own is seen from above, and not scaled

@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.formation.anchors import Anchors
-from agents.formation.changes import Change, Presence, Reshaping, changed_targets
+from agents.formation.changes import Change, NewTargets, Presence, Reshaping, changed_targets
 from agents.formation.graph import BY_DISTANCE, Links
 from agents.plugins.laws import Distance, Law
 from experiments.definition.experiment import Anchor, Experiment
@@ -49,7 +49,7 @@ class FormationArrays:
 
     def select(self, which: Index) -> FormationArrays:
         """Some of the links, or the same in another order."""
-        changes = tuple(change.select(which) for change in self.changes)
+        changes = tuple(replace(change, to=change.to.take(which)) for change in self.changes)
         return FormationArrays(
             self.links.take(which), changes, None if self.presence is None else self.presence.take(which)
         )
@@ -66,7 +66,8 @@ class FormationArrays:
 
     def append(self, others: Links) -> FormationArrays:
         """Append links that do not change and are always present."""
-        changes = tuple(change.padded(len(others)) for change in self.changes)
+        same = NewTargets.unchanged(len(others))
+        changes = tuple(replace(change, to=NewTargets.joined([change.to, same])) for change in self.changes)
         presence = None if self.presence is None else self.presence.padded(len(others))
         return FormationArrays(self.links.append(others), changes, presence)
 
@@ -118,7 +119,7 @@ def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) ->
     many = links.repeated(count, rows)
     if pattern.changes:
         all_of_them = np.tile(np.arange(len(links)), count)
-        changes = [change.select(all_of_them) for change in pattern.changes]
+        changes = [replace(change, to=change.to.take(all_of_them)) for change in pattern.changes]
         many = changed_targets(many, changes, np.repeat(time, len(links)))
     flat = position.reshape(-1, 3)
     return law.error(flat, flat[many.sender], many).reshape(count, len(links))
@@ -165,16 +166,13 @@ def _change(experiment: Experiment, described: Described, one_way: Sequence[OneW
         for pair in link_pairs(text)
     }
     then = [new.get((link.receiver, link.sender)) for link in one_way]
-    return Change(
-        at=described.at_s,
-        over=described.over_s,
-        distance=np.array([math.nan if each is None else each.distance for each in then]),
-        relative=_vectors([UNKNOWN if each is None else each.relative for each in then]),
-        bearing=_vectors([UNKNOWN if each is None else each.bearing for each in then]),
-        scale=described.scale,
-        turn=described.rotate,
-        rise=rise,
+    to = NewTargets(
+        np.array([math.nan if each is None else each.distance for each in then]),
+        _vectors([UNKNOWN if each is None else each.relative for each in then]),
+        _vectors([UNKNOWN if each is None else each.bearing for each in then]),
+        rise,
     )
+    return Change(described.at_s, described.over_s, to, described.scale, described.rotate)
 
 
 def _spatial(vector: Sequence[float] | None) -> tuple[float, float, float]:

@@ -1,11 +1,12 @@
 """Shapes go smoothly from one to the next, and links come and go by the clock and by range."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.changes import Change, Presence, Reshaping, changed_targets, progress
+from agents.formation.changes import Change, NewTargets, Presence, Reshaping, changed_targets, progress
 from agents.formation.graph import Links
 from tests.agents.plugins.test_laws import told_more
 
@@ -14,9 +15,8 @@ FEW = settings(max_examples=25)
 
 def change(count, at=10.0, over=4.0, **parts):
     """A change of `count` links that leaves everything as it was, but for `parts`."""
-    blank = np.full((count, 3), np.nan)
-    given = {"distance": blank[:, 0], "relative": blank, "bearing": blank, "scale": 1.0, "turn": 0.0}
-    return Change(at=at, over=over, **{**given, "rise": np.zeros(count), **parts})
+    scale, turn = parts.pop("scale", 1.0), parts.pop("turn", 0.0)
+    return Change(at, over, msgspec.structs.replace(NewTargets.unchanged(count), **parts), scale, turn)
 
 
 def after(net, changes, t):
