@@ -12,9 +12,10 @@ from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.bodies import DRIVES, WORLD
-from experiments.definition.experiment import Arena, Experiment, Hybrid, Robot
-from experiments.file import consistency_formation, consistency_network
-from experiments.file.problems import Fault, after_the_end, unknown_robot
+from experiments.definition.experiment import Arena, Change, Experiment, Hybrid, Link, Robot, Target
+from experiments.definition.links import FORM, held_height, link_pairs
+from experiments.file import consistency_network
+from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 from twins import scene as outlines
 from twins.models.differential import DRIVES as DRIVEN
 from twins.models.quadrotor import RESPONSES
@@ -53,6 +54,7 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
 
 
 _RESERVED: Final = ("all", "estop", "run", "world", "centre", *KINDS)  # words of keys and of [disturbance]
+ROUNDED: Final = 1e-3  # [m] heights written with three decimals
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
 
@@ -66,7 +68,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
         yield from _robot(experiment, ("spares", name), robot)
     yield from standby_faults(experiment)
     yield from _start_conflicts(experiment)
-    yield from consistency_formation.faults(experiment)
+    yield from _formation(experiment)
     yield from consistency_network.channel_faults(experiment)
     yield from consistency_network.host_faults(experiment)
     yield from _timeline(experiment)
@@ -140,7 +142,7 @@ def _rates(experiment: Experiment) -> Iterator[Fault]:
     for name in ("pose_hz", "coordination_hz", "state_hz"):
         ratio = body / getattr(experiment.rates, name)
         if abs(ratio - max(1, round(ratio))) > 1e-9 * ratio:
-            hint = f"the nearest that does: {name} = {_divisor(body, body / ratio):g}"
+            hint = f"the nearest that does: {name} = {divisor(body, body / ratio):g}"
             yield Fault(("rates", name), f"{name} = {body / ratio:g} does not divide body_hz = {body:g}", hint)
 
     samples = experiment.duration_s * experiment.rates.state_hz
@@ -150,7 +152,7 @@ def _rates(experiment: Experiment) -> Iterator[Fault]:
         yield Fault(("duration_s",), message, hint)
 
 
-def _divisor(body: float, wanted: float) -> float:
+def divisor(body: float, wanted: float) -> float:
     """The nearest rate that divides `body` and can be written in a few digits."""
     written = (float(f"{body / times:g}") for times in range(1, 1001))
     exact = [rate for times, rate in enumerate(written, 1) if rate * times == body]
@@ -256,3 +258,120 @@ def _timeline(experiment: Experiment) -> Iterator[Fault]:
             hint = f"sort its legs by time; the one before begins at {before[leg.robot]:g} s"
             yield Fault((*path, "at_s"), message, hint)
         before[leg.robot] = max(leg.at_s, before.get(leg.robot, -1.0))
+
+
+def _formation(experiment: Experiment) -> Iterator[Fault]:
+    """All contradictions in [formation]."""
+    found = list(_links(experiment))
+    yield from found
+    formation = experiment.formation
+    places = [("anchors", name) for name in formation.anchors] + [("shape", name) for name in formation.shape]
+    for table, name in places:
+        yield from unknown_robot(("formation", table, name), name, experiment.robots, on_key=True)
+    if found:
+        return  # what follows looks links up
+    for text, link in experiment.formation.links.items():
+        path = ("formation", "links", text)
+        yield from _asked(experiment, text, link, path)
+        if isinstance(link, Link):
+            yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
+    for number, change in enumerate(experiment.formation.changes):
+        yield from _change(experiment, number, change)
+    near = experiment.formation.proximity
+    if near is not None and near.distance is None and not experiment.formation.links:
+        message = "there are no links that could come and go by range"
+        hint = "add distance = 0.5, which any two robots keep while they are near each other, or [formation.links]"
+        yield Fault(("formation", "proximity"), message, hint)
+
+
+def _links(experiment: Experiment) -> Iterator[Fault]:
+    robots = experiment.robots
+    if experiment.formation.leader is not None:
+        yield from unknown_robot(("formation", "leader"), experiment.formation.leader, robots)
+    given: dict[tuple[str, str], str] = {}
+    for text in experiment.formation.links:
+        path = ("formation", "links", text)
+        try:
+            both = link_pairs(text)
+        except ValueError as error:
+            hint = str(error)
+            yield Fault(path, f"{text!r} is no link", hint if hint == FORM else f"{hint}; {FORM}", on_key=True)
+            continue
+        for name in dict.fromkeys(reversed(both[0])):
+            yield from unknown_robot(path, name, robots, on_key=True)
+        if both[0][0] == both[0][1]:
+            yield Fault(path, f"'{both[0][0]}' cannot receive from itself", "name two robots", on_key=True)
+            continue
+        again = [pair for pair in both if pair in given]
+        if again:
+            receiver, sender = again[0]
+            message = f"the link {sender} > {receiver} is already given by '{given[again[0]]}'"
+            yield Fault(path, message, "keep one of the two", on_key=True)
+        given.update(dict.fromkeys(both, text))
+
+
+def _kind_of(given: Target | float) -> str:
+    """Name of the target of a link."""
+    if not isinstance(given, Target):
+        return "distance"
+    return next(name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None)
+
+
+def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
+    """Targets that the law does not take, or that robots with held heights cannot meet."""
+    name, _ = registry.split(experiment.formation.law)
+    needs, kind = getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"), _kind_of(given)
+    can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}
+    words = {"distance": "a distance or an offset", "relative": "an offset", "bearing": "a bearing or an offset"}
+    if needs in can and kind not in can[needs]:
+        message = f"the law '{name}' needs {words[needs]} of every link; this one asks for a {kind}"
+        example = {"relative": "{ offset = [0.6, 0.0] }", "bearing": "{ bearing = [1.0, 0.0] }"}.get(needs, "0.6")
+        hint = f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {example}'
+        yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
+        return
+    if not isinstance(given, Target):
+        return
+    second, first = link_pairs(text)[0]
+    rise = held_height(experiment, second) - held_height(experiment, first)
+    if given.offset is not None:
+        if needs == "bearing" and not any(given.offset) and rise == 0.0:
+            yield Fault((*path, "offset"), "an offset of zeros has no direction", "give x, y other than 0")
+        if len(given.offset) == 3 and abs(given.offset[2] - rise) > ROUNDED:
+            message = f"'{second}' is held {rise:g} m above '{first}', not {given.offset[2]:g} m"
+            yield Fault((*path, "offset", 2), message, "leave the third number out, or change hover")
+    slope = given.bearing[2] if given.bearing is not None and len(given.bearing) == 3 else None
+    if slope is not None and slope * rise <= 0.0 and not slope == rise == 0.0:
+        message = f"'{second}' is held {rise:g} m above '{first}': this direction is never met"
+        yield Fault((*path, "bearing", 2), message, "leave the third number out: a direction seen from above")
+
+
+def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fault]:
+    path = ("formation", "changes", number)
+    yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
+    before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
+    kinds = {_kind_of(given) for given in before.values()}
+    for text, given in change.links.items():
+        where = (*path, "links", text)
+        try:
+            both = link_pairs(text)
+        except ValueError as error:
+            yield Fault(where, f"{text!r} is no link", str(error), on_key=True)
+            continue
+        if not set(both) <= set(before):
+            hint = did_you_mean(text, experiment.formation.links)
+            yield Fault(where, f"{text!r} is none of the formation's links", hint, on_key=True)
+            continue
+        old, new = _kind_of(before[both[0]]), _kind_of(given)
+        if old != new:
+            message = f"{text!r} asks for a {old} before, and for a {new} then: there is no way between them"
+            yield Fault(where, message, f"give a {old}")
+        else:
+            yield from _asked(experiment, text, given, where)
+    if change.rotate and kinds == {"distance"}:
+        message = "nothing here knows a direction: distances are met whichever way the formation faces"
+        yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")
+    if change.scale != 1.0:
+        for text, given in experiment.formation.links.items():
+            if isinstance(given, Target) and given.bearing is not None and len(given.bearing) == 3 and given.bearing[2]:
+                message = f"the slope of {text!r} changes when the formation grows and heights are held"
+                yield Fault((*path, "scale"), message, "give that bearing as seen from above, without the third number")

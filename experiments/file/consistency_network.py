@@ -75,11 +75,7 @@ def _network(experiment: Experiment) -> Iterator[Fault]:
         if endpoints is not None and not endpoints:
             yield Fault(("network", name), f"`{name}` is empty", "leave it out, or give an endpoint")
         for number, endpoint in enumerate(endpoints or ()):
-            try:
-                Endpoint.parse(endpoint)
-            except ValueError as error:
-                message, _, hint = str(error).partition("; ")
-                yield Fault(("network", name, number), message, hint)
+            yield from _endpoint(("network", name, number), endpoint)
     if network.topology == "mesh":
         yield from _mesh(experiment)
     elif network.addresses:
@@ -114,14 +110,17 @@ def _mesh(experiment: Experiment) -> Iterator[Fault]:
     for robot, endpoint in network.addresses.items():
         path = ("network", "addresses", robot)
         yield from unknown_robot(path, robot, experiment.robots)
-        try:
-            found = Endpoint.parse(endpoint)
-        except ValueError as error:
-            message, _, hint = str(error).partition("; ")
-            yield Fault(path, message, hint)
-        else:
-            if found.is_wildcard:
-                yield Fault(path, "a wildcard is no address to connect", "give the one at which its neighbours find it")
+        yield from _endpoint(path, endpoint, one=True)
+
+
+def _endpoint(path: Path, text: str, *, one: bool = False) -> Iterator[Fault]:
+    """Faults of an endpoint; `one`: it stands for one address."""
+    try:
+        if Endpoint.parse(text).is_wildcard and one:
+            yield Fault(path, "a wildcard is no address to connect", "give the one at which its neighbours find it")
+    except ValueError as error:
+        message, _, hint = str(error).partition("; ")
+        yield Fault(path, message, hint)
 
 
 FORM: Final = '"A > B" are poses from A to B, "A - B" both ways'

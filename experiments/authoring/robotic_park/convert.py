@@ -21,6 +21,7 @@ from experiments.authoring.robotic_park.heights import Heights, find_heights, or
 from experiments.catalogue import index
 from experiments.file import catalogue as entries
 from experiments.file import document
+from experiments.file.consistency import divisor
 from experiments.file.problems import refusal
 from experiments.file.reference import written
 from experiments.file.text import content
@@ -187,8 +188,7 @@ def _note_robots(park: Park, notes: list[str]) -> None:
 def _rate(key: str, what: str, periods: Sequence[float], notes: list[str]) -> float:
     """The rate [Hz] nearest to the commonest period [s] that divides the rate of bodies."""
     hz = 1.0 / _commonest(key, periods, notes)
-    divisors = [RATE_HZ / times for times in range(1, 1001) if (1000 * RATE_HZ / times).is_integer()]
-    nearest = min(divisors, key=lambda each: abs(np.log(each / hz)))
+    nearest = divisor(RATE_HZ, hz)
     if abs(nearest - hz) > 1e-6 * hz:
         notes.append(f"{what} at {hz:g} Hz become {nearest:g} Hz, which divides the {RATE_HZ:g} Hz of bodies")
     return nearest
