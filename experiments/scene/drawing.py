@@ -216,8 +216,8 @@ class SceneDrawing:
         self._draw_robots(moment, still=still)
         self._draw_links(moment)
         for handle, pose in zip(self._obstacles, moment.obstacles, strict=True):
-            if not _drawn_at(handle, pose):
-                handle.position, handle.wxyz = (pose[0], pose[1], 0.0), appearance.quaternions(pose[2])
+            _update(handle, "position", np.array([pose[0], pose[1], 0.0]).round(4))
+            _update(handle, "wxyz", appearance.quaternions(pose[2]).round(4))
         if trails:
             self._draw_trails(moment)
         self._draw_margins(moment)
@@ -324,15 +324,6 @@ class SceneDrawing:
 
     def _leading(self) -> Mask:
         return np.isin(np.array(self.stage.names), self.stage.leaders)
-
-
-def _drawn_at(handle: Any, pose: Array) -> bool:  # noqa: ANN401
-    """Whether an obstacle is drawn at this pose already."""
-    place = np.array([pose[0], pose[1], 0.0])
-    return bool(
-        np.abs(handle.position - place).max() < 1e-5
-        and np.abs(handle.wxyz - appearance.quaternions(pose[2])).max() < 1e-5
-    )
 
 
 def _linear(colours: Colours | Array | Colour) -> Colours:

@@ -244,16 +244,6 @@ class Moment:
     shadow_yaw: Array | None = None  # (N,) [rad]
     time: float | None = None  # [s] since the common start; None before it
 
-    @classmethod
-    def unknown(cls, stage: Stage) -> Moment:
-        """Nothing is known yet."""
-        rows, net = len(stage.names), len(stage.links)
-        blank = np.full((rows, 3), np.nan)
-        return cls(
-            blank, np.full(rows, np.nan), blank.copy(), np.full(rows, int(Condition.WAITING)), np.full(rows, inf),
-            np.full(net, np.nan), np.zeros(net, dtype=bool), stage.scene.pose.copy(), np.zeros((rows, 0, 3)),
-        )  # fmt: skip
-
 
 class LinkTracker:
     """Errors of the links as the law measures them, along a motion."""

@@ -139,10 +139,7 @@ class Observer:
         self._starts = np.full(len(stage.names), nan)
 
     def _report(self, name: str) -> RobotReport:
-        found = self.robots.get(name)
-        if found is None:
-            found = self.robots[name] = RobotReport()
-        return found
+        return self.robots.setdefault(name, RobotReport())
 
     def _receive_status(self, status: messages.Status, now: float) -> None:
         report = self._report(status.robot)

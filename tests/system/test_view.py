@@ -19,9 +19,10 @@ from agents.runtime.orders import PAUSED
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.run import simulate
-from experiments.scene.stage import Condition, Moment, Stage
+from experiments.scene.stage import Condition, Stage
 from experiments.view import acting
 from tests.conftest import RouterProcess
+from tests.experiments import moments
 from tests.system.browser import Page, needs_chromium, opened
 from tests.system.lab import NEAR, ROOT, Flight, RobotProcess, Started, Watcher, typed, zenpark
 
@@ -266,7 +267,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     shown = Page(server, dark=False)
     shown.begin(crowd_stage)
     over = threading.Event()
-    moment = Moment.unknown(crowd_stage)
+    moment = moments.unknown(crowd_stage)
     grid = np.array([[k % 10 - 4.5, k // 10 - 4.5, 0.6 * (k % 2)] for k in range(100)])
     moment.condition[:], moment.yaw[:] = Condition.ACTIVE, 0.0
 

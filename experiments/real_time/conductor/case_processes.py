@@ -115,10 +115,10 @@ class CaseProcesses:
 
     def _start(self, names: Sequence[str], file: Path, experiment: Experiment) -> None:
         group = self._group(names[0])
-        station, process = self._context.hosts.station_of(names[0]), self._process(group)
+        station = self._context.hosts.by_robot.get(names[0])
         if station is not None:
             case = document.case_document(experiment)
-            self._abroad[f"{station.name}/{group}"] = station.start(process, names, case, self._launcher)
+            self._abroad[f"{station.name}/{group}"] = station.start(self._process(names[0]), names, case)
         else:
             self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
 
@@ -140,15 +140,15 @@ class CaseProcesses:
 
     def runs(self, name: str) -> bool:
         """Whether the process of a robot was started from here, and has not ended."""
-        return self._launcher.running(self._process(self._group(name)))
+        return self._launcher.running(self._process(name))
 
     def release(self, name: str) -> None:
         """Cut the lifeline of a robot's process: it lands by itself, and ends."""
-        self._launcher.release(self._process(self._group(name)))
+        self._launcher.release(self._process(name))
 
     def kill(self, name: str) -> None:
         """Kill the process of a robot that ignores its lifeline."""
-        self._launcher.kill(self._process(self._group(name)))
+        self._launcher.kill(self._process(name))
 
     def end(self) -> None:
         """End all but the router: robots land first, and the recorder sees it."""
@@ -159,7 +159,7 @@ class CaseProcesses:
 
     def end_robots(self) -> list[str]:
         """End the processes of all robots, which land first; return the robots whose process had to be killed."""
-        groups = {self._process(group): members for group, members in self._groups.items()}
+        groups = {self._context.process(group): members for group, members in self._groups.items()}
         return [name for process in self._launcher.end(groups, grace_s=LAND_S) for name in groups[process.name]]
 
     def deaths(self) -> Iterator[Death]:
@@ -189,12 +189,11 @@ class CaseProcesses:
 
     def last_line(self, robot: str) -> str:
         """The last line that the process of a robot wrote; empty if it wrote none."""
-        group = self._group(robot)
-        log = self._context.folder / "logs" / f"{self._process(group)}.log"
+        log = self._context.folder / "logs" / f"{self._process(robot)}.log"
         return "".join(log.read_text(errors="replace").strip().splitlines()[-1:]) if log.exists() else ""
 
     def _group(self, robot: str) -> str:
         return next(group for group, members in self._groups.items() if robot in members)
 
-    def _process(self, group: str) -> str:
-        return self._context.process(group)
+    def _process(self, robot: str) -> str:
+        return self._context.process(self._group(robot))

@@ -136,7 +136,7 @@ class Inspector(CaseRun):
                 found = checks.at_rest(observed, self._experiment.safety, today)
                 for name, each in observed.items():
                     if each.status is not None:
-                        found[name].append(self._stop_at_rest(name, each))
+                        found[name].append(self._stop_at_rest(name))
                 self._processes.end_robots()
                 for name, each in observed.items():
                     found[name] += self._try(name, each, red=any(check.verdict == "bad" for check in found[name]))
@@ -167,11 +167,11 @@ class Inspector(CaseRun):
                 each.ended = "its host has no address: it is started there by hand or at boot; check it there"
         return observed
 
-    def _stop_at_rest(self, name: str, each: Observed) -> Check:
+    def _stop_at_rest(self, name: str) -> Check:
         self._phase(f"{name}: stop, motors off")
         tried = Tried()
         self._stop(name, tried)
-        return checks.stop_at_rest(each, tried)
+        return checks.stop("stop, motors off", tried)
 
     def _stop(self, name: str, tried: Tried) -> None:
         """Order the motors off, and wait until the robot reports that."""

@@ -260,14 +260,9 @@ def _ready(status: messages.Status) -> Check:
     return _bad("ready", why, "docs/safety.md, section `Before take-off`, has every condition")
 
 
-def stop_at_rest(observed: Observed, tried: Tried) -> Check:
-    """Emergency stop of a robot that stands: order accepted, motors off, nothing moved."""
-    return _stop("stop, motors off", observed, tried)
-
-
 def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     """Emergency stop of a drone that begins to climb, or of a robot that drives."""
-    check = _stop("stop, motors on", observed, tried)
+    check = stop("stop, motors on", tried)
     way = _largest_displacement(tried.states)
     if check.verdict == "ok" and observed.robot.hover is None and way > STOP_WAY_M:
         return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
@@ -276,7 +271,8 @@ def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     return check
 
 
-def _stop(what: str, observed: Observed, tried: Tried) -> Check:
+def stop(what: str, tried: Tried) -> Check:
+    """Emergency stop: order accepted, motors off."""
     remedy = "do not fly it: end its other clients, look at its log, and keep a hand on its switch"
     if tried.failure:
         return _bad(what, tried.failure, remedy)

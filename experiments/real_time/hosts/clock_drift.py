@@ -28,8 +28,8 @@ def applied(now: HostClock, before: float) -> float:
 class Drift:
     """Measures and corrects the clocks of some hosts in a thread of its own, for an answer may take long."""
 
-    def __init__(self, hosts: Iterable[tuple[Station, list[str]]]) -> None:
-        """`hosts` with the robots that run on each; measured once already."""
+    def __init__(self, hosts: Iterable[Station]) -> None:
+        """`hosts` were measured once already."""
         self._hosts = list(hosts)
         self._over = threading.Event()
         self._measured: list[HostClock] = []
@@ -62,20 +62,20 @@ class Drift:
 
     def _run(self) -> None:
         while self._hosts and not self._over.wait(PERIOD_S):
-            for host, robots in list(self._hosts):
+            for host in list(self._hosts):
                 try:
-                    self._measure(host, robots)
+                    self._measure(host)
                 except HostError as error:
-                    self._hosts.remove((host, robots))
+                    self._hosts.remove(host)
                     with self._lock:
                         self._trouble.append(f"{error}; its clock is not corrected any more")
 
-    def _measure(self, host: Station, robots: list[str]) -> None:
+    def _measure(self, host: Station) -> None:
         """Measure one clock and correct its robots."""
         before = host.clock
         assert before is not None
         assert before.applied is not None
-        now = host.measure(robots, SAMPLES)
+        now = host.measure(SAMPLES)
         step, last = (applied(each, before.applied) - before.applied for each in (now, before))
         if abs(step) <= STEP_S:
             now = host.correct(before.applied + step)

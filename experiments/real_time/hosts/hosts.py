@@ -106,7 +106,8 @@ class Station:
         self._waiting.register(stdout.fileno(), select.POLLIN)
         self._rest = b""
         self._starting: list[Process] = []
-        self._robots: list[tuple[Process, Launcher]] = []
+        self._robots: list[Process] = []
+        self._launcher = launcher
         self._silent = False
         self.reset_clock()
 
@@ -180,22 +181,22 @@ class Station:
     def same_version(self) -> bool:
         return self.hello.zenpark == version.digest()
 
-    def measure(self, robots: Sequence[str] = (), samples: int = SAMPLES) -> HostClock:
-        """Measure the host's clock, by some round trips; `robots` run there."""
+    def measure(self, samples: int = SAMPLES) -> HostClock:
+        """Measure the host's clock, by some round trips."""
         trips = []
         for _ in range(samples):
             answer, left, back = self.ask(Question("clock"))
             trips.append(clocks.Sample(left, answer.clock, back))
         offset, uncertainty = clocks.host_offset(trips)
-        self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, list(robots), self.applied)
+        self.clock = HostClock(self.name, trips[-1].back, offset, uncertainty, self.host.robots, self.applied)
         return self.clock
 
     def correct(self, applied: float) -> HostClock:
         """Set the correction of the host's clock for its robots [s], those that are started later too."""
         assert self.clock is not None
         self.applied = applied
-        for process, launcher in self._robots:
-            launcher.send_line(process, clock.correction_line(-applied))
+        for process in self._robots:
+            self._launcher.send_line(process, clock.correction_line(-applied))
         self.clock = msgspec.structs.replace(self.clock, applied=applied)
         return self.clock
 
@@ -224,16 +225,16 @@ class Station:
         """Folder of certificates on the host."""
         return self.host.lab.removeprefix("~/")
 
-    def start(self, name: str, robots: Sequence[str], document: bytes, launcher: Launcher) -> Process:
+    def start(self, name: str, robots: Sequence[str], document: bytes) -> Process:
         while len(self._under_way()) >= HANDSHAKES:
             time.sleep(POLL_S)
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
         connect += [] if self.lab is None else ["--lab", self.folder]
         correction = f"{-self.applied:.6f}"
         words = self.command("agent", "-", *robots, *connect, f"--clock-correction={correction}", "--lifeline")
-        process = launcher.spawn(name, ssh.command(self.address, words), first_input=document + b"\n")
+        process = self._launcher.spawn(name, ssh.command(self.address, words), first_input=document + b"\n")
         self._starting.append(process)
-        self._robots.append((process, launcher))
+        self._robots.append(process)
         return process
 
     def _under_way(self) -> list[Process]:
@@ -254,7 +255,7 @@ class Hosts:
         self._launcher, self.routers = launcher, list(routers)
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}
-        self._robots: dict[str, Station] = {}
+        self.by_robot: dict[str, Station] = {}  # of the case
 
     def join(self, experiment: Experiment) -> list[HostClock]:
         """Connect the hosts of a case that have robots and an address; return their clocks.
@@ -285,21 +286,17 @@ class Hosts:
             for station in fresh:
                 del self._stations[station.name]
             raise HostError("\n".join(trouble))
-        self._robots = {robot: self._stations[name] for name, host in wanted.items() for robot in host.robots}
-        return [self._begin(self._stations[name], host.robots) for name, host in wanted.items()]
+        self.by_robot = {robot: self._stations[name] for name, host in wanted.items() for robot in host.robots}
+        measured = []
+        for station in self.in_use():
+            station.host = wanted[station.name]
+            station.reset_clock()
+            measured.append(station.correct(station.measure().offset))
+        return measured
 
-    @staticmethod
-    def _begin(station: Station, robots: Sequence[str]) -> HostClock:
-        station.reset_clock()
-        return station.correct(station.measure(robots).offset)
-
-    def in_use(self) -> list[tuple[Station, list[str]]]:
-        """Hosts of the case, and the robots that run there."""
-        stations = dict.fromkeys(self._robots.values())
-        return [(each, [name for name, place in self._robots.items() if place is each]) for each in stations]
-
-    def station_of(self, robot: str) -> Station | None:
-        return self._robots.get(robot)
+    def in_use(self) -> list[Station]:
+        """Hosts of the case."""
+        return list(dict.fromkeys(self.by_robot.values()))
 
     def sweep(self) -> list[str]:
         """Kill remaining processes of the run on every host, and name them."""

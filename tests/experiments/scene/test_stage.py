@@ -13,6 +13,7 @@ from agents.network import messages
 from experiments.file.document import load, loads
 from experiments.scene import models, stage
 from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTracker, Moment, Place, Stage, Trail
+from tests.experiments import moments
 
 ALIVE = {"alive": True, "age_s": 0.1}
 
@@ -34,7 +35,7 @@ def park() -> Stage:
 
 
 def at_start(park: Stage) -> Moment:
-    moment = Moment.unknown(park)
+    moment = moments.unknown(park)
     assert park.experiment is not None
     for row, robot in enumerate(park.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
@@ -104,7 +105,7 @@ def test_a_link_is_lit_while_its_sender_has_just_transmitted(park):
 
 
 def test_unknown_robots_are_out_of_sight(park):
-    moment = Moment.unknown(park)
+    moment = moments.unknown(park)
     assert (stage.shown(moment.position)[:, 2] < -100.0).all()
     ends = stage.segments(park, moment)
     assert (stage.visible(ends, np.ones(len(ends), dtype=bool))[..., 2] < -100.0).all()
@@ -177,7 +178,7 @@ def test_obstacles_stand_where_the_file_says():
         mesh = models.obstacle(scene, k)
         assert mesh.vertices[:, 2].min() == pytest.approx(scene.bottom[k])
         assert mesh.vertices[:, 2].max() == pytest.approx(scene.top[k])
-    assert Moment.unknown(course).obstacles == pytest.approx(scene.pose)
+    assert moments.unknown(course).obstacles == pytest.approx(scene.pose)
 
 
 def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
@@ -190,4 +191,4 @@ def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
 def test_robots_without_an_experiment_are_drawn_too():
     found = Stage.of_robots(("A", "B"))
     assert LinkTracker(found).errors(None, np.zeros((2, 3))).shape == (0,)
-    assert replace(Moment.unknown(found)).position.shape == (2, 3)
+    assert replace(moments.unknown(found)).position.shape == (2, 3)

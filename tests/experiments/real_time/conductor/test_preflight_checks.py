@@ -141,7 +141,7 @@ def test_a_clock_that_is_off():
     ],
 )
 def test_stops(tried, verdict):
-    assert checks.stop_at_rest(standing(), tried).verdict == verdict
+    assert checks.stop("stop, motors off", tried).verdict == verdict
     made = checks.stop_in_motion(standing(), tried)
     assert (made.verdict, "locked" in made.found) == (verdict, verdict == "ok")
 

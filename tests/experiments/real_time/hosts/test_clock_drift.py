@@ -66,10 +66,10 @@ class Host:
         self.name, self.clock = "lab2", HostClock("lab2", 0.0, 0.2, UNCERTAINTY_S, ["CF01"], 0.2)
         self.offsets, self.told = list(offsets), []
 
-    def measure(self, robots, samples):
+    def measure(self, samples):
         if not self.offsets:
             raise HostError("lab2: says nothing")
-        self.clock = HostClock("lab2", time.time(), self.offsets.pop(0), UNCERTAINTY_S, robots, self.clock.applied)
+        self.clock = HostClock("lab2", time.time(), self.offsets.pop(0), UNCERTAINTY_S, ["CF01"], self.clock.applied)
         return self.clock
 
     def correct(self, applied):
@@ -88,7 +88,7 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
             every.extend(more)
         return len(trouble) >= 2
 
-    with clock_drift.Drift([(host, ["CF01"])]) as following:
+    with clock_drift.Drift([host]) as following:
         until(followed, "a jump and silence are noticed")
     assert host.told == pytest.approx([0.21 - UNCERTAINTY_S, 0.22 - UNCERTAINTY_S])
     assert [each.offset for each in measured] == pytest.approx([0.21, 0.21 + 2 * STEP_S, 0.22])
