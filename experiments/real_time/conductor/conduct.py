@@ -32,7 +32,7 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.conductor.run_view import Shown
-from experiments.real_time.conductor.support import RouterEnded, await_routers, make_routers
+from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE
@@ -175,9 +175,7 @@ def _staged(
     with run_registry.registered(me) as unlisted, user.launching(folder / "logs") as launcher:
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
         routers = make_routers(listening, network.routers) if own_router else []
-        for router in routers:
-            router.start(launcher, rights)
-        await_routers(launcher, routers)
+        start_routers(launcher, routers, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)
         # a mesh has no members yet: only the session of each case receives stops there
         keys = Keys(network.realm)

@@ -198,33 +198,26 @@ class Inspector(CaseRun):
 
     def _try(self, name: str, each: Observed, *, red: bool) -> Iterator[Check]:
         """Hop or drive, then stop in motion, of one robot; what is red is not moved."""
-        what = checks.hop_of(each.robot)
-        wanted = [(what, "--hop", self._trials.hop), ("stop, motors on", "--stop", self._trials.stop)]
-        if each.robot.kind == TELLO.name:  # first: the other flights are steered by what it measures
-            wanted.insert(0, ("sticks", "--sticks", self._trials.sticks))
-        for check, option, asked in wanted:
-            if not asked:
+        robot, asked, safety = each.robot, self._trials, self._experiment.safety
+        trials: list[tuple[str, str, bool, Callable[[], Check]]] = [
+            (checks.hop_of(robot), "--hop", asked.hop, lambda: checks.hop(each, self._move(name, robot), safety)),
+            ("stop, motors on", "--stop", asked.stop,
+             lambda: checks.stop_in_motion(each, self._move(name, robot, stop=True))),
+        ]  # fmt: skip
+        if robot.kind == TELLO.name:  # first: the other flights are steered by what it measures
+            trials.insert(0, ("sticks", "--sticks", asked.sticks, lambda: checks.sticks(each, self._test_sticks(name))))
+        for check, option, wanted, judge in trials:
+            if not wanted:
                 yield checks.not_tried(check, f"{option} tries it")
-            elif red or self._context.ended():
-                yield checks.not_tried(
-                    check, "not tried: interrupted" if self._context.ended() else "not tried: mend that first"
-                )
+            elif self._context.ended():
+                yield checks.not_tried(check, "not tried: interrupted")
+            elif red:
+                yield checks.not_tried(check, "not tried: mend that first")
             else:
                 self._phase(f"{name}: {check}")
-                tried = (
-                    self._test_sticks(name)
-                    if check == "sticks"
-                    else self._move(name, each.robot, stop=option == "--stop")
-                )
+                made = judge()
                 if self._context.ended():
-                    yield checks.not_tried(check, "interrupted; it is down")
-                    continue
-                if check == "sticks":
-                    made = checks.sticks(each, tried)
-                elif option == "--stop":
-                    made = checks.stop_in_motion(each, tried)
-                else:
-                    made = checks.hop(each, tried, self._experiment.safety)
+                    made = checks.not_tried(check, "interrupted; it is down")
                 red = made.verdict == "bad"
                 yield made
 
@@ -233,14 +226,14 @@ class Inspector(CaseRun):
         robot = self._processes.robot(name)
         device = robot.device | {"stick_test": True}
         robot = msgspec.structs.replace(robot, hover=tello.TAKEOFF_HEIGHT, device=device)
-        return self._move(name, robot, stop=False, changed={name: robot}, hold_s=tello.TEST_ENDS_S[-1])
+        return self._move(name, robot, changed={name: robot}, hold_s=tello.TEST_ENDS_S[-1])
 
     def _move(
         self,
         name: str,
         robot: Robot,
         *,
-        stop: bool,
+        stop: bool = False,
         changed: Mapping[str, Robot] | None = None,
         hold_s: float = HOLD_S,
     ) -> Tried:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final, Literal, Protocol, Self
+from typing import Final, Literal
 
 from agents.clock import Clock
 from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
@@ -106,6 +106,7 @@ class News:
 
 
 Show = Callable[[Progress], None]
+Shown = AbstractContextManager[Show]  # a live table takes the terminal over
 
 
 class RunFailed(RuntimeError):
@@ -272,13 +273,3 @@ def _fell_out(before: messages.Status | None, now: messages.Status) -> bool:
         return False
     told = any(incident.text.startswith(("land: ", "cut: ")) for incident in now.incidents)
     return now.phase in ("landing", "done") and not (told or now.reason.startswith(ASKED))
-
-
-class Shown(Protocol):
-    """A way to show progress; a context manager, because a live table takes the terminal over."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def __call__(self, progress: Progress) -> None: ...

@@ -53,8 +53,8 @@ def _announced(process: Process, pattern: str, count: int, interrupted: Callable
         time.sleep(POLL_S)
 
 
-def await_routers(launcher: Launcher, routers: Sequence[Router]) -> None:
-    """Wait until started routers listen.
+def start_routers(launcher: Launcher, routers: Sequence[Router], rights: Path | None) -> None:
+    """Start routers, and wait until they listen.
 
     Without that, robots would join a stranger's router where another run took the port at the same moment.
 
@@ -62,8 +62,7 @@ def await_routers(launcher: Launcher, routers: Sequence[Router]) -> None:
         RouterEnded: If one ends instead.
         StandInError: If one does not listen in time.
     """
-    for router in routers:
-        process = launcher.get(router.name)
+    for process in [router.start(launcher, rights) for router in routers]:
         try:
             _announced(process, r"^(router) (ready)\b", 1, lambda: False)
         except StandInError as error:
@@ -180,12 +179,12 @@ class Router:
     # routers before it, which it connects to for as long as it lives, so that any two are linked once
     link: Sequence[str] = ()
 
-    def start(self, launcher: Launcher, rights: Path | None = None) -> None:
+    def start(self, launcher: Launcher, rights: Path | None = None) -> Process:
         """Start the router; it outlives a killed launcher until robots have landed. In a lab it enforces `rights`."""
         listen = [part for endpoint in self.listen for part in ("--listen", endpoint)]
         link = [part for endpoint in self.link for part in ("--connect", endpoint)]
         enforced = [] if rights is None else ["--rights", str(rights)]
-        launcher.start(
+        return launcher.start(
             self.name, "agents.runtime.router", *listen, *link, *enforced, "--lifeline", "--linger", str(LINGER_S)
         )
 

@@ -45,7 +45,7 @@ class Recorder:
         self._connected = True
         self._session = session
         self._arrival = Clock()
-        self._unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
+        self.unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._reported: dict[str, int] = {}
         self._alive: set[str] = set()
         self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in TOPICS]
@@ -75,14 +75,9 @@ class Recorder:
             while waiting and (last or waiting[0][1].stamp <= truths[-1].stamp or now - waiting[0][0] > PATIENCE_S):
                 self._recording.write(with_truth(waiting.popleft()[1], truths))
 
-    @property
-    def malformed(self) -> int:
-        """Number of unreadable messages."""
-        return sum(count for count, _ in self._unread.values())
-
     def report_malformed(self, *, last: bool = False) -> None:
         """Records unreadable messages as events: of each key the first, and their number the `last` time."""
-        for key, (count, why) in list(self._unread.items())[:NAMED]:
+        for key, (count, why) in list(self.unread.items())[:NAMED]:
             before = self._reported.get(key, 0)
             if not before or (last and count != before):
                 self._reported[key] = count
@@ -102,7 +97,7 @@ class Recorder:
         )
 
     def _note_unread(self, key: str, reason: str) -> None:
-        self._unread[key] = self._unread.get(key, (0, ""))[0] + 1, reason
+        self.unread[key] = self.unread.get(key, (0, ""))[0] + 1, reason
 
     def _store(self, topic: Topic, message: Message, size: int) -> None:
         if isinstance(message, messages.State) and message.true_position is None and message.robot in self._truth:
