@@ -19,7 +19,7 @@ from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import Figures, figures_of
 from experiments.virtual_time import simulation
-from experiments.virtual_time.log import goals_of
+from experiments.virtual_time.log import Logbook
 
 SEEDS: Final = 20
 BATCH: Final = 10  # seeds side by side: more take more memory, not less time
@@ -43,8 +43,7 @@ def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], 
         poses = np.bincount(log.sent.link[within], minlength=rows * len(log.seeds)).reshape(-1, rows)
         for copy, sent in enumerate(poses):
             told, heard = 0, 0
-            if log.centre is not None:
-                seen = goals_of(log.centre, log.names, copy * rows, experiment.duration_s, "json")
+            if (seen := Logbook(log, experiment, "", copy).goals) is not None:
                 told, heard = len(seen.sent), int(seen.received.sum())
                 delay.append(float(seen.delay.mean()))
             messages.append(int(sent.sum()) + told)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from functools import cached_property
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from msgspec.structs import replace
@@ -43,75 +44,7 @@ from experiments.virtual_time.simulation import OPTIONAL, Log
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 
 
-def goal_messages(centre: CentreLog, names: Sequence[str], first: int) -> Iterator[tuple[float, messages.Goal]]:
-    """Goals of one repetition, and when they were sent since the common start [s].
-
-    Args:
-        first: Row of the first of them.
-    """
-    own = centre.sent.between(first, first + len(names))
-    assert own.yaw is not None
-    assert own.extra is not None
-    columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
-    for t, robot, number, place, yaw, pose in zip(*(column.tolist() for column in columns), strict=True):
-        stamps = round(EPOCH + t, 6), round(EPOCH + pose, 6)
-        yield (
-            t,
-            messages.Goal(names[robot], number, stamps[0], tuple(place), None if math.isnan(yaw) else yaw, stamps[1]),
-        )
-
-
-def centre_receipts(
-    centre: CentreLog, sample: Array, first: int, rows: int
-) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
-    """Goals that reached robots of one repetition, by number of the `sample` (T,) and row."""
-    own = centre.followed.between(first, first + rows)
-    assert own.extra is not None
-    at = np.searchsorted(sample, own.arrival - ROUNDING_S)
-    found: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
-    columns = (column.tolist() for column in (at, own.link, own.seq, own.stamp, own.extra[:, 0], own.arrival))
-    for k, robot, number, sent, taken, acted in zip(*columns, strict=True):
-        news = messages.GoalReceipt(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
-        found.setdefault((k, robot), []).append(news)
-    return found
-
-
-def centre_report(goals: Goals, names: Sequence[str], duration: float) -> messages.CentreState:
-    """The report of the central controller of one repetition in virtual time at the end of the run."""
-    return messages.CentreState(
-        stamp=EPOCH + duration,
-        robots=[name for name, reached in zip(names, goals.reached, strict=True) if reached],
-        missing=[],
-        load=0.0,
-        late_s=0.0,
-        decisions=len(np.unique(goals.sent.stamp)),
-        missed=0,
-        goals=len(goals.sent),
-        received=dict(zip(names, goals.received.tolist(), strict=True)),
-        lost=dict.fromkeys(names, 0),
-        dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
-        malformed=0,
-        pid=0,
-        cpu_s=0.0,
-        rss_mb=0.0,
-    )
-
-
-def goals_of(
-    centre: CentreLog, names: Sequence[str], first: int, duration: float, encoding: messages.Encoding
-) -> Goals:
-    """Goals of one repetition in virtual time, whose first row is `first`."""
-    rows, end = len(names), first + len(names)
-    sizes = [len(messages.encode(goal, encoding)) for _, goal in goal_messages(centre, names, first)]
-    received = received_in_run(centre.received.between(first, end), duration)
-    return Goals.of_run(
-        replace(centre.sent.between(first, end), bytes=np.array(sizes, dtype=np.intp)),
-        centre.followed.between(first, end),
-        duration,
-        received=np.bincount(received.link, minlength=rows),
-        lost=np.zeros(rows, dtype=np.intp),
-        dropped=centre.lost_poses[first:end],
-    )
+T = TypeVar("T")
 
 
 class Logbook:
@@ -132,10 +65,23 @@ class Logbook:
         per_copy = len(self._links)
         self._received = log.received.between(copy * per_copy, (copy + 1) * per_copy)
         self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
-        self._goals: Goals | None = None
-        if log.centre is not None and not log.lean:
-            encoding = experiment.network.encoding
-            self._goals = goals_of(log.centre, log.names, copy * rows, experiment.duration_s, encoding)
+
+    @cached_property
+    def goals(self) -> Goals | None:
+        """Goals of the central controller; None if each robot decides for itself."""
+        centre, mine, rows = self._log.centre, self._mine, len(self._log.names)
+        if centre is None:
+            return None
+        sizes = [len(messages.encode(goal, self._encoding)) for _, goal in self._goal_messages(centre)]
+        received = received_in_run(centre.received.between(mine.start, mine.stop), self._experiment.duration_s)
+        return Goals.of_run(
+            replace(centre.sent.between(mine.start, mine.stop), bytes=np.array(sizes, dtype=np.intp)),
+            centre.followed.between(mine.start, mine.stop),
+            self._experiment.duration_s,
+            received=np.bincount(received.link, minlength=rows),
+            lost=np.zeros(rows, dtype=np.intp),
+            dropped=centre.lost_poses[mine],
+        )
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
@@ -167,7 +113,7 @@ class Logbook:
             contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
             dropped=self._dropped,
-            goals=self._goals,
+            goals=None if log.lean else self.goals,
             **columns,
         )
 
@@ -195,11 +141,10 @@ class Logbook:
         yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
         yield ((pose.stamp, pose, size) for pose, size in zip(self._poses(), self._sent.bytes.tolist(), strict=True))
         yield ((state.stamp, state, None) for _, states in self._states() for state in states)
-        if self._log.centre is not None and self._goals is not None:
-            goals = goal_messages(self._log.centre, self._log.names, self._mine.start)
+        if self._log.centre is not None and self.goals is not None:
+            goals = self._goal_messages(self._log.centre)
             yield ((EPOCH + t, goal, len(messages.encode(goal, self._encoding))) for t, goal in goals)
-            report = centre_report(self._goals, self._log.names, self._experiment.duration_s)
-            yield [(report.stamp, report, None)]
+            yield [(EPOCH + self._experiment.duration_s, self._centre_report(self.goals), None)]
         for rare in (self._statuses(), self._world(), self._contacts()):
             yield sorted(((each.stamp, each, None) for each in rare), key=itemgetter(0))
 
@@ -214,6 +159,38 @@ class Logbook:
         for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
             yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
 
+    def _goal_messages(self, centre: CentreLog) -> Iterator[tuple[float, messages.Goal]]:
+        """Goals, and when they were sent since the common start [s]."""
+        own, names = centre.sent.between(self._mine.start, self._mine.stop), self._log.names
+        assert own.yaw is not None
+        assert own.extra is not None
+        columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
+        for t, robot, number, place, yaw, pose in zip(*(column.tolist() for column in columns), strict=True):
+            sent, taken = round(EPOCH + t, 6), round(EPOCH + pose, 6)
+            heading = None if math.isnan(yaw) else yaw
+            yield t, messages.Goal(names[robot], number, sent, tuple(place), heading, taken)
+
+    def _centre_report(self, goals: Goals) -> messages.CentreState:
+        """The report of the central controller at the end of the run."""
+        names = self._log.names
+        return messages.CentreState(
+            stamp=EPOCH + self._experiment.duration_s,
+            robots=[name for name, reached in zip(names, goals.reached, strict=True) if reached],
+            missing=[],
+            load=0.0,
+            late_s=0.0,
+            decisions=len(np.unique(goals.sent.stamp)),
+            missed=0,
+            goals=len(goals.sent),
+            received=dict(zip(names, goals.received.tolist(), strict=True)),
+            lost=dict.fromkeys(names, 0),
+            dropped=dict(zip(names, goals.dropped.tolist(), strict=True)),
+            malformed=0,
+            pid=0,
+            cpu_s=0.0,
+            rss_mb=0.0,
+        )
+
     def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
         """Telemetry, sample by sample, with the poses that each robot received since the sample before."""
         log, mine = self._log, self._mine
@@ -226,10 +203,7 @@ class Logbook:
             *(repeat(None, len(log.time)) if column is None else column[:, mine].tolist() for column in rest),
             strict=True,
         )
-        received = self._received_by_sample()
-        receipts: dict[tuple[int, int], list[messages.GoalReceipt]] = {}
-        if log.centre is not None:
-            receipts = centre_receipts(log.centre, log.time, mine.start, len(log.names))
+        received, receipts = self._received_by_sample(), self._goals_by_sample()
         for k, (t, phase, position, velocity, yaw, goal, setpoint, error, truth, true_yaw, *more) in enumerate(samples):
             yield (
                 t,
@@ -257,15 +231,31 @@ class Logbook:
 
     def _received_by_sample(self) -> dict[tuple[int, int], list[messages.PoseReceipt]]:
         names, got = self._log.names, self._received
-        sample = np.searchsorted(self._log.time, got.arrival - ROUNDING_S)
-        receiver, sender = self._links.receiver[got.link], self._links.sender[got.link]
-        found: dict[tuple[int, int], list[messages.PoseReceipt]] = {}
-        columns = (sample, receiver, sender, got.seq, got.stamp, got.arrival, got.position, got.velocity)
-        for k, row, whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True):
-            news = messages.PoseReceipt(
-                names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves)
-            )
-            found.setdefault((k, row), []).append(news)
+        columns = (self._links.sender[got.link], got.seq, got.stamp, got.arrival, got.position, got.velocity)
+        news = (
+            messages.PoseReceipt(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
+            for whose, number, taken, arrived, where, moves in zip(*(c.tolist() for c in columns), strict=True)
+        )
+        return self._by_sample(got.arrival, self._links.receiver[got.link], news)
+
+    def _goals_by_sample(self) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
+        if self._log.centre is None:
+            return {}
+        got = self._log.centre.followed.between(self._mine.start, self._mine.stop)
+        assert got.extra is not None
+        columns = (got.seq, got.stamp, got.extra[:, 0], got.arrival)
+        news = (
+            messages.GoalReceipt(number, EPOCH + sent, EPOCH + taken, EPOCH + acted)
+            for number, sent, taken, acted in zip(*(c.tolist() for c in columns), strict=True)
+        )
+        return self._by_sample(got.arrival, got.link, news)
+
+    def _by_sample(self, arrival: Array, row: Index, news: Iterable[T]) -> dict[tuple[int, int], list[T]]:
+        """What arrived, by the number of the next sample and the row."""
+        sample = np.searchsorted(self._log.time, arrival - ROUNDING_S)
+        found: dict[tuple[int, int], list[T]] = {}
+        for k, robot, each in zip(sample.tolist(), row.tolist(), news, strict=True):
+            found.setdefault((k, robot), []).append(each)
         return found
 
     def _statuses(self) -> Iterator[messages.Status]:
