@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
@@ -17,17 +17,18 @@ NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference."""
+    formation = any(case.belief for case in cases)
     return [
         *failures(cases),
         *interruptions(cases),
-        *_other_findings(cases),
+        *(Finding("bad", f"In {case.case}: {_first_few(case.troubles)}.") for case in cases if case.troubles),
         *_lost_poses(cases),
-        *_modelled(cases),
+        *_of_each_case(cases, _modelled),
         *_deadlines(cases),
         *_gaps(cases),
-        *_died(cases),
-        *_guided(cases),
-        *_formation(cases),
+        *_of_each_case(cases, _died),
+        *_of_each_case(cases, _guided),
+        *([*_acquired(cases), _worst_link(cases), *_against_the_first(cases)] if formation else []),
         *contacts(cases),
         *_avoided(cases),
         *_unfinished(cases),
@@ -37,11 +38,11 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     ]
 
 
-def _formation(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Acquisition of the formation, where there is one."""
-    if not any(case.belief for case in cases):
-        return []
-    return [*_acquired(cases), _worst_link(cases), *_against_the_first(cases)]
+def _of_each_case(
+    cases: Sequence[CaseMetrics], find: Callable[[str, Sequence[CaseMetrics]], Finding | None]
+) -> list[Finding]:
+    """Findings about each case, from its name and its runs of all seeds."""
+    return [found for name, runs in by_case(cases).items() if (found := find(name, runs)) is not None]
 
 
 def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -89,28 +90,20 @@ def _lost_poses(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
 
 
-def _other_findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Robots that began late, and messages that could not be read."""
-    return [Finding("bad", f"In {case.case}: {_first_few(case.troubles)}.") for case in cases if case.troubles]
-
-
-def _modelled(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """Loss and delay of each modelled network."""
-    found, several = [], len(by_case(cases)) > 1
-    for name, runs in by_case(cases).items():
-        if not runs[0].modelled:
-            continue
-        links = [link for run in runs for link in run.passages]
-        dropped = sum(link.dropped for link in links)
-        every = dropped + sum(link.heard for link in links)
-        text = f"The modelled network dropped {number(dropped)} of {number(every)} samples"
-        text += (f" in {name}" if several else "") + (f" ({number(dropped_share(links))} %)" if dropped else "")
-        mean = mean_delay(links)
-        if mean is not None:
-            longest = max(link.delay_max for link in links if link.delay_max is not None)
-            text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
-        found.append(Finding("plain", f"{text}."))
-    return found
+def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+    """Loss and delay of a modelled network."""
+    if not runs[0].modelled:
+        return None
+    links = [link for run in runs for link in run.passages]
+    dropped = sum(link.dropped for link in links)
+    every = dropped + sum(link.heard for link in links)
+    text = f"The modelled network dropped {number(dropped)} of {number(every)} samples in {name}"
+    text += f" ({number(dropped_share(links))} %)" if dropped else ""
+    mean = mean_delay(links)
+    if mean is not None:
+        longest = max(link.delay_max for link in links if link.delay_max is not None)
+        text += f"; those received took {number(mean, 1e3)} ms, at most {number(longest, 1e3)} ms"
+    return Finding("plain", f"{text}.")
 
 
 def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -138,33 +131,27 @@ def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
     ]
 
 
-def _died(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    found = []
-    for name, runs in by_case(cases).items():
-        died = list(dict.fromkeys(robot for run in runs for robot in run.died))
-        if died:
-            them = _verb(died, "it", "them")
-            found.append(Finding("bad", f"In {name}, {_list(died)} dropped out; the means leave {them} out."))
-    return found
+def _died(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+    died = list(dict.fromkeys(robot for run in runs for robot in run.died))
+    if not died:
+        return None
+    return Finding("bad", f"In {name}, {_list(died)} dropped out; the means leave {_verb(died, 'it', 'them')} out.")
 
 
-def _guided(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def _guided(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
     """Cost of the central controller."""
-    found = []
-    for name, runs in by_case(cases).items():
-        centres = [run.guidance for run in runs if run.guidance is not None]
-        if not centres:
-            continue
-        delay = spread([centre.delay_mean_s for centre in centres])
-        busy = spread([centre.load for centre in centres])
-        text = f"In {name} a centre decides for {_list(centres[0].guided)}"
-        text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
-        if delay.mean is not None:
-            text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
-        if busy.mean is not None:
-            text += f"; its process took {interval(busy, 100.0)} % of a core"
-        found.append(Finding("plain", f"{text}."))
-    return found
+    centres = [run.guidance for run in runs if run.guidance is not None]
+    if not centres:
+        return None
+    delay = spread([centre.delay_mean_s for centre in centres])
+    busy = spread([centre.load for centre in centres])
+    text = f"In {name} a centre decides for {_list(centres[0].guided)}"
+    text += f": {interval(spread([centre.goals_hz for centre in centres]))} goals per second"
+    if delay.mean is not None:
+        text += f", acted on {interval(delay, 1000.0)} ms after the pose on which they rest"
+    if busy.mean is not None:
+        text += f"; its process took {interval(busy, 100.0)} % of a core"
+    return Finding("plain", f"{text}.")
 
 
 def _acquired(cases: Sequence[CaseMetrics]) -> list[Finding]:

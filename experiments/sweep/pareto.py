@@ -88,11 +88,12 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
 def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages."""
     found: list[CellRow] = []
-    known = [row for row in rows if _point_of(row, index) is not None]
-    for row in sorted(known, key=lambda row: _point_of(row, index) or ()):
-        at, last = _point_of(row, index), _point_of(found[-1], index) if found else None
-        if at and (last is None or at[1] < last[1] or at == last):
+    last = (math.inf, math.inf)
+    points = [(at, row) for row in rows if (at := _point_of(row, index)) is not None]
+    for at, row in sorted(points, key=lambda point: point[0]):
+        if at[1] < last[1] or at == last:
             found.append(row)
+            last = at
     return found
 
 
