@@ -1,7 +1,7 @@
 """Tables of a report, from measured cases; several seeds of a case become means with 95 % intervals.
 
 Two shapes: numbers of a case, with a column for each case (`_table_by_case`); and numbers of each robot or link
-(`_Rows`), in a table for each case or with the cases side by side.
+(`_table_by_row`), in a table for each case.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
 from agents.network.messages import Event
 from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics, ShadowMetrics
@@ -20,9 +20,8 @@ from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.page import NONE, Cell, Row, Table, interval, number
 
-T = TypeVar("T")  # a robot, or a link
 Line = tuple[str, Callable[[CaseMetrics], float | None], float]  # label, value of a run, scale
-Column = tuple[str, Callable[[Sequence[T]], Cell]]  # head, cell of the same robot or link in all seeds
+Column = tuple[str, Callable[[Sequence[Any]], Cell]]  # head, cell of the same robot or link in all seeds
 
 MOST_EVENTS: Final = 200
 ALIKE_S: Final = 0.2  # [s] between the same event of two cases
@@ -242,31 +241,29 @@ def architecture_of(case: CaseMetrics) -> str:
 # ---------------------------------------------------------------------- numbers of each robot or link
 
 
-@dataclass(frozen=True)
-class _Rows(Generic[T]):
-    """Rows of a table: one for each robot or link, all seeds together."""
-
-    head: str  # of the names
-    items: Callable[[CaseMetrics], Iterable[T]]  # robots or links of a run
-    name: Callable[[T], Cell]  # the same in all seeds
-    columns: Sequence[Column[T]]
-
-    def row(self, name: Cell, items: Sequence[T], *, summed: bool = False) -> Row:
-        return Row((name, *(cell(items) for _, cell in self.columns)), sum=summed)
-
-    def groups(self, runs: Sequence[CaseMetrics]) -> Mapping[Cell, list[T]]:
-        """Robots or links by name."""
-        found: dict[Cell, list[T]] = {}
-        for run in runs:
-            for item in self.items(run):
-                found.setdefault(self.name(item), []).append(item)
-        return found
-
-    def table(self, case: str, runs: Sequence[CaseMetrics], sums: Mapping[Cell, Sequence[T]] | None = None) -> Table:
-        """The table of one case, with further rows of `sums`."""
-        rows = [self.row(name, items) for name, items in self.groups(runs).items()]
-        rows += [self.row(name, items, summed=True) for name, items in (sums or {}).items()]
-        return Table((self.head, *(head for head, _ in self.columns)), tuple(rows), title=case)
+def _table_by_row(
+    case: str,
+    runs: Sequence[CaseMetrics],
+    columns: Sequence[Column],
+    *,
+    head: str = "Robot",
+    items: Callable[[CaseMetrics], Iterable[Any]] = attrgetter("robots"),
+    name: Callable[[Any], Cell] = attrgetter("robot"),
+    sums: Mapping[Cell, Sequence[Any]] | None = None,
+    totals: bool = False,
+) -> Table:
+    """The table of one case: a row for each robot or link, all seeds together, then rows of `sums`, or of all."""
+    every = [item for run in runs for item in items(run)]
+    sums = {"all": every} if totals else sums
+    found: dict[Cell, list[Any]] = {}
+    for item in every:
+        found.setdefault(name(item), []).append(item)
+    rows = [
+        Row((what, *(cell(mine) for _, cell in columns)), sum=group is sums)
+        for group in (found, sums or {})
+        for what, mine in group.items()
+    ]
+    return Table((head, *(column for column, _ in columns)), tuple(rows), title=case)
 
 
 def _cell(what: Callable[[Iterable[Any]], float], field: str, scale: float = 1.0) -> Callable[[Sequence[Any]], str]:
@@ -281,10 +278,6 @@ def _mean(values: Iterable[float]) -> float:
     return statistics.fmean([first, *others]) if others else first
 
 
-def _robots(run: CaseMetrics) -> Sequence[RobotMetrics]:
-    return run.robots
-
-
 def robot_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case a table of all robots, with means by kind and over the followers."""
     return tuple(_robot_table(name, runs) for name, runs in by_case(cases).items())
@@ -292,7 +285,7 @@ def robot_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 
 def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     left_out = {name for run in runs for name in (*run.leaders, *run.died)}
-    columns: list[Column[RobotMetrics]] = [
+    columns: list[Column] = [
         ("f [Hz]", _cell(_mean, "f_hz")),
         ("Sent", _cell(_mean, "messages")),
         ("IAE [m s]", _cell(_mean, "iae")),
@@ -315,14 +308,14 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
         (f"mean of {len(group)}", kind): [robot for robot in kept if robot.robot in group]
         for kind, group in groups.items()
     }
-    rows = _Rows("Robot", _robots, lambda r: (f"({r.robot})" if r.robot in left_out else r.robot, r.kind), columns)
-    table = rows.table(case, runs, sums)
+    name = lambda robot: (f"({robot.robot})" if robot.robot in left_out else robot.robot, robot.kind)  # noqa: E731
+    table = _table_by_row(case, runs, columns, name=name, sums=sums)
     return replace(table, note="In brackets: left out of the means.") if left_out else table
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case: poses sent, recorded, received, lost, and dropped by a modelled network; seeds are added up."""
-    columns: list[Column[RobotMetrics]] = [
+    columns: list[Column] = [
         ("Receivers", lambda robots: str(robots[0].listeners) if len({r.robot for r in robots}) == 1 else ""),
         ("Sent", _cell(sum, "messages")),
         ("Recorded", _cell(sum, "recorded")),
@@ -332,28 +325,24 @@ def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Dropped", _cell(sum, "dropped")),
     ]
     return tuple(
-        _Rows("Robot", _robots, attrgetter("robot"), columns if runs[0].modelled else columns[:-1]).table(
-            name, runs, {"all": [robot for run in runs for robot in run.robots]}
-        )
+        _table_by_row(name, runs, columns if runs[0].modelled else columns[:-1], totals=True)
         for name, runs in by_case(cases).items()
     )
 
 
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """For each case with a modelled network the fate of the poses on each link; several seeds are added up."""
-    columns: list[Column[Passage]] = [
+    columns: list[Column] = [
         ("Received", _cell(sum, "heard")),
         ("Dropped", _cell(sum, "dropped")),
         ("Share [%]", lambda links: number(dropped_share(links))),
         ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
         ("Longest [ms]", _cell(max, "delay_max", 1e3)),
     ]
-    rows: _Rows[Passage] = _Rows("Link", attrgetter("passages"), "{0.sender} > {0.receiver}".format, columns)
-    return tuple(
-        rows.table(name, runs, {"all": [link for run in runs for link in run.passages]})
-        for name, runs in by_case(cases).items()
-        if runs[0].modelled
+    link = partial(
+        _table_by_row, head="Link", items=attrgetter("passages"), name="{0.sender} > {0.receiver}".format, totals=True
     )
+    return tuple(link(name, runs, columns) for name, runs in by_case(cases).items() if runs[0].modelled)
 
 
 def dropped_share(links: Sequence[Passage]) -> float | None:
@@ -395,8 +384,7 @@ def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Changed by safety [%]", _cell(statistics.fmean, "intervened_share", 100.0)),
         ("By avoidance [%]", _cell(statistics.fmean, "avoided_share", 100.0)),
     ]
-    rows: _Rows[RobotMetrics] = _Rows("Robot", _robots, attrgetter("robot"), columns)
-    return tuple(rows.table(name, runs) for name, runs in by_case(cases).items())
+    return tuple(_table_by_row(name, runs, columns) for name, runs in by_case(cases).items())
 
 
 def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -418,7 +406,7 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         horizon_s = robots[0].shadow and robots[0].shadow.horizon_s
         return "all of it" if horizon_s is None else f"{horizon_s:g}"
 
-    columns: list[Column[RobotMetrics]] = [
+    columns: list[Column] = [
         ("Ahead [s]", ahead),
         ("Bias x, y, z [cm]", signed("bias")),
         ("Along, across [cm]", signed("along", "across")),
@@ -430,8 +418,7 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("of speeds", signed("correlation_speed", scale=1.0, form=".4f")),
     ]
     shadows = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
-    rows: _Rows[RobotMetrics] = _Rows("Robot", shadows, attrgetter("robot"), columns)
-    tables = (rows.table(name, runs[:1]) for name, runs in by_case(cases).items())
+    tables = (_table_by_row(name, runs[:1], columns, items=shadows) for name, runs in by_case(cases).items())
     return tuple(table for table in tables if table.rows)
 
 

@@ -55,7 +55,7 @@ def codec(kind: type[S]) -> Codec[S]:
 
     Fields may be bool, int, float, str, fixed tuples of floats, other structs, lists of these (except of tuples), and
     dict[str, int], which becomes `<name>_keys` and `<name>_values`. A float or fixed tuple that may be None is NaN then
-    (and NaN is read as None), an int that may be None is -1.
+    (and NaN is read as None).
 
     Raises:
         TypeError: If a field has another type, or a name that ROS does not allow.
@@ -154,18 +154,14 @@ class _Writer:
             case mi.ListType(item_type=mi.StructType() | mi.StrType() | mi.BoolType() | mi.IntType() | mi.FloatType()):
                 return self._sequence(kind.item_type, value, where)
             case mi.UnionType(types=(one, mi.NoneType()) | (mi.NoneType(), one)) if isinstance(
-                one, mi.IntType | mi.FloatType | mi.TupleType
+                one, mi.FloatType | mi.TupleType
             ):
                 held = self._name("o")
-                missing = "-1" if isinstance(one, mi.IntType) else "NAN"
-                if isinstance(one, mi.TupleType):
-                    missing = f"({'NAN, ' * len(one.item_types)})"
+                missing = f"({'NAN, ' * len(one.item_types)})" if isinstance(one, mi.TupleType) else "NAN"
                 rebuilt, ros = self._encode_expression(
                     one, f"({missing} if ({held} := {value}) is None else {held})", where
                 )
-                numbers = rebuilt.strip("(,)").split(", ")
-                known = "{0} == -1" if isinstance(one, mi.IntType) else "{0} != {0}"
-                absent = " and ".join(known.format(each) for each in numbers)
+                absent = " and ".join(f"{each} != {each}" for each in rebuilt.strip("(,)").split(", "))
                 return f"None if {absent} else {rebuilt}", ros
         raise TypeError(f"{where}: no ROS message can hold {type(kind).__name__} here")
 
