@@ -111,7 +111,9 @@ class ExternalBody:
         self._positions = MeasuredPositions(session, keys, self._names, rows, REACH)
         self._ranges = RangeInbox(session, keys, self._names, rows)
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
-        self._orders = [pubsub.urgent_publisher(session, keys.setpoint(name), mime) for name in self._names]
+        self._orders = [
+            pubsub.publisher(session, keys.setpoint(name), mime, zenoh.Priority.REAL_TIME) for name in self._names
+        ]
         pause = threading.Event()
         while (missing := self._missing_positions()) and time.monotonic() < deadline:
             pause.wait(POLL_S)

@@ -73,21 +73,17 @@ def pose_subscriber(
     )
 
 
-def publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
-    """A plain publisher for frequent values (telemetry): dropped when the link is congested."""
-    return session.declare_publisher(
-        key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA
-    )
+def publisher(
+    session: zenoh.Session, key: str, mime: str, priority: zenoh.Priority = zenoh.Priority.DATA
+) -> zenoh.Publisher:
+    """A plain publisher for frequent values (telemetry): dropped when the link is congested.
 
-
-def urgent_publisher(session: zenoh.Session, key: str, mime: str) -> zenoh.Publisher:
-    """A publisher for repeated values that must overtake all others: commands to a body in another process.
-
-    Not express: then each sample fills a batch, a link has two of a priority, and a router drops what twenty robots
+    Commands to a body in another process, which are repeated, overtake all others by the priority REAL_TIME. They are
+    not express: then each sample fills a batch, a link has two of a priority, and a router drops what twenty robots
     send to one world at once.
     """
     return session.declare_publisher(
-        key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.REAL_TIME
+        key, encoding=mime, congestion_control=zenoh.CongestionControl.DROP, priority=priority
     )
 
 

@@ -11,7 +11,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from traceback import walk_tb
 from typing import Any, Final, Protocol
 
@@ -126,12 +126,7 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 def culprit(error: BaseException) -> str | None:
     """The line of another distribution's plug-in in which an error came about; None if there is none."""
-    owners = {
-        entry.module: entry.dist.name
-        for group in (BODIES, DEVICES, *STRUCTS)
-        for entry in _installed().select(group=group)
-        if entry.dist is not None and entry.dist.name != "zenpark"
-    }
+    owners = {entry.module: dist.name for entry, dist in _foreign()}
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         if (module := frame.f_globals.get("__name__")) in owners:
             return f"plug-in {module} of {owners[module]} failed at {frame.f_code.co_filename}:{line}"
@@ -145,12 +140,15 @@ def body_name(address: str) -> str:
 
 def distributions(text: str | None = None) -> dict[str, str]:
     """Installed distributions with plug-ins, and their versions, but for our own; those that a text names, if given."""
-    entries = [entry for group in (BODIES, DEVICES, *STRUCTS) for entry in _installed().select(group=group)]
-    if text is not None:
-        words = {*re.findall(r"[\w.-]+", text)}
-        entries = [entry for entry in entries if entry.name in words]
-    owners = {entry.dist.name: entry.dist.version for entry in entries if entry.dist is not None}
-    return {name: owners[name] for name in sorted(owners) if name != "zenpark"}
+    words = None if text is None else {*re.findall(r"[\w.-]+", text)}
+    owners = {dist.name: dist.version for entry, dist in _foreign() if words is None or entry.name in words}
+    return dict(sorted(owners.items()))
+
+
+def _foreign() -> list[tuple[EntryPoint, Distribution]]:
+    """Entry points of other distributions than ours."""
+    entries = (entry for group in (BODIES, DEVICES, *STRUCTS) for entry in _installed().select(group=group))
+    return [(entry, entry.dist) for entry in entries if entry.dist is not None and entry.dist.name != "zenpark"]
 
 
 @cache

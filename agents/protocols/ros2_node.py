@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import count
 from typing import Final
 
 import zenoh
@@ -31,11 +32,7 @@ class Participant:
         self.domain: Final = domain
         self.zid: Final = str(session.zid())
         self.clock: Final = Clock()
-        self._entities = 0
-
-    def number(self) -> int:
-        self._entities += 1
-        return self._entities - 1
+        self.numbers: Final = count()  # of its entities
 
     def node(self, name: str, namespace: str = "") -> Node:
         """A node; namespace as in "tb3_0", without the leading slash."""
@@ -48,7 +45,7 @@ class Node:
     def __init__(self, participant: Participant, name: str, namespace: str) -> None:
         self.participant: Final = participant
         self.name, self.namespace = name, namespace
-        self._number = participant.number()
+        self._number = next(participant.numbers)
         self._token: zenoh.LivelinessToken | None = None
         if participant.style == "rmw":
             key = ros2.node_token(participant.domain, participant.zid, self._number, namespace, name)
@@ -71,7 +68,7 @@ class Node:
         if it.style == "ros2dds":
             return ros2.dds_token(it.zid, role, full, kind), key
         rest = ros2.endpoint_topic(full, kind, quality, it.types)
-        entity = it.number()
+        entity = next(it.numbers)
         return ros2.endpoint_token(it.domain, it.zid, self._number, entity, role, self.namespace, self.name, rest), key
 
     def close(self) -> None:
@@ -105,10 +102,7 @@ class Publisher:
             return
         self._sequence += 1
         now = round(self._node.participant.clock.utc() * 1e9)
-        self._publisher.put(
-            payload,
-            attachment=ros2.attachment(self._sequence, now, self._gid),
-        )
+        self._publisher.put(payload, attachment=ros2.attachment(self._sequence, now, self._gid))
 
     def close(self) -> None:
         if self._token is not None:

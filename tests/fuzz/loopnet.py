@@ -229,7 +229,6 @@ class Net:
             "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
             "pose_publisher": mute,
             "publisher": mute,
-            "urgent_publisher": mute,
             "LastValue": mute,
             "alive_token": mute,
         }
