@@ -26,7 +26,7 @@ from agents.protocols.crazyflie import (
 )
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import CrazyfliePilot
-from bridges.crazyflie.telemetry import BEARING, ELEVATION, Board, Telemetry
+from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
 
 STALE_S: Final = 0.5  # the note reports poses older than this
 POLL_S: Final = 0.01
@@ -61,7 +61,7 @@ class CrazyflieBody:
         self._capacity: dict[str, float] = {}  # [1/s] measured, by radio
         self._dongles, self._settings = dongles, settings
         turns = {one: threading.Lock() for one in self._radios}
-        self._board = Board(rows)
+        self._telemetry = [Telemetry(lighthouse=isinstance(each.positioning, Lighthouse)) for each in settings]
         in_turn = max((len(on_it) for on_it in self._radios.values()), default=1)
         self._open_timeout = max(each.connect_s + each.converge_s for each in settings) + 5.0 * in_turn
         self._pilots = [
@@ -69,7 +69,7 @@ class CrazyflieBody:
                 name,
                 where,
                 each,
-                Telemetry(self._board, row, lighthouse=isinstance(each.positioning, Lighthouse)),
+                self._telemetry[row],
                 place=(request.start[row], float(request.yaw[row])),
                 turn=turns.get(dongles[row], threading.Lock()),
             )
@@ -126,29 +126,33 @@ class CrazyflieBody:
         """See `Body.read`."""
         now = time.monotonic()
         self._zero = now - t
-        board = self._board
-        pose = np.where(board.settled[:, None], board.pose, np.nan)
+        telemetry = self._telemetry
+        heard = np.array([one.pose_time for one in telemetry]) - self._zero
+        settled = np.array([one.settled for one in telemetry])
+        pose = np.array([one.pose for one in telemetry])
+        yaw = pose[:, 6].copy()
+        pose[~settled] = np.nan
         unknown = np.full_like(pose[:, :3], np.nan)
         state = BodyState(
-            time=board.pose_time - self._zero,
+            time=heard.copy(),
             position=pose[:, :3].copy(),
             velocity=pose[:, 3:6].copy(),
-            yaw=board.pose[:, 6].copy(),
+            yaw=yaw,
             true_position=unknown,
             true_yaw=unknown[:, 0],
-            battery=board.battery.copy(),
-            flying=board.airborne.copy(),
+            battery=np.array([one.battery for one in telemetry]),
+            flying=np.array([one.airborne for one in telemetry]),
             notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
             refusals=tuple(pilot.refusal for pilot in self._pilots),
-            heard=board.pose_time - self._zero,
+            heard=heard,
             rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
         )
         if len(self._external_rows):
             rows = self._external_rows
             self._external.fill(state, rows)
-            state.position[rows[~board.settled[rows]]] = np.nan  # no flight before the estimator on board has settled
+            state.position[rows[~settled[rows]]] = np.nan  # no flight before the estimator on board has settled
             # a drone without telemetry is lost as well
-            state.time[rows] = np.minimum(state.time[rows], board.pose_time[rows] - self._zero)
+            state.time[rows] = np.minimum(state.time, heard)[rows]
         return state
 
     def command(self, setpoint: Array) -> None:
@@ -160,7 +164,7 @@ class CrazyflieBody:
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Body.takeoff`."""
         for row, up in zip(rows.tolist(), height.tolist(), strict=True):
-            self._board.airborne[row] = True  # at once: callers wait for a landing as long as this is set
+            self._telemetry[row].airborne = True  # at once: callers wait for a landing as long as this is set
             self._pilots[row].give_order("takeoff", up)
 
     def land(self, rows: Index) -> None:
@@ -183,7 +187,7 @@ class CrazyflieBody:
         load = self._loads[row]
         return Inspection(
             firmware=self._pilots[row].firmware,
-            volts=number(float(self._board.volts[row])),
+            volts=number(self._telemetry[row].volts),
             packets_hz=load,
             capacity_hz=self._capacity.get(self._dongles[row]),
         )
@@ -197,15 +201,15 @@ class CrazyflieBody:
         self._claims.release()
 
     def _note(self, row: int, now: float) -> str:
-        age = now - self._board.pose_time[row]
+        age = now - self._telemetry[row].pose_time
         stale = f"no pose for {age:.1f} s" if STALE_S < age < np.inf else ""
         return "; ".join(part for part in (self._pilots[row].note, stale) if part)
 
     def _scan(self, row: int) -> RangeScan | None:
-        scanned = float(self._board.ranges_time[row])
-        if not np.isfinite(scanned):
+        one = self._telemetry[row]
+        if not isfinite(one.ranges_time):
             return None
-        return RangeScan(scanned - self._zero, BEARING, ELEVATION, self._board.ranges[row].copy())
+        return RangeScan(one.ranges_time - self._zero, BEARING, ELEVATION, one.ranges)
 
 
 def open_crazyflie(request: BodyRequest) -> CrazyflieBody:

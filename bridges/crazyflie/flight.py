@@ -98,8 +98,8 @@ class Flight:
             self._target = target
 
     def publish_airborne(self) -> None:
-        """Write `airborne` to the board."""
-        self._telemetry.board.airborne[self._telemetry.row] = self.airborne
+        """Write `airborne` to the telemetry."""
+        self._telemetry.airborne = self.airborne
 
     @property
     def _hold(self) -> float:
@@ -117,8 +117,7 @@ class Flight:
         """Climb to `height` [m] above the ground here; on refusal, `trouble` gives the reason."""
         if self.airborne:
             return
-        x, y, z = self._telemetry.position.tolist()
-        yaw = self._telemetry.yaw
+        x, y, z, *_, yaw = self._telemetry.pose
         place = x, y, z, yaw if abs(yaw) > STRAIGHT else 0.0
         self._span = max(height / CLIMB, SHORTEST_S)
         self.trouble = self.takeoff_refusal()
@@ -150,7 +149,7 @@ class Flight:
         self._land()
 
     def _land(self) -> None:
-        height = float(self._telemetry.position[2]) - FLOOR
+        height = self._telemetry.pose[2] - FLOOR
         span = max(min(LONGEST_S, height / DESCENT), SHORTEST_S)  # an unknown height is a large one
         self._command_planner(HighLevel.LAND, lambda: self._planner.land(FLOOR, span, yaw=None))
         self._enter(Phase.LANDING)
@@ -292,7 +291,7 @@ class Flight:
             return "locked: switch it off and on"
         if Info.CRASHED in telemetry.info or Info.TUMBLED in telemetry.info:
             return f"no take-off: {telemetry.status_text()}"
-        if not telemetry.board.settled[telemetry.row]:
+        if not telemetry.settled:
             return "no take-off: its position estimate has not settled"
         return ""
 

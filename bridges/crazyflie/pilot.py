@@ -267,7 +267,7 @@ class CrazyfliePilot:
             return
         if Info.CRASHED in telemetry.info and settings.recover:
             link.cf.supervisor.send_crash_recovery_request()
-        self._telemetry.board.settled[telemetry.row] = False
+        telemetry.settled = False
         for parameter, value in settings.parameters.items():
             link.set_parameter(parameter, value)
         configure(link, settings)
@@ -294,7 +294,7 @@ class CrazyfliePilot:
             time.sleep(0.02)
 
     def _arrive(self) -> None:
-        self._telemetry.board.settled[self._telemetry.row] = True
+        self._telemetry.settled = True
         self._connection_note = ""
         self.opened.set()
 
@@ -429,8 +429,7 @@ class CrazyfliePilot:
                 start_yaw = yaw if isfinite(yaw) else self._start_pose[1]
                 self._convergence = Convergence(link, position, start_yaw, absolute=True)
                 self._settle_deadline = now + self._settings.converge_s
-        placed = self._telemetry.board.settled
-        if self._convergence is not None and not placed[self._telemetry.row]:
+        if self._convergence is not None and not self._telemetry.settled:
             if self._convergence.advance(now):
                 self._arrive()
             elif now > self._settle_deadline:

@@ -47,23 +47,6 @@ INFO_TEXT: Final = {
 STATION_TEXT: Final = ("receives no base station", "misses geometry or calibration of its base stations", "")
 
 
-class Board:
-    """Newest telemetry of N Crazyflies; times of reception on the monotonic clock [s], -inf before the first."""
-
-    def __init__(self, rows: int) -> None:
-        never = np.full(rows, -np.inf)
-        self.pose_time, self.ranges_time = never.copy(), never.copy()  # (N,) [s]
-        self.pose = np.full((rows, 7), np.nan)  # x, y, z [m], their rates [m/s], yaw [rad]
-        self.settled = np.zeros(rows, dtype=bool)  # position estimate has settled and may be used
-        self.info = np.zeros(rows, dtype=np.intp)  # flags of the supervisor
-        self.power = np.full(rows, int(Power.BATTERY))  # state of power management
-        self.battery = np.full(rows, np.nan)  # charge, 0 to 1
-        self.volts = np.full(rows, np.nan)  # of the battery [V]
-        self.stations = np.full(rows, -1)  # lighthouse.status, or -1
-        self.ranges = np.full((rows, 5), np.nan)  # front, back, left, right, up [m]; NaN: nothing in reach
-        self.airborne = np.zeros(rows, dtype=bool)  # motors on, as far as the bridge knows
-
-
 class StampAge:
     """Age of packets of one drone: arrival less its stamp, less the smallest such difference so far."""
 
@@ -90,62 +73,55 @@ class StampAge:
 
 
 class Telemetry:
-    """One row of a board."""
+    """Newest telemetry of one Crazyflie; times on the monotonic clock [s], -inf before the first."""
 
-    def __init__(self, board: Board, row: int, *, lighthouse: bool) -> None:
+    def __init__(self, *, lighthouse: bool) -> None:
         """`lighthouse`: report the state of the base stations."""
-        self.board, self.row = board, row
         self.stamps = StampAge()
-        self.arrival = -inf  # of the last packet of a log [s, monotonic]
-        self.status_time = -inf  # of the last status over this connection [s, monotonic]
+        self.arrival = -inf  # of the last packet of a log
+        self.status_time = -inf  # of the last status over this connection
+        self.pose_time = self.ranges_time = -inf
+        self.pose: tuple[float, ...] = (nan,) * 7  # x, y, z [m], their rates [m/s], yaw [rad]
+        self.settled = False  # position estimate has settled and may be used
+        self.info = Info(0)  # flags of the supervisor
+        self.power = int(Power.BATTERY)  # state of power management
+        self.battery = nan  # charge, 0 to 1
+        self.volts = nan  # of the battery [V]
+        self.stations = -1  # lighthouse.status, or -1
+        self.ranges: Array = np.full(len(RANGES), nan)  # front, back, left, right, up [m]; NaN: nothing in reach
+        self.airborne = False  # motors on, as far as the bridge knows
         self._lighthouse = lighthouse
-
-    @property
-    def info(self) -> Info:
-        """Last flags of the supervisor."""
-        return Info(int(self.board.info[self.row]))
-
-    @property
-    def position(self) -> Array:
-        """(3,) [m]."""
-        return self.board.pose[self.row, :3]
-
-    @property
-    def yaw(self) -> float:
-        """[rad]."""
-        return float(self.board.pose[self.row, 6])
 
     @property
     def battery_low(self) -> bool:
         """Whether the battery is nearly empty."""
-        return bool(self.board.power[self.row] >= Power.LOW)
+        return self.power >= Power.LOW
 
     @property
     def pose_age(self) -> float:
         """Age of the last pose [s]; infinity before the first."""
-        return time.monotonic() - float(self.board.pose_time[self.row])
+        return time.monotonic() - self.pose_time
 
     def reset_status(self) -> None:
         """Clear the status at a new connection."""
         self.stamps = StampAge()
         self.arrival = -inf
         self.status_time = -inf
-        self.board.info[self.row] = 0
+        self.info = Info(0)
 
     def start_logging(self, link: CrazyflieLink, *, log_hz: float, ranges_hz: float | None) -> None:
-        """Start the log blocks that fill the board."""
+        """Start the log blocks."""
         link.start_log("state", log_hz, STATE, self._state)
         if ranges_hz is not None:
             link.start_log("ranges", ranges_hz, RANGES, self._ranges)
 
     def status_text(self) -> str:
         """Faults in the last status, for users."""
-        board, row = self.board, self.row
         faults = [text for flag, text in INFO_TEXT.items() if flag in self.info]
-        if board.power[row] >= Power.LOW:
+        if self.battery_low:
             faults.append("battery low")
-        if self._lighthouse and board.stations[row] >= 0:
-            faults.append(STATION_TEXT[min(int(board.stations[row]), len(STATION_TEXT) - 1)])
+        if self._lighthouse and self.stations >= 0:
+            faults.append(STATION_TEXT[min(self.stations, len(STATION_TEXT) - 1)])
         return "; ".join(text for text in faults if text)
 
     def _stamped(self, t: float, stamp: int) -> float:
@@ -154,30 +130,28 @@ class Telemetry:
         return t - self.stamps.age(t, stamp)
 
     def _state(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
-        board, row = self.board, self.row
         measured = self._stamped(t, stamp)
         place = (MM * values.get(name, nan) for name in PLACE)
-        board.pose[row] = *place, radians(values.get(YAW, nan))
-        board.pose_time[row] = measured
-        board.info[row] = int(values["supervisor.info"]) if "supervisor.info" in values else _info(values)
-        board.power[row] = int(values.get("pm.state", Power.BATTERY))
+        self.pose = *place, radians(values.get(YAW, nan))
+        self.pose_time = measured
+        self.info = Info(int(values["supervisor.info"])) if "supervisor.info" in values else _info(values)
+        self.power = int(values.get("pm.state", Power.BATTERY))
         self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
-        board.stations[row] = int(values.get("lighthouse.status", -1))
+        self.stations = int(values.get("lighthouse.status", -1))
         self.status_time = measured
 
     def _add_volts(self, volts: float, since: float) -> None:
         """Filter the voltage `since` [s] after the last one, and estimate the charge, with the motors on or off."""
-        board, row = self.board, self.row
-        before = float(board.volts[row])
+        before = self.volts
         share = 1.0 - exp(-since / SMOOTHING_S) if isfinite(before) and isfinite(since) else 1.0
-        board.volts[row] = before + share * (volts - before) if share < 1.0 else volts
+        self.volts = before + share * (volts - before) if share < 1.0 else volts
         empty = EMPTY_V - (SAG_V if Info.FLYING in self.info else 0.0)
-        board.battery[row] = min(max((board.volts[row] - empty) / (FULL_V - EMPTY_V), 0.0), 1.0)
+        self.battery = min(max((self.volts - empty) / (FULL_V - EMPTY_V), 0.0), 1.0)
 
     def _ranges(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         measured = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
-        self.board.ranges[self.row] = [nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured]
-        self.board.ranges_time[self.row] = self._stamped(t, stamp)
+        self.ranges = np.array([nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured])
+        self.ranges_time = self._stamped(t, stamp)
 
 
 def _info(values: Mapping[str, float]) -> Info:

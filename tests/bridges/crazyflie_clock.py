@@ -19,7 +19,7 @@ from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.link import BUSY_S
 from bridges.crazyflie.pilot import LOOP_HZ
-from bridges.crazyflie.telemetry import Board, Telemetry
+from bridges.crazyflie.telemetry import Telemetry
 from tests.twins.loopback import request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS
@@ -75,7 +75,8 @@ class Drone:
     def __init__(self, fleet, row):
         self._fleet, self.row = fleet, row
         self.out, self.order, self._blocks, self._replies = deque(), None, {}, {}
-        self.telemetry = Telemetry(fleet.board, row, lighthouse=False)
+        self.telemetry = Telemetry(lighthouse=False)
+        self.telemetry.settled = True
         self.flight = Flight(fleet.settings, self.telemetry, lambda seconds: self.thread.pause(fleet.now + seconds))
         self.trajectories = trajectory.Trajectories(self._send_at_once)
         self.trajectories.memory = fleet.twin.drones[row].memories.kinds.index(crtp.Memory.TRAJECTORY)
@@ -159,8 +160,6 @@ class Fleet:
         self.settings = chosen("", device, external=False)
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
         self.twin.flock.estimator.error[:] = 0.0  # set up
-        self.board = Board(rows)
-        self.board.settled[:] = True
         self.drones = [Drone(self, row) for row in range(rows)]
         self.ages, self.fastest = [], 0.0  # (k, rows) ages of poses [s]; fastest descent [m/s]
         self._begin = self._next_tick = self._next_exchange = self.now
@@ -210,7 +209,7 @@ class Fleet:
     def _advance(self, speed):
         """Step of the twins; then the robots' loop reads and commands."""
         self.twin.advance(self.now - self._begin)
-        self.ages.append(self.now - self.board.pose_time)
+        self.ages.append(self.now - np.array([drone.telemetry.pose_time for drone in self.drones]))
         self.fastest = max(self.fastest, -self.twin.flock.quadrotor.velocity[:, 2].min())
         for row, drone in enumerate(self.drones):
             angle = speed / 0.3 * self.now + row

@@ -14,7 +14,7 @@ from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from agents.protocols.crtp import Info
 from bridges.crazyflie.body import open_crazyflie
-from bridges.crazyflie.telemetry import Board, Telemetry
+from bridges.crazyflie.telemetry import Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from tests.waiting import until
@@ -226,8 +226,7 @@ def test_library_is_missing(monkeypatch):
 
 def test_firmware_without_supervisor():
     """What older firmwares say instead is enough to take off and to land."""
-    board = Board(1)
-    telemetry = Telemetry(board, 0, lighthouse=False)
+    telemetry = Telemetry(lighthouse=False)
     blocks = {}
 
     class Old:
@@ -237,7 +236,7 @@ def test_firmware_without_supervisor():
     telemetry.start_logging(Old(), log_hz=50.0, ranges_hz=None)
     blocks["state"][1](1.0, 0, {"pm.vbat": 3.55, "pm.state": 3, "sys.canfly": 1, "sys.isFlying": 1, "sys.isTumbled": 0})
     assert telemetry.info == Info.ARMED | Info.CAN_FLY | Info.FLYING
-    assert board.battery[0] == pytest.approx(0.5)
+    assert telemetry.battery == pytest.approx(0.5)
     assert telemetry.battery_low
     assert telemetry.status_text() == "battery low"
 

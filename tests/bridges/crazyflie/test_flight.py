@@ -13,7 +13,7 @@ from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie import trajectory as trajectory_module
 from bridges.crazyflie.flight import Flight, Phase
-from bridges.crazyflie.telemetry import Board, Telemetry
+from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, TAKEOFFS, Trajectories
 
 PLACE = (0.1, 0.2, 0.5, 0.0)
@@ -26,8 +26,7 @@ class Air:
         self.now, self.sent = 100.0, []
         for each in (module, telemetry_module, trajectory_module):
             monkeypatch.setattr(each, "time", types.SimpleNamespace(monotonic=lambda: self.now))
-        self.board = Board(1)
-        self.telemetry = Telemetry(self.board, 0, lighthouse=False)
+        self.telemetry = Telemetry(lighthouse=False)
         self.flight = Flight(CrazyflieSettings(**chosen), self.telemetry, self.pause)
         self.flight.link = types.SimpleNamespace(
             cf=self,
@@ -57,7 +56,7 @@ class Air:
         self.now += seconds
 
     def fly(self):
-        self.board.settled[:], self.board.pose[0] = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
+        self.telemetry.settled, self.telemetry.pose = True, [0.1, 0.2, 0.5, 0.0, 0.0, 0.0, 0.0]
         self.flight._enter(Phase.CLIMBING)
         return self.pass_(0.1)
 
@@ -66,8 +65,8 @@ class Air:
         end = self.now + seconds
         while self.now < end:
             self.now += 0.02
-            self.telemetry.status_time = self.board.pose_time[0] = self.telemetry.arrival = self.now
-            self.board.info[0] = int(self.info | (Info.FLYING if self.flying else 0))
+            self.telemetry.status_time = self.telemetry.pose_time = self.telemetry.arrival = self.now
+            self.telemetry.info = self.info | (Info.FLYING if self.flying else 0)
             self.flight.set_target(self.now, PLACE)
             self.flight.update_phase(self.now)
             self.flight.send_due(self.now)
@@ -127,7 +126,7 @@ def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
 def test_the_end_of_a_climb_is_held_until_the_first_setpoint(monkeypatch):
     """By the robot's loop, which may wait for others; without it, the drone is landed."""
     air = Air(monkeypatch)
-    air.board.settled[:], air.board.pose[0] = True, [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
+    air.telemetry.settled, air.telemetry.pose = True, [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
     air.flying = False
     air.pass_(0.1)
     air.flight.takeoff(0.5)
@@ -190,7 +189,7 @@ def test_one_that_stands_is_not_locked(monkeypatch):
 def test_a_drone_that_flies_without_an_order_is_landed_and_not_cut(monkeypatch):
     """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
     air = Air(monkeypatch)
-    air.board.pose[0] = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
+    air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
     air.pass_(0.1)
     assert air.flight.phase is Phase.LANDING
     assert air.flight.airborne
@@ -200,7 +199,7 @@ def test_a_drone_that_flies_without_an_order_is_landed_and_not_cut(monkeypatch):
 
 def test_a_take_off_without_an_answer_goes_on(monkeypatch):
     air = Air(monkeypatch)
-    air.board.settled[:], air.flying, air.board.pose[0] = True, False, 0.0
+    air.telemetry.settled, air.flying, air.telemetry.pose = True, False, (0.0,) * 7
     air.pass_(0.1)
     air.flight.takeoff(0.5)
     assert air.flight.phase is Phase.CLIMBING
@@ -249,7 +248,7 @@ def test_an_old_status_tells_of_an_earlier_phase(air):
 
 
 def test_setpoints_of_old_poses_are_ignored(air):
-    air.board.pose_time[0] = air.now - 0.4
+    air.telemetry.pose_time = air.now - 0.4
     air.flight.set_target(air.now, (1.0, 0.2, 0.5, 0.0))
     air.flight._stream(air.now + 1.0)
     assert air.flight._target == PLACE
@@ -258,7 +257,7 @@ def test_setpoints_of_old_poses_are_ignored(air):
 @pytest.mark.parametrize("info", [Info.CRASHED, Info.TUMBLED])
 def test_a_crashed_drone_is_not_recovered_by_a_take_off(monkeypatch, info):
     air = Air(monkeypatch)
-    air.board.settled[:], air.flying, air.info = True, False, Info.ARMED | info
+    air.telemetry.settled, air.flying, air.info = True, False, Info.ARMED | info
     air.pass_(0.1)
     air.flight.takeoff(0.5)
     assert air.flight.phase is Phase.GROUND
@@ -269,14 +268,14 @@ def test_a_crashed_drone_is_not_recovered_by_a_take_off(monkeypatch, info):
 def test_armed_is_not_yet_able_to_fly(monkeypatch):
     """Motors that are checked after arming: no take-off before the supervisor permits it, and one request to arm."""
     air = Air(monkeypatch)
-    air.board.settled[:], air.flying, air.info, air.board.pose[0] = True, False, Info.ARMED, 0.0
+    air.telemetry.settled, air.flying, air.info, air.telemetry.pose = True, False, Info.ARMED, (0.0,) * 7
     air.pass_(0.1)
     pause = air.pause
 
     def spun_up(seconds):
         pause(seconds)
         if air.now > 101.5:
-            air.board.info[0] = int(Info.ARMED | Info.CAN_FLY)
+            air.telemetry.info = Info.ARMED | Info.CAN_FLY
 
     air.flight._pause = spun_up
     air.flight.takeoff(0.5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.protocols.crtp import Info
-from bridges.crazyflie.telemetry import Board, StampAge, Telemetry
+from bridges.crazyflie.telemetry import StampAge, Telemetry
 
 
 def ages(packets):
@@ -56,18 +56,17 @@ class Blocks:
 
 
 def test_poses_carry_the_time_of_their_measurement():
-    board = Board(1)
-    blocks = Blocks(Telemetry(board, 0, lighthouse=False))
+    telemetry = Telemetry(lighthouse=False)
+    blocks = Blocks(telemetry)
     state = {"stateEstimateZ.x": 1500, "stateEstimateZ.vy": -20, "stateEstimate.yaw": 90.0}
     blocks.logged["state"](10.0, 5000, state)
     blocks.logged["state"](13.0, 5020, state)
-    assert board.pose[0, [0, 4, 6]] == pytest.approx([1.5, -0.02, np.pi / 2])
-    assert board.pose_time[0] == pytest.approx(10.02, abs=1e-3)
+    assert [telemetry.pose[k] for k in (0, 4, 6)] == pytest.approx([1.5, -0.02, np.pi / 2])
+    assert telemetry.pose_time == pytest.approx(10.02, abs=1e-3)
 
 
 def test_charge_by_the_voltage_under_load():
-    board = Board(1)
-    telemetry = Telemetry(board, 0, lighthouse=False)
+    telemetry = Telemetry(lighthouse=False)
     blocks = Blocks(telemetry)
 
     def after(seconds, volts, info):
@@ -75,7 +74,7 @@ def test_charge_by_the_voltage_under_load():
         for tick in range(1, int(10 * seconds) + 1):
             t = begin + 0.1 * tick
             blocks.logged["state"](t, int(1000 * t), {"supervisor.info": int(info), "pm.vbat": volts})
-        return float(board.battery[0])
+        return telemetry.battery
 
     assert after(1.0, 4.2, Info.CAN_FLY) == pytest.approx(1.0)
     assert after(10.0, 3.7, Info.CAN_FLY) == pytest.approx(0.29, abs=0.01)
