@@ -64,11 +64,7 @@ class ExternalBody:
     """
 
     def __init__(self, request: BodyRequest) -> None:
-        """Create the body, still closed.
-
-        Raises:
-            BodyError: If a row has settings: there are none.
-        """
+        """Create the body, still closed; raises BodyError if a row has settings: there are none."""
         for name, device in zip(request.names, request.device, strict=True):
             try:
                 msgspec.convert(dict(device), ExternalSettings)

@@ -32,12 +32,7 @@ class TwinBody:
     """Simulated robots of any kinds; implements `agents.body.interface.Body`. Advances to the time of each `read`."""
 
     def __init__(self, request: BodyRequest, world: World | None = None) -> None:
-        """Without a world every row is alone.
-
-        Raises:
-            BodyError: If a kind has no twin, or the engine's library is missing.
-            plugins.PluginError: If the engine is unknown.
-        """
+        """Without a world every row is alone; raises BodyError or PluginError for an unknown kind or engine."""
         kinds = request.kinds
         rows = len(kinds)
         self._dt = 1.0 / request.rate_hz

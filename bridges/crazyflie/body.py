@@ -213,9 +213,5 @@ class CrazyflieBody:
 
 
 def open_crazyflie(request: BodyRequest) -> CrazyflieBody:
-    """Entry points `radio`, `usb` and `udp` of the group `zenpark.bodies`.
-
-    Raises:
-        BodyError: If an address or a setting is invalid.
-    """
+    """Entry points `radio`, `usb` and `udp`; raises BodyError for an invalid address or setting."""
     return CrazyflieBody(request)

@@ -274,22 +274,13 @@ class CrazyflieLink:
         return self._values.get(parameter)
 
     def set_parameter(self, parameter: str, value: float) -> None:
-        """Set a parameter and wait for the confirmation.
-
-        Raises:
-            BodyError: If the firmware has no such parameter, a read-only one, or confirms another value.
-            LinkError: If no confirmation comes.
-        """
+        """Set a parameter; raises BodyError if the firmware refuses it, LinkError if no confirmation comes."""
         confirmed = self._ask(parameter, value)
         if abs(confirmed - value) > 1e-5 * max(1.0, abs(value)):  # floats travel with 24 bits
             raise BodyError(f"the parameter {parameter} is {confirmed:g}, not {value:g}")
 
     def parameter_value(self, parameter: str) -> float | None:
-        """Value of a parameter; None if the firmware has no such parameter.
-
-        Raises:
-            LinkError: If no answer comes.
-        """
+        """Value of a parameter; None if the firmware has no such parameter; raises LinkError if no answer comes."""
         return None if self._parameter(parameter) is None else self._ask(parameter, None)
 
     def _parameter(self, parameter: str) -> Any:  # noqa: ANN401 - cflib's
@@ -327,12 +318,7 @@ class CrazyflieLink:
         self._send(Port.PLATFORM, crtp.VERSIONS, bytes((crtp.FIRMWARE,)))
 
     def define_trajectories(self) -> None:
-        """Tell the drone where its trajectories will be.
-
-        Raises:
-            BodyError: If the firmware cannot fly uploaded trajectories.
-            LinkError: If no answer comes.
-        """
+        """Tell the drone where its trajectories will be; raises BodyError if it refuses, else LinkError."""
         memories = [memory.id for memory in self.cf.mem.mems if memory.type == Memory.TRAJECTORY]
         if not memories:
             raise BodyError("the firmware has no memory for trajectories: update it")

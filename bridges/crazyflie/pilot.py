@@ -184,10 +184,7 @@ class CrazyfliePilot:
     def _connect_in_turn(self) -> CrazyflieLink:
         """Connect for the first time when no other drone of the radio does; again at once, because it may fly.
 
-        Then the tables of contents are read once for all, by a drone that has the radio for itself.
-
-        Raises:
-            LinkError: See `_connect`.
+        Then the tables of contents are read once for all, by a drone that has the radio for itself. Raises LinkError.
         """
         if self.opened.is_set():
             return self._connect()
@@ -201,11 +198,7 @@ class CrazyfliePilot:
             self._turn.release()
 
     def _connect(self) -> CrazyflieLink:
-        """Open a new link, in as many attempts as the time allows.
-
-        Raises:
-            LinkError: If all attempts fail.
-        """
+        """Open a new link, in as many attempts as the time allows; raises LinkError if all attempts fail."""
         begin = time.monotonic()
         answered = False
         while True:
@@ -299,11 +292,7 @@ class CrazyfliePilot:
         self.opened.set()
 
     def _serve(self, link: CrazyflieLink) -> None:
-        """Loop of the thread, until `close` or the loss of the link.
-
-        Raises:
-            LinkError: If the link is lost.
-        """
+        """Loop of the thread, until `close` or the loss of the link; raises LinkError if the link is lost."""
         due = time.monotonic()
         landed_by = inf
         link.take_gap()
@@ -379,12 +368,7 @@ class CrazyfliePilot:
         self._flight.scale_setpoints(share)
 
     def _pause(self, seconds: float) -> None:
-        """Wait in the middle of an order.
-
-        Raises:
-            LinkError: If the link is lost meanwhile.
-            OrderReplaced: If a stop is ordered meanwhile, or the process stood still.
-        """
+        """Wait in an order; raises LinkError if the link is lost, OrderReplaced after a stop or a standstill."""
         link = self._flight.link
         until = time.monotonic() + seconds
         while True:

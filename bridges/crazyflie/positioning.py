@@ -73,11 +73,7 @@ class StationFile(msgspec.Struct, frozen=True, kw_only=True, rename={"system_typ
 
 
 def stations(path: str, count: int) -> StationFile:
-    """Read the Lighthouse configuration of a file, for `count` base stations at most.
-
-    Raises:
-        BodyError: If the file holds none.
-    """
+    """The Lighthouse configuration in a file, for `count` base stations at most; raises BodyError if there is none."""
     try:
         read = msgspec.yaml.decode(Path(path).read_bytes(), type=StationFile)
     except OSError as error:
@@ -93,12 +89,7 @@ def stations(path: str, count: int) -> StationFile:
 
 
 def configure(link: CrazyflieLink, settings: CrazyflieSettings) -> None:
-    """Choose the estimator and set up the positioning system.
-
-    Raises:
-        BodyError: If the Crazyflie lacks the hardware or firmware, or refuses a setting.
-        LinkError: If no answer comes.
-    """
+    """Set up estimator and positioning; raises BodyError if the Crazyflie cannot, LinkError if no answer comes."""
     system = settings.positioning
     estimator = settings.estimator or (None if system is None else "kalman")
     if estimator is not None:
@@ -256,11 +247,7 @@ def _anchors(link: CrazyflieLink, memory: Any) -> dict[int, tuple[float, float, 
 
 
 def _await_answer(link: CrazyflieLink, ask: Callable[[Callable[[Any], None]], object], what: str) -> Any:  # noqa: ANN401 - cflib's own objects
-    """Call `ask` with a callback, and return the callback's argument.
-
-    Raises:
-        LinkError: If cflib never calls back.
-    """
+    """Call `ask` with a callback, and return the callback's argument; raises LinkError if cflib never calls back."""
     received = threading.Event()
     answers: list[object] = []
 

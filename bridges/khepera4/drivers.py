@@ -44,23 +44,14 @@ class Wire:
         os.write(self._descriptor, data)
 
     def pending(self) -> bytes:
-        """Input that has come so far.
-
-        Raises:
-            ConnectionError: If the other end has closed.
-        """
+        """Input that has come so far; raises ConnectionError if the other end has closed."""
         data = b""
         while self._poll.poll(0):
             data += self._read()
         return data
 
     def receive(self, until: float) -> bytes:
-        """Next bytes received.
-
-        Raises:
-            TimeoutError: If nothing comes before `until` [s, monotonic].
-            ConnectionError: If the other end has closed.
-        """
+        """Next bytes; raises TimeoutError after `until` [s, monotonic], ConnectionError if the other end has closed."""
         if not self._poll.poll(max(0.0, 1e3 * (until - time.monotonic()))):
             raise TimeoutError
         return self._read()

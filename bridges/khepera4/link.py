@@ -50,11 +50,7 @@ class Address:
 
     @classmethod
     def parse(cls, robot: str, address: str) -> Address:
-        """Parse an address.
-
-        Raises:
-            BodyError: If it has none of the three forms.
-        """
+        """Parse an address; raises BodyError if it has none of the three forms."""
         try:
             parts = urlsplit(address)
             host, port = parts.hostname or "", parts.port
@@ -99,11 +95,7 @@ class Address:
         return os.path.realpath(self.serial) if self.serial else f"{numeric(self.host)}:{self.port}"
 
     def connect(self) -> Wire:
-        """Open the connection or line.
-
-        Raises:
-            OSError: If that fails.
-        """
+        """Open the connection or line; raises OSError if that fails."""
         if not self.serial:
             wire = socket.create_connection((self.host, self.port), CONNECT_S)
             wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

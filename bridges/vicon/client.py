@@ -37,11 +37,7 @@ class Decoder:
         self._z_up = True
 
     def frame(self, body: bytes) -> Frame | None:
-        """Decode the body of a packet; None if the packet has only names, axes or answers.
-
-        Raises:
-            Malformed: If the packet is damaged.
-        """
+        """Decode a packet; None if it has only names, axes or answers; raises Malformed if it is damaged."""
         number, latency = None, 0.0
         named: dict[int, Subject] = {}
         seen: dict[int, list[Segment]] = {}
@@ -73,12 +69,7 @@ class Reader:
     """Connection to a DataStream server, which streams every frame."""
 
     def __init__(self, host: str, port: int = vicon_datastream.PORT, timeout_s: float = 2.0) -> None:
-        """Connect and request the stream.
-
-        Raises:
-            OSError: If no answer comes in time.
-            Malformed: If the answer is not DataStream, or the server offers no poses.
-        """
+        """Connect and request the stream; raises OSError without an answer in time, Malformed for one without poses."""
         deadline = time.monotonic() + timeout_s
         self._framer, self._decoder = Framer(), Decoder()
         self._waiting: deque[bytes] = deque()  # packets received, not decoded yet

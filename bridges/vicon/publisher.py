@@ -229,11 +229,7 @@ def serve(launch: ViconLaunch) -> int:
 
 
 def parse_server(server: str) -> tuple[str, int]:
-    """Host and port of "HOST" or "HOST:PORT".
-
-    Raises:
-        ValueError: If it is neither.
-    """
+    """Host and port of "HOST" or "HOST:PORT"; raises ValueError if it is neither."""
     host, colon, port = server.partition(":")
     if not host or (colon and not (port.isascii() and port.isdigit() and 0 < int(port) < 65536)):
         raise ValueError(f"'{server}' is neither HOST nor HOST:PORT, such as 192.168.0.10:801")

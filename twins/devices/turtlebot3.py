@@ -57,12 +57,7 @@ class _Row:
 
 
 class TurtleBot3Twin:
-    """TurtleBot3 robots behind ROS topics; implements `twins.devices.device.Device`.
-
-    Raises:
-        BodyError: If a setting is wrong.
-        Unreachable: If no router answers.
-    """
+    """TurtleBot3 robots behind ROS topics: a `Device`; raises BodyError for a wrong setting, or Unreachable."""
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body

@@ -257,11 +257,7 @@ class TwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of "HOST:PORT".
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """Host and port of "HOST:PORT"; raises ValueError if it is none."""
     host, _, port = text.rpartition(":")
     if not (host and port.isascii() and port.isdigit() and int(port) < 65536):
         raise ValueError(f"'{text}' is not HOST:PORT, such as 127.0.0.1:801")

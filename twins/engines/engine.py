@@ -99,9 +99,5 @@ class EngineFactory(Protocol):
     """
 
     def build(self, stage: Stage) -> Engine:
-        """Build an engine with these parameters.
-
-        Raises:
-            BodyError: If a kind has no twin, or a library is missing, with the remedy.
-        """
+        """Build an engine; raises BodyError with the remedy if a kind has no twin, or a library is missing."""
         ...

@@ -55,11 +55,7 @@ class RigidBodyEngine(PointMassEngine):
     quadrotor: Drones
 
     def __init__(self, stage: Stage, motor_lag: float) -> None:
-        """`motor_lag` is the time constant of a motor's thrust [s].
-
-        Raises:
-            BodyError: For a kind without a twin, or if MuJoCo is not installed.
-        """
+        """`motor_lag`: of a thrust [s]; raises BodyError for a kind without a twin, or without MuJoCo."""
         super().__init__(stage, partial(Drones, scene=stage.scene, motor_lag=motor_lag))
         self._update_attitude()
 

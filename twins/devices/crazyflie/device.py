@@ -163,9 +163,5 @@ class CrazyflieTwin:
 
 
 def open_device(request: DeviceRequest) -> CrazyflieTwin:
-    """Entry point `crazyflie-twin` of the group `zenpark.devices`.
-
-    Raises:
-        BodyError: If a row is no Crazyflie, or has invalid settings.
-    """
+    """Entry point; raises BodyError if a row is no Crazyflie, or has invalid settings."""
     return CrazyflieTwin(request)
