@@ -12,7 +12,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from math import atan2, cos, isfinite, sin
+from math import isfinite
 from typing import Annotated, Final
 
 import msgspec
@@ -146,7 +146,7 @@ class Graph:
             self.refused += 1
             return
         turned = q.x or q.y or q.z or q.w  # a quaternion of zeros means any yaw
-        yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z)) if turned else None
+        yaw = ros2.yaw_of(q) if turned else None
         self._seq += 1
         goal = messages.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
         robot.goal_publisher.put(messages.encode(goal))
@@ -160,12 +160,8 @@ def ros_name(robot: str) -> str:
 
 def pose(types: Types, state: messages.State, position: messages.Vector) -> Message:
     """A PoseStamped in the arena; only the robot's yaw is known, and an unknown yaw is sent as 0."""
-    x, y, z = position
-    place = types.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    half = 0.5 * (state.yaw or 0.0)
-    orientation = types.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(half), w=cos(half))
-    stamped = types.make("geometry_msgs/msg/Pose", position=place, orientation=orientation)
-    return types.make(ros2.POSE_STAMPED, header=types.header(state.stamp, FRAME), pose=stamped)
+    header = types.header(state.stamp, FRAME)
+    return types.make(ros2.POSE_STAMPED, header=header, pose=types.pose(*position, state.yaw or 0.0))
 
 
 def velocity(types: Types, state: messages.State, linear: messages.Vector) -> Message:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 from functools import cache
-from math import floor
+from math import atan2, cos, floor, sin
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from agents.body.interface import BodyError
@@ -98,6 +98,18 @@ class Types:
     def twist(self, linear: tuple[float, float, float], angular: tuple[float, float, float]) -> Message:
         """A geometry_msgs/Twist [m/s, rad/s]."""
         return self.make(TWIST, linear=self.vector(*linear), angular=self.vector(*angular))
+
+    def pose(self, x: float, y: float, z: float, yaw: float) -> Message:
+        """An upright geometry_msgs/Pose [m, rad]."""
+        turned = self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(0.5 * yaw), w=cos(0.5 * yaw))
+        return self.make(
+            "geometry_msgs/msg/Pose", position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turned
+        )
+
+
+def yaw_of(q: Message) -> float:
+    """Yaw [rad] of a geometry_msgs/Quaternion."""
+    return atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
 
 
 @cache

@@ -129,8 +129,8 @@ class CrazyflieLink:
         self.replies: dict[int, tuple[int, int]] = {}  # of the planner, by command: number of replies, last code
         self._last_answer = self.last_packet  # [s] packet with a content
         self._connected = threading.Event()
-        self._error: str | None = None
-        self._answered = self._unsafe = False
+        self.error: str | None = None  # reason of the loss; None while connected
+        self.answered = self._unsafe = False  # any packet was received; safelink is missing
         self._blocks: dict[str, Any] = {}
         self._periods: dict[str, int] = {}  # that were asked for, in units of 10 ms
         self._parameters: dict[int, tuple[str, str]] = {}  # asked for, by number: name, format
@@ -150,16 +150,6 @@ class CrazyflieLink:
         cf.add_port_callback(int(Port.PLATFORM), self._note_firmware)
         cf.add_port_callback(int(Port.PARAM), self._note_parameter)
         cf.add_port_callback(int(Port.MEMORY), self._note_memory)
-
-    @property
-    def answered(self) -> bool:
-        """Whether any packet was received."""
-        return self._answered
-
-    @property
-    def error(self) -> str | None:
-        """Reason of the loss; None while connected."""
-        return self._error
 
     @property
     def gap(self) -> float:
@@ -190,13 +180,13 @@ class CrazyflieLink:
             self.cf.link._thread._radio = PromptRadio(self.cf.link._thread._radio)
         while not self._connected.wait(0.02):
             now = time.monotonic()
-            if self._error is not None:
-                raise LinkError(self._error)
+            if self.error is not None:
+                raise LinkError(self.error)
             if self._unsafe:
                 # a drone that still has safelink on takes all packets of a session without it for repetitions
                 raise SilentError("no safelink")
-            if now - (self._last_answer if self._answered else self.last_packet) > (
-                SILENCE_S if self._answered else FIRST_S
+            if now - (self._last_answer if self.answered else self.last_packet) > (
+                SILENCE_S if self.answered else FIRST_S
             ):
                 raise SilentError("no answer")
             if now > deadline or end.is_set():
@@ -301,7 +291,7 @@ class CrazyflieLink:
         again = 0.0
         while again == 0.0 or (answered := answer()) is None:
             now = time.monotonic()
-            if now > deadline or self._error is not None:
+            if now > deadline or self.error is not None:
                 raise LinkError(f"no answer about {about}")
             if now >= again:
                 again = now + REPEAT_S
@@ -318,7 +308,7 @@ class CrazyflieLink:
         self._send(Port.PLATFORM, crtp.VERSIONS, bytes((crtp.FIRMWARE,)))
 
     def define_trajectories(self) -> None:
-        """Tell the drone where its trajectories will be; raises BodyError if it refuses, else LinkError."""
+        """Tell the drone where its trajectories will be; raises BodyError if it refuses, LinkError if silent."""
         memories = [memory.id for memory in self.cf.mem.mems if memory.type == Memory.TRAJECTORY]
         if not memories:
             raise BodyError("the firmware has no memory for trajectories: update it")
@@ -375,9 +365,9 @@ class CrazyflieLink:
         self._longest_gap = max(self._longest_gap, now - self.last_packet)
         self.last_packet = now
         self.exchanges += 1
-        if not self._answered:  # over a radio, cflib has tried for safelink before it hands the first packet on
+        if not self.answered:  # over a radio, cflib has tried for safelink before it hands the first packet on
             self._unsafe = self.is_radio and getattr(self.cf.link, "needs_resending", False)
-            self._answered = True
+            self.answered = True
         if (packet.port, packet.channel) != crtp.NULL:
             self._last_answer = self.last_packet
 
@@ -408,4 +398,4 @@ class CrazyflieLink:
 
     def _fail(self, text: str) -> None:
         lines = [line.strip() for line in str(text).splitlines() if line.strip()]
-        self._error = re.sub(r"^\w+: ", "", lines[-1]) if lines else "lost"  # the last line of a traceback
+        self.error = re.sub(r"^\w+: ", "", lines[-1]) if lines else "lost"  # the last line of a traceback

@@ -17,18 +17,25 @@ from agents.arrays import Array
 from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
 
+# for firmwares without a supervisor
+OLD_INFO: Final = {
+    "sys.canfly": Info.ARMED | Info.CAN_FLY,
+    "sys.isFlying": Info.FLYING,
+    "sys.isTumbled": Info.TUMBLED,
+}
 PLACE: Final = tuple(f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz"))  # [mm], [mm/s]
 YAW: Final = "stateEstimate.yaw"  # [degrees]
-STATE: Final = dict.fromkeys(PLACE, "int16_t") | {  # 23 bytes of 26: pose and status are one packet
-    YAW: "FP16",
-    "supervisor.info": "uint16_t",
-    "pm.vbat": "FP16",
-    "pm.state": "int8_t",
-    "lighthouse.status": "uint8_t",
-    "sys.canfly": "uint8_t",  # these three for firmwares without a supervisor
-    "sys.isFlying": "uint8_t",
-    "sys.isTumbled": "uint8_t",
-}
+STATE: Final = (
+    dict.fromkeys(PLACE, "int16_t")
+    | {  # 23 bytes of 26: pose and status are one packet
+        YAW: "FP16",
+        "supervisor.info": "uint16_t",
+        "pm.vbat": "FP16",
+        "pm.state": "int8_t",
+        "lighthouse.status": "uint8_t",
+    }
+    | dict.fromkeys(OLD_INFO, "uint8_t")
+)
 RANGES: Final = {f"range.{side}": "uint16_t" for side in ("front", "back", "left", "right", "up")}
 BEARING: Final = np.radians([0.0, 180.0, 90.0, -90.0, 0.0])
 ELEVATION: Final = np.radians([0.0, 0.0, 0.0, 0.0, 90.0])
@@ -134,7 +141,8 @@ class Telemetry:
         place = (MM * values.get(name, nan) for name in PLACE)
         self.pose = *place, radians(values.get(YAW, nan))
         self.pose_time = measured
-        self.info = Info(int(values["supervisor.info"])) if "supervisor.info" in values else _info(values)
+        old = sum(flags for name, flags in OLD_INFO.items() if values.get(name))
+        self.info = Info(int(values.get("supervisor.info", old)))
         self.power = int(values.get("pm.state", Power.BATTERY))
         self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
         self.stations = int(values.get("lighthouse.status", -1))
@@ -152,15 +160,3 @@ class Telemetry:
         measured = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
         self.ranges = np.array([nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured])
         self.ranges_time = self._stamped(t, stamp)
-
-
-def _info(values: Mapping[str, float]) -> Info:
-    """Flags of a supervisor, from the variables of firmwares that have none."""
-    info = Info(0)
-    if values.get("sys.canfly"):
-        info |= Info.ARMED | Info.CAN_FLY
-    if values.get("sys.isFlying"):
-        info |= Info.FLYING
-    if values.get("sys.isTumbled"):
-        info |= Info.TUMBLED
-    return info

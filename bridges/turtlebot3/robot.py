@@ -6,7 +6,7 @@ silent, not when we are. So every end sends zeros on cmd_vel, and every command 
 
 from __future__ import annotations
 
-from math import atan2, cos, hypot, nan, pi, sin
+from math import cos, hypot, nan, pi, sin
 from typing import Final
 
 import numpy as np
@@ -116,7 +116,7 @@ class Robot:
         place, q = message.pose.pose.position, message.pose.pose.orientation
         twist = message.twist.twist
         x, y, v, w = place.x, place.y, twist.linear.x, twist.angular.z
-        yaw = atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        yaw = ros2.yaw_of(q)
         if not np.isfinite((x, y, yaw, v, w)).all():
             return False
         if self._frame is None:

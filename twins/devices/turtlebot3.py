@@ -196,14 +196,8 @@ class TurtleBot3Twin:
             x0, y0, yaw0 = row.start
             x, y = position[index, 0] - x0, position[index, 1] - y0
             turned = float(yaw[index]) - yaw0
-            place = make(
-                "geometry_msgs/msg/Point",
-                x=float(cos(yaw0) * x + sin(yaw0) * y),
-                y=float(cos(yaw0) * y - sin(yaw0) * x),
-                z=0.0,
-            )
-            toward = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(0.5 * turned), w=cos(0.5 * turned))
-            pose = make("geometry_msgs/msg/Pose", position=place, orientation=toward)
+            ahead, left = cos(yaw0) * x + sin(yaw0) * y, cos(yaw0) * y - sin(yaw0) * x
+            pose = row.types.pose(float(ahead), float(left), 0.0, turned)
             twist = row.types.twist((float(speed[index]), 0.0, 0.0), (0.0, 0.0, float(turn[index])))
             message = make(
                 ros2.ODOMETRY,

@@ -23,11 +23,8 @@ class Response:
     position: tuple[float, float, float]  # gains [1/s]
     velocity: tuple[float, float, float]  # gains [1/s]
     speed: tuple[float, float, float]  # limits [m/s]
-    tilt: tuple[float, float, float] = (
-        math.inf,
-        math.inf,
-        math.inf,
-    )  # lag of the acceleration by tilting [1/s]; inf: none
+    # lag of the acceleration by tilting [1/s]; inf: none
+    tilt: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     turn: float | None = None  # rate of convergence of yaw [1/s]; None: that of the kind
 
 

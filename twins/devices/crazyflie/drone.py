@@ -266,9 +266,9 @@ class Drone:
         memories = self.memories
         if channel == 0:
             if data[0] == 1:
-                return bytes((1, memories.count))
-            listed = memories.listed(data[1]) if data[0] == 2 else None
-            return None if listed is None else crtp.MEMORY_INFO.pack(2, data[1], *listed)
+                return bytes((1, len(memories.listed)))
+            known = data[0] == 2 and data[1] < len(memories.listed)
+            return crtp.MEMORY_INFO.pack(2, data[1], *memories.listed[data[1]]) if known else None
         number, address = crtp.MEMORY.unpack_from(data)
         head, rest = data[: crtp.MEMORY.size], data[crtp.MEMORY.size :]
         read: bytes | None = b""

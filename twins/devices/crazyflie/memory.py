@@ -52,21 +52,16 @@ class Memories:
         self.write_errors = 0  # of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
 
-    def listed(self, number: int) -> tuple[int, int] | None:
-        """Kind and size [bytes] of a memory by its number; None if there is none."""
-        if number < len(self.kinds):
-            return self.kinds[number], SIZES[self.kinds[number]]
-        return (Memory.DECK, ONE_WIRE_BYTES) if number < self.count else None
-
     @property
-    def count(self) -> int:
-        return len(self.kinds) + len(self.decks)
+    def listed(self) -> list[tuple[int, int]]:
+        """Kind and size [bytes] of each memory."""
+        return [*SIZES.items(), *[(Memory.DECK, ONE_WIRE_BYTES)] * len(self.decks)]
 
     def read_number(self, number: int, address: int, count: int) -> bytes | None:
         """Read by the number of a memory, see `read`."""
         if number < len(self.kinds):
             return self.read(self.kinds[number], address, count)
-        if number >= self.count or address + count > ONE_WIRE_BYTES:
+        if number >= len(self.listed) or address + count > ONE_WIRE_BYTES:
             return None
         return self.decks[number - len(self.kinds)][address : address + count]
 
