@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final
 
 import msgspec
@@ -17,7 +17,7 @@ from agents.formation.graph import edges
 from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
-from experiments.check.findings import FORGIVEN, Claim, Severity, first_of_each_code
+from experiments.check.findings import FORGIVEN, MARK, Finding, first_of_each_code
 from experiments.check.ideal_run import message_rate, predict, undisturbed
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
@@ -26,33 +26,14 @@ from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
 NOT_RANDOM: Final = "not-random"
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
-MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
-ORDER: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Finding on an experiment: an error, a warning or a note, with remedy and place."""
-
-    # of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good news, or
-    # explains
-    severity: Severity
-    code: str  # one word for programs
-    message: str  # what it is, with numbers
-    remedy: str  # what to change; empty for notes
-    where: str  # file:line:column, or the `--set` at fault; empty where it concerns the whole
-
-    def __str__(self) -> str:
-        """Line for a terminal."""
-        return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
-
-
-def chance(analysis: Analysis) -> Iterator[Claim]:
+def chance(analysis: Analysis) -> Iterator[Finding]:
     """Warn if no seed changes anything."""
     if not analysis.plan.uses_chance:
         message = "nothing in this file is random: runs of other seeds are the same"
         remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
-        yield Claim("warning", NOT_RANDOM, message, remedy, ("disturbance",))
+        yield Finding("warning", NOT_RANDOM, message, remedy, ("disturbance",))
 
 
 SUBJECTS: Final = (
@@ -143,21 +124,21 @@ def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
 @QUIET
 def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding]:
     """Findings, each once; those of only some cases name these cases."""
-    holders: dict[Claim, list[str]] = {}
+    holders: dict[Finding, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
-            for claim in first_of_each_code(subject(analysis)):
-                holders.setdefault(claim, []).append(name)
+            for finding in first_of_each_code(subject(analysis)):
+                holders.setdefault(finding, []).append(name)
     source = given.source
     found = []
-    for claim, names in holders.items():
-        message = claim.message
+    for finding, names in holders.items():
+        message = finding.message
         if len(names) < len(analyses):
             words = ", ".join(f"'{name}'" for name in names)
             message = f"in case{'s' * (len(names) > 1)} {words}: {message}"
-        where = _place(source, claim.path, names) if claim.path else ""
-        found.append(Finding(claim.severity, claim.code, message, claim.remedy, where))
-    return sorted(found, key=lambda each: ORDER.index(each.severity))
+        where = finding.where if isinstance(finding.where, str) else _place(source, finding.where, names)
+        found.append(replace(finding, message=message, where=where))
+    return sorted(found, key=lambda each: list(MARK).index(each.severity))
 
 
 def _place(source: Source, path: Path, cases: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Claims of the checks: severity, code, message and remedy at a path of the file."""
+"""Findings of the checks: severity, code, message and remedy at a place of the file."""
 
 from __future__ import annotations
 
@@ -10,19 +10,30 @@ from experiments.file.problems import Path
 
 Severity = Literal["error", "warning", "note"]
 
-SHOWN: Final = 5  # claims of one sort; the others are counted
+SHOWN: Final = 5  # findings of one sort; the others are counted
 FORGIVEN: Final = 1e-6  # of rounding
 
 
-@dataclass(frozen=True)
-class Claim:
-    """Claim about a path of the experiment file."""
+MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
 
+
+@dataclass(frozen=True)
+class Finding:
+    """Finding on an experiment: an error, a warning or a note, with remedy and place."""
+
+    # of an error, the experiment cannot work; of a warning, it may not do what was meant; a note is good news, or
+    # explains
     severity: Severity
-    code: str
-    message: str
-    remedy: str = ""
-    path: Path = ()
+    code: str  # one word for programs
+    message: str  # what it is, with numbers
+    remedy: str = ""  # what to change; empty for notes
+    # path in the file; of those that `check` returns file:line:column, or the `--set` at fault; empty where it concerns
+    # the whole
+    where: Path | str = ""
+
+    def __str__(self) -> str:
+        """Line for a terminal."""
+        return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 def join_names(words: Sequence[str], most: int = 4) -> str:
@@ -31,11 +42,11 @@ def join_names(words: Sequence[str], most: int = 4) -> str:
     return ", ".join(words) if more <= 0 else f"{', '.join(words[:most])} and {more} more"
 
 
-def first_of_each_code(claims: Iterable[Claim]) -> list[Claim]:
-    """First claims of each code; the last of them ends with the number of the others."""
-    by_code: dict[str, list[Claim]] = {}
-    for claim in claims:
-        by_code.setdefault(claim.code, []).append(claim)
+def first_of_each_code(findings: Iterable[Finding]) -> list[Finding]:
+    """First findings of each code; the last of them ends with the number of the others."""
+    by_code: dict[str, list[Finding]] = {}
+    for each in findings:
+        by_code.setdefault(each.code, []).append(each)
     kept = []
     for same in by_code.values():
         kept += same[:SHOWN]

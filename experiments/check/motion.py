@@ -15,7 +15,7 @@ from agents.formation.graph import BY_DISTANCE
 from agents.plugins import registry
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
-from experiments.check.findings import FORGIVEN, Claim
+from experiments.check.findings import FORGIVEN, Finding
 from experiments.check.ideal_run import approaches, fly_repeatedly, isolated, repetitions, undisturbed
 from experiments.check.theory import FAR_OFF, GAIN, OFF, strength
 
@@ -25,7 +25,7 @@ SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then,
 SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to rest
 
 
-def starts(analysis: Analysis) -> Iterator[Claim]:
+def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
     names, limits, start = analysis.names, analysis.assignment.limits, analysis.start[:, :2]
     inside = np.minimum(start - limits.low[:2], limits.high[:2] - start).min(axis=1)
@@ -35,7 +35,7 @@ def starts(analysis: Analysis) -> Iterator[Claim]:
             f"{names[row]} starts {max(0.0, inside[row]):.2f} m from a wall, inside the margin of {limits.margin:g} m"
         )
         remedy = "start it farther inside, or reduce margin in [safety]"
-        problems.append(Claim("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
+        problems.append(Finding("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
     radius = np.array([kind.radius for kind in analysis.assignment.kinds])
     i, j = np.triu_indices(len(names), 1)
     apart = norm(start[i] - start[j])
@@ -43,27 +43,27 @@ def starts(analysis: Analysis) -> Iterator[Claim]:
         first, second, needed = names[i[k]], names[j[k]], radius[i[k]] + radius[j[k]]
         message = f"{first} and {second} start {apart[k]:.2f} m apart, but need {needed:.2f} m to stand side by side"
         remedy = "all start on the floor, flying ones too: move one of them"
-        problems.append(Claim("error", "start-overlap", message, remedy, ("robots", second, "start")))
+        problems.append(Finding("error", "start-overlap", message, remedy, ("robots", second, "start")))
     yield from problems
     if not problems:
-        yield Claim("note", "starts", "every robot starts inside the arena, clear of the others")
+        yield Finding("note", "starts", "every robot starts inside the arena, clear of the others")
 
 
-def flight(analysis: Analysis) -> Iterator[Claim]:
+def flight(analysis: Analysis) -> Iterator[Finding]:
     """Report what stopped or disturbed the ideal run, and how much of it was flown."""
     experiment, prediction = analysis.experiment, analysis.prediction
     if prediction.stuck:
         message = f"the run does not begin, even undisturbed: {prediction.stuck}"
-        yield Claim("error", "not-begun", message, "see what its robots wait for", ("robots",))
+        yield Finding("error", "not-begun", message, "see what its robots wait for", ("robots",))
         return
     end = float(prediction.time[-1])
     if _cut(analysis):
         message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
-        yield Claim("note", "predicted-in-part", message, "", ("duration_s",))
+        yield Finding("note", "predicted-in-part", message, "", ("duration_s",))
     for each in prediction.incidents:
         name = analysis.names[each.row]
         message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
-        yield Claim("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
+        yield Finding("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
 
 
 def _cut(analysis: Analysis) -> bool:
@@ -72,7 +72,7 @@ def _cut(analysis: Analysis) -> bool:
     return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
 
 
-def formation(analysis: Analysis) -> Iterator[Claim]:
+def formation(analysis: Analysis) -> Iterator[Finding]:
     """Check that the formation is acquired, and kept at the end."""
     experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
     last = analysis.error[-1]
@@ -90,7 +90,7 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         departure = min(analysis.departure, end)
         formed = analysis.acquired(departure)
         if formed is not None:
-            yield Claim("note", "acquired", f"the formation is acquired after {formed:.1f} s; at the end {left}")
+            yield Finding("note", "acquired", f"the formation is acquired after {formed:.1f} s; at the end {left}")
             return
         at = int(np.searchsorted(prediction.time, departure + 1e-9)) - 1
         then = analysis.error[at]
@@ -102,7 +102,7 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         what, path = ("shape changes", ("formation", "changes")) if changes else ("plans begin", ("timeline",))
         message = f"the formation is not acquired when the {what} at {departure:g} s: {early}"
         remedy = f"begin later, start nearer to the shape, or raise {strength(analysis)}"
-        yield Claim("warning", "acquired-late", message, remedy, path)
+        yield Finding("warning", "acquired-late", message, remedy, path)
     elif not prediction.transmissions and experiment.architecture == "distributed":
         moved = float(norm(prediction.position - prediction.position[0]).max())
         kind = registry.split(experiment.trigger)[0]
@@ -111,20 +111,20 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
             f"to {moved:.2g} m, so neighbours are believed at their starts; {left} {allowed}"
         )
         remedy = "look at the trigger's parameters: thresholds are in metres; maximum_silence_s bounds the silence"
-        yield Claim("error", "silent", message, remedy, ("trigger",))
+        yield Finding("error", "silent", message, remedy, ("trigger",))
     elif (stopped := _stopped(analysis, -1, f"{left} {allowed}")) is not None:
         yield stopped
     elif analysis.shapes[0].worst > OFF:
         message = f"from these starts the robots end in another shape, a local minimum: {left} {allowed}"
         remedy = "start them nearer to the shape, in the order in which they stand in it"
-        yield Claim("warning", "local-minimum", message, remedy, ("formation", "links"))
+        yield Finding("warning", "local-minimum", message, remedy, ("formation", "links"))
     elif (
         len(prediction.time) > 1
         and np.ptp(prediction.position[-2:, analysis.without_neighbours], axis=0).max(initial=0.0) > SETTLED
     ):
         message = f"the formation lags behind its leader: {left} {allowed}"
         remedy = f"lead more slowly, or raise {strength(analysis)} or the clamp"
-        yield Claim("warning", "lags", message, remedy, ("timeline",))
+        yield Finding("warning", "lags", message, remedy, ("timeline",))
     else:
         departure = min(analysis.departure, end)
         formed = analysis.acquired(departure)
@@ -133,10 +133,10 @@ def formation(analysis: Analysis) -> Iterator[Claim]:
         message = f"the formation{before} is not acquired {late}: {left} {allowed}"
         other = "start nearer to the shape" if formed is None else "change or lead more slowly"
         remedy = f"give a longer duration_s, {other}, or raise {strength(analysis)}"
-        yield Claim("warning", "not-acquired", message, remedy, ("duration_s",))
+        yield Finding("warning", "not-acquired", message, remedy, ("duration_s",))
 
 
-def softness(analysis: Analysis) -> Iterator[Claim]:
+def softness(analysis: Analysis) -> Iterator[Finding]:
     """Check that a soft formation that is acquired without noise is also acquired with the noise of its file."""
     experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
     bare, end = isolated(experiment), float(analysis.prediction.time[-1])
@@ -180,11 +180,11 @@ def softness(analysis: Analysis) -> Iterator[Claim]:
         f"({seeds}): {worst_link}"
     )
     remedy = f"raise {strength(analysis)}, add links that stiffen the formation, or allow a larger tolerance"
-    yield Claim("warning", "soft", message, remedy, ("formation", "links"))
+    yield Finding("warning", "soft", message, remedy, ("formation", "links"))
 
 
-def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
-    """Claim that wheeled robots which stand still at sample `at` prevent acquisition."""
+def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
+    """Finding that wheeled robots which stand still at sample `at` prevent acquisition."""
     experiment, links = analysis.experiment, analysis.pattern.links
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
@@ -201,10 +201,10 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Claim | None:
     remedy, path = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance", ("formation", name)
     if (own := strength(analysis)) not in GAIN.values():
         remedy, path = f"raise {own}, or allow a larger tolerance", ("formation", "law")
-    return Claim("warning", "wheels-stop", message, remedy, path)
+    return Finding("warning", "wheels-stop", message, remedy, path)
 
 
-def walls(analysis: Analysis) -> Iterator[Claim]:
+def walls(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robot leaves the arena, or is held back by the margin at a wall."""
     names, limits, track = analysis.names, analysis.assignment.limits, analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
@@ -216,13 +216,13 @@ def walls(analysis: Analysis) -> Iterator[Claim]:
         time, place = _first_time(analysis, int(row), tight[:, row])
         message = f"{names[row]} comes within the margin of {limits.margin:g} m of a wall at {time:.1f} s, at {place}"
         remedy = "it will be held back there: enlarge size in [arena], or lead the formation away from the wall"
-        problems.append(Claim("warning", "near-wall", message, remedy, ("arena", "size")))
+        problems.append(Finding("warning", "near-wall", message, remedy, ("arena", "size")))
     yield from problems
     if not problems:
-        yield Claim("note", "inside", "the expected paths stay inside the arena")
+        yield Finding("note", "inside", "the expected paths stay inside the arena")
 
 
-def encounters(analysis: Analysis) -> Iterator[Claim]:
+def encounters(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robots collide or land on each other; pairs too near at the start are not repeated."""
     names, kinds, start = analysis.names, analysis.assignment.kinds, analysis.start
     radius = np.array([kind.radius for kind in kinds])
@@ -241,9 +241,9 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
         path = ("robots", second, "start")
         robots = analysis.experiment.robots
         if analysis.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
-            yield Claim("warning", "too-close", message, "move the start of one of them", path)
+            yield Finding("warning", "too-close", message, "move the start of one of them", path)
         else:
-            yield Claim("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
+            yield Finding("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if _cut(analysis) or analysis.prediction.stuck:
         return
     final, links = analysis.prediction.position[-1], analysis.assignment.links
@@ -253,11 +253,11 @@ def encounters(analysis: Analysis) -> Iterator[Claim]:
             targets = ("formation", "links")
             if ((links.receiver == row) & (links.sender == under)).any():
                 message = f"{names[row]} ends above {names[under]}, and goes aside before it lands"
-                yield Claim("note", "lands-beside", message, "", targets)
+                yield Finding("note", "lands-beside", message, "", targets)
                 continue
             message = f"{names[row]} ends above {names[under]}, from which it receives no poses, and would land on it"
             remedy = "change their distances, link them, or end the timeline elsewhere"
-            yield Claim("warning", "lands-on", message, remedy, targets)
+            yield Finding("warning", "lands-on", message, remedy, targets)
 
 
 def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
@@ -267,19 +267,19 @@ def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
     return float(analysis.prediction.time[at]), f"({x:.2f}, {y:.2f})"
 
 
-def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Claim:
+def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
     name = analysis.names[row]
     time, place = _first_time(analysis, row, outside)
     begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.experiment.timeline[k].at_s <= time]
     message = f"{name} would leave the arena at {time:.1f} s, at {place}"
     if row in analysis.without_neighbours and begun:
         remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
-        return Claim("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
+        return Finding("error", "leaves-arena", f"{message}, by its plan", remedy, ("timeline", begun[-1], "plan"))
     remedy = "start the formation farther inside, lead it elsewhere, or enlarge size in [arena]"
-    return Claim("error", "leaves-arena", message, remedy, ("robots", name, "start"))
+    return Finding("error", "leaves-arena", message, remedy, ("robots", name, "start"))
 
 
-def speeds(analysis: Analysis) -> Iterator[Claim]:
+def speeds(analysis: Analysis) -> Iterator[Finding]:
     """Check that plans ask for no more speed than the robots have."""
     names, timeline, problems = analysis.names, analysis.experiment.timeline, []
     for number, robot, plan in analysis.legs:
@@ -289,10 +289,10 @@ def speeds(analysis: Analysis) -> Iterator[Claim]:
         what = f"the leg at {timeline[number].at_s:g} s asks {robot} for {asked:.3g} m/s"
         remedy = f"plan for less than {NEARLY * has:.2g} m/s"
         if leads and asked > has * (1.0 + 1e-9):
-            problems.append(Claim("error", "leader-too-fast", f"{what}; it has {has:.3g} m/s", remedy, path))
+            problems.append(Finding("error", "leader-too-fast", f"{what}; it has {has:.3g} m/s", remedy, path))
         elif asked > NEARLY * has:
             message = f"{what} of the {has:.3g} m/s at which it can follow a plan: it cannot catch up"
-            problems.append(Claim("warning", "leader-near-limit", message, remedy, path))
+            problems.append(Finding("warning", "leader-near-limit", message, remedy, path))
     fastest = analysis.fastest
     if fastest is not None and analysis.follower is not None:
         number, robot, plan = fastest
@@ -303,14 +303,14 @@ def speeds(analysis: Analysis) -> Iterator[Claim]:
             clamp = math.ceil(110.0 * analysis.assignment.clamp * asked / has) / 100.0
             slow = asked > analysis.speed[analysis.follower]
             remedy = "lead more slowly" if slow else f"lead more slowly, or raise clamp in [formation] to {clamp:g}"
-            problems.append(Claim("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
+            problems.append(Finding("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
     yield from problems
     if not problems and fastest is not None:
         asked = fastest[2].speed()
-        yield Claim("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
+        yield Finding("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
 
 
-def rates(analysis: Analysis) -> Iterator[Claim]:
+def rates(analysis: Analysis) -> Iterator[Finding]:
     """Check the rates: trigger period against pose_hz, pose_hz against coordination_hz."""
     rates, trigger = analysis.experiment.rates, analysis.assignment.trigger
     asked = 1.0 / rates.pose_hz
@@ -322,17 +322,17 @@ def rates(analysis: Analysis) -> Iterator[Claim]:
         message = f"the trigger asks for a transmission every {period:g} s, but is asked every {asked:g} s"
         if times < 1.0 - FORGIVEN:
             remedy = f"raise pose_hz in [rates] to {1.0 / period:g}, or {field} to {asked:g}"
-            yield Claim("warning", "trigger-too-fast", message, remedy, path)
+            yield Finding("warning", "trigger-too-fast", message, remedy, path)
         elif field == "period_s" and abs(times - round(times)) > FORGIVEN * times:
             message += f": it transmits every {math.ceil(times) * asked:g} s"
-            yield Claim("warning", "trigger-uneven", message, f"use a multiple of {asked:g}", path)
+            yield Finding("warning", "trigger-uneven", message, f"use a multiple of {asked:g}", path)
     if rates.pose_hz < rates.coordination_hz:
         message = f"decisions at {rates.coordination_hz:g} Hz see poses that come at {rates.pose_hz:g} Hz at most"
         remedy = "raise pose_hz, or lower coordination_hz"
-        yield Claim("warning", "decides-unheard", message, remedy, ("rates", "pose_hz"))
+        yield Finding("warning", "decides-unheard", message, remedy, ("rates", "pose_hz"))
 
 
-def ends(analysis: Analysis) -> Iterator[Claim]:
+def ends(analysis: Analysis) -> Iterator[Finding]:
     """Check that the last leg of each robot ends before the run."""
     timeline, duration = analysis.experiment.timeline, analysis.experiment.duration_s
     last = {robot: (number, plan) for number, robot, plan in analysis.legs}
@@ -343,7 +343,7 @@ def ends(analysis: Analysis) -> Iterator[Claim]:
         if lasts is not None and at + lasts > duration * (1.0 + 1e-9) + 0.1:
             message = f"the leg of {robot} at {at:g} s lasts {lasts:.3g} s, but the run ends at {duration:g} s"
             remedy = f"give a duration_s of {math.ceil(at + lasts):g} or more, or a faster or shorter plan"
-            yield Claim("warning", "leg-cut", message, remedy, ("timeline", number, "plan"))
+            yield Finding("warning", "leg-cut", message, remedy, ("timeline", number, "plan"))
 
 
 def _plan_duration(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 from agents.arrays import Array, Index, Mask
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, join_names
+from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Robot
 from twins import scene as outlines
@@ -31,7 +31,7 @@ def describe_obstacle(obstacle: Obstacle) -> str:
     return what + above + (f", {obstacle.mass:g} kg" if obstacle.mass else "") + (", moves" if obstacle.plan else "")
 
 
-def obstacles(analysis: Analysis) -> Iterator[Claim]:
+def obstacles(analysis: Analysis) -> Iterator[Finding]:
     """Check that no predicted path meets an obstacle; with avoidance, note that it will act."""
     scene, prediction = analysis.scene, analysis.prediction
     if not scene.names:
@@ -50,18 +50,18 @@ def obstacles(analysis: Analysis) -> Iterator[Claim]:
                 met.append(_met(analysis, number, rows, near[:, rows], keeps=keeps))
     yield from met
     if not met:
-        yield Claim("note", "obstacles", "the expected paths keep clear of all obstacles")
+        yield Finding("note", "obstacles", "the expected paths keep clear of all obstacles")
     for number, (name, plan) in enumerate(zip(scene.names, scene.plans, strict=True)):
         beyond = np.maximum(poses[:, number, :2] - scene.high[:2], scene.low[:2] - poses[:, number, :2]).max(axis=1)
         if plan is not None and beyond.max() > FORGIVEN:
             when = prediction.time[(beyond > FORGIVEN).argmax()]
             message = f"the middle of '{name}' leaves the arena at {when:.1f} s"
             remedy = "shorten its plan, or start it elsewhere"
-            yield Claim("warning", "obstacle-leaves", message, remedy, ("arena", "obstacles", name, "plan"))
+            yield Finding("warning", "obstacle-leaves", message, remedy, ("arena", "obstacles", name, "plan"))
 
 
-def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Claim:
-    """Claim that `rows` (K,) meet an obstacle at the times `near` (T, K); `keeps`: avoidance is on."""
+def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: bool) -> Finding:
+    """Finding that `rows` (K,) meet an obstacle at the times `near` (T, K); `keeps`: avoidance is on."""
     scene, prediction, names = analysis.scene, analysis.prediction, analysis.names
     name, path = scene.names[number], ("arena", "obstacles", scene.names[number])
     which = int(near.argmax(axis=0).argmin())
@@ -72,14 +72,14 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
     when = f", {names[first]} first {when}" if len(rows) > 1 else f" {when}"
     if keeps:
         message = f"the path of {subject} crosses '{name}'{when}: avoidance will have to act"
-        return Claim("note", "avoidance-acts", message, "", path)
+        return Finding("note", "avoidance-acts", message, "", path)
     if np.isfinite(scene.mass[number]):
-        return Claim("note", "pushes", f"{subject} would push '{name}'{when}", "", path)
+        return Finding("note", "pushes", f"{subject} would push '{name}'{when}", "", path)
     remedy = f"lead the formation around it, {AVOID}"
-    return Claim("warning", "hits-obstacle", f"{subject} would run into '{name}'{when}", remedy, path)
+    return Finding("warning", "hits-obstacle", f"{subject} would run into '{name}'{when}", remedy, path)
 
 
-def contacts(analysis: Analysis) -> Iterator[Claim]:
+def contacts(analysis: Analysis) -> Iterator[Finding]:
     """Check that the engine computes the contacts for which the arena is made."""
     experiment, scene = analysis.experiment, analysis.scene
     kind, _ = registry.split(experiment.world.engine)
@@ -88,7 +88,7 @@ def contacts(analysis: Analysis) -> Iterator[Claim]:
         if obstacle.mass is not None and not touching:
             message = f"'{name}' has a mass, but in the engine '{kind}' nothing is pushed: it stands fast"
             remedy = 'choose another: engine = "pymunk" in [world], or leave mass out'
-            yield Claim("warning", "not-pushed", message, remedy, ("arena", "obstacles", name, "mass"))
+            yield Finding("warning", "not-pushed", message, remedy, ("arena", "obstacles", name, "mass"))
     if touching and scene.walled:
         start = analysis.start[:, :2]
         gap = np.minimum(start - scene.low[:2], scene.high[:2] - start).min(axis=1)
@@ -96,10 +96,10 @@ def contacts(analysis: Analysis) -> Iterator[Claim]:
             name, needed = analysis.names[row], analysis.assignment.kinds[row].radius
             message = f"{name} starts in a wall of the arena: {max(gap[row], 0.0):.2f} m off, but needs {needed:.2f} m"
             remedy = "start it farther inside, or leave the walls out: walls = false in [arena]"
-            yield Claim("error", "start-overlap", message, remedy, ("robots", name, "start"))
+            yield Finding("error", "start-overlap", message, remedy, ("robots", name, "start"))
 
 
-def perception(analysis: Analysis) -> Iterator[Claim]:
+def perception(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots with avoidance have sensors or neighbours to avoid by."""
     experiment, scene = analysis.experiment, analysis.scene
     avoidance = analysis.plan.avoidance
@@ -117,14 +117,14 @@ def perception(analysis: Analysis) -> Iterator[Claim]:
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
         if there:
             message = f"{name} has no range sensors: it cannot avoid {join_names(there)}"
-            yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
+            yield Finding("warning", "sees-nothing", message, remedy, ("robots", name))
         elif name in isolated:
             message = f"{name} has neither neighbours nor range sensors: it avoids nothing"
             remedy += ', or hears = "all" in [avoidance]'
-            yield Claim("warning", "sees-nothing", message, remedy, ("robots", name))
+            yield Finding("warning", "sees-nothing", message, remedy, ("robots", name))
 
 
-def reality(analysis: Analysis) -> Iterator[Claim]:
+def reality(analysis: Analysis) -> Iterator[Finding]:
     """Check worlds, range sensors and shadows against the bodies of the robots."""
     experiment, robots = analysis.experiment, analysis.experiment.robots
     peopled = any(robot.body == WORLD for robot in robots.values())
@@ -133,21 +133,21 @@ def reality(analysis: Analysis) -> Iterator[Claim]:
         served, path = robot.ranges == "world", ("robots", name, "ranges")
         if served and robot.body == WORLD:
             message = f'{name} lives in the world, whose range sensors are its own: ranges = "world" adds nothing'
-            yield Claim("warning", "ranges-twice", message, "leave ranges out", path)
+            yield Finding("warning", "ranges-twice", message, "leave ranges out", path)
         elif served and not _sensors(robot):
             message = f"{name} has no range sensors that the world could serve"
-            yield Claim("warning", "ranges-of-nothing", message, 'say which: sensors = ["multiranger"]', path)
+            yield Finding("warning", "ranges-of-nothing", message, 'say which: sensors = ["multiranger"]', path)
         elif served and bare:
             message = f"{name} takes its ranges from a world without obstacles and robots"
-            yield Claim("warning", "ranges-of-nothing", message, "add [arena.obstacles], or leave ranges out", path)
+            yield Finding("warning", "ranges-of-nothing", message, "add [arena.obstacles], or leave ranges out", path)
         if robot.shadow is not None and robot.body in TWINS:
             message = f"{name} is a twin, so its shadow only compares one twin with another"
-            yield Claim("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
+            yield Finding("warning", "shadow-of-twin", message, "leave shadow out", ("robots", name, "shadow"))
     alone = [name for name, robot in robots.items() if robot.body == "twin" and robot.ranges != "world"]
     if alone and (experiment.arena.obstacles or experiment.avoidance is not None):
         subject = f"{join_names(alone)} {'is' if len(alone) == 1 else 'are'}"
         message = f'in real time {subject} in no common place and without range sensors, unless body = "world"'
-        yield Claim("note", "alone", message, "", ("robots", alone[0]))
+        yield Finding("note", "alone", message, "", ("robots", alone[0]))
 
 
 def _avoids(analysis: Analysis) -> Mask:

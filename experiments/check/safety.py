@@ -10,24 +10,24 @@ from agents.arrays import norm
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, join_names
+from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition import bodies
 
 
-def safety(analysis: Analysis) -> Iterator[Claim]:
+def safety(analysis: Analysis) -> Iterator[Finding]:
     """Report settings of `[safety]` that contradict each other or the experiment."""
     chosen = analysis.experiment.safety
     if chosen.battery_min < chosen.battery_low:
         message = f"robots take off at {chosen.battery_min:.0%} of charge, and land below {chosen.battery_low:.0%}"
-        yield Claim("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
+        yield Finding("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
     if chosen.cut_outside <= OUTSIDE_M:
         message = f"motors are cut {chosen.cut_outside:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
-        yield Claim("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
+        yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
     if chosen.separation is not None:
         yield from _separation(analysis, chosen.separation)
 
 
-def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
+def _separation(analysis: Analysis, limit: float) -> Iterator[Finding]:
     """Check the separation of linked pairs: at the start, at their target, and on their way."""
     names, path, track = analysis.names, ("safety", "separation"), analysis.prediction.position
     links, poses = analysis.plan.links, analysis.plan.pose_links
@@ -43,32 +43,32 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Claim]:
         least = float(norm(track[:, first] - track[:, second]).min())
         if apart < limit - FORGIVEN:
             message = f"{both} start {apart:.2f} m apart, {nearer}: neither takes off"
-            yield Claim("error", "separation-start", message, "start them farther apart, or reduce separation", path)
+            yield Finding("error", "separation-start", message, "start them farther apart, or reduce separation", path)
         elif wanted.get((first, second), np.inf) < limit - FORGIVEN:
             message = f"{both} are to be {wanted[first, second]:.2f} m apart, {nearer}: they hold before they are there"
-            yield Claim("warning", "separation-link", message, "reduce separation, or ask for more distance", path)
+            yield Finding("warning", "separation-link", message, "reduce separation, or ask for more distance", path)
         elif least < limit - FORGIVEN:
             message = f"{both} come within {least:.2f} m, {nearer}: they hold there"
-            yield Claim("warning", "separation-path", message, "start elsewhere, or reduce separation", path)
+            yield Finding("warning", "separation-path", message, "start elsewhere, or reduce separation", path)
         else:
             continue
         quiet = False
     if quiet and len(pairs) < len(names) * (len(names) - 1) // 2:
         message = f"only the {len(pairs)} pairs with a link keep the separation of {limit:g} m"
-        yield Claim("note", "separation", message, "", path)
+        yield Finding("note", "separation", message, "", path)
 
 
-def libraries(analysis: Analysis) -> Iterator[Claim]:
+def libraries(analysis: Analysis) -> Iterator[Finding]:
     """Report bodies of robots of this machine whose library is missing."""
     experiment = analysis.experiment
     elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
     for name, robot in experiment.robots.items():
         if name not in elsewhere and (library := bodies.missing_library(registry.body_name(robot.body))):
             message = f"the body of {name} needs {library}, which is not installed here"
-            yield Claim("warning", "library", message, "`./zenpark hardware` adds it", ("robots", name, "body"))
+            yield Finding("warning", "library", message, "`./zenpark hardware` adds it", ("robots", name, "body"))
 
 
-def devices(analysis: Analysis) -> Iterator[Claim]:
+def devices(analysis: Analysis) -> Iterator[Finding]:
     """Report robots with the same address of a device, on one machine."""
     experiment = analysis.experiment
     host_of = {name: place for place, host in experiment.hosts.items() for name in host.robots}
@@ -79,10 +79,10 @@ def devices(analysis: Analysis) -> Iterator[Claim]:
             other = drivers.setdefault(device, name)
             if other != name:
                 message = f"{other} and {name} have the same body, {robot.body}: one device gets the setpoints of both"
-                yield Claim("warning", "same-device", message, "give each its own address", ("robots", name, "body"))
+                yield Finding("warning", "same-device", message, "give each its own address", ("robots", name, "body"))
 
 
-def architecture(analysis: Analysis) -> Iterator[Claim]:
+def architecture(analysis: Analysis) -> Iterator[Finding]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
     experiment, path = analysis.experiment, ("architecture",)
     guided = analysis.plan.guided
@@ -93,12 +93,14 @@ def architecture(analysis: Analysis) -> Iterator[Claim]:
     rest = "" if all_guided else "; the others decide for themselves, and receive their poses as before"
     hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
     what = "centralised" if all_guided else "hybrid"
-    yield Claim("note", what, f"{what}: a centre decides for {subject} {rate:g} times a second{rest}; {hold}", "", path)
+    yield Finding(
+        "note", what, f"{what}: a centre decides for {subject} {rate:g} times a second{rest}; {hold}", "", path
+    )
     if experiment.safety.link_silence_s <= 1.0 / rate:
         message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
         remedy = "give safety.link_silence_s more than twice that, or decide more often"
-        yield Claim("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
+        yield Finding("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
     if getattr(analysis.plan.trigger, "judges_errors", False):
         kind, _ = registry.split(experiment.trigger)
         message = f"the trigger '{kind}' judges by the formation error, which is 0 where the centre guides"
-        yield Claim("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))
+        yield Finding("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))

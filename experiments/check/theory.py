@@ -13,7 +13,7 @@ from agents.arrays import Index, Mask
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, components, reachable
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Claim, Severity, join_names
+from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
 from experiments.file.problems import Path
 
@@ -25,12 +25,12 @@ HUNTS: Final = 2.0  # of the share of an error that one decision corrects
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
 
-def network(analysis: Analysis) -> Iterator[Claim]:
+def network(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network is connected, and that every robot is reached by a leader."""
     names, links = analysis.names, analysis.assignment.links
     path = ("formation", "links")
     if not len(links):
-        yield Claim("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")
+        yield Finding("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")
         return
     rows = len(names)
     linked = np.union1d(links.receiver, links.sender)
@@ -48,40 +48,44 @@ def network(analysis: Analysis) -> Iterator[Claim]:
             subject = join_names([names[row] for row in lost])
             message = f"{subject} cannot be reached by the leader ({join_names(leaders)}), directly or through others"
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
-            problems.append(Claim("error", "leader-unknown", message, remedy, path))
+            problems.append(Finding("error", "leader-unknown", message, remedy, path))
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
     apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
     if parts > 1 and anchors is not None and reachable(links, rows, anchors.row)[linked].all():
-        yield Claim("note", "parts", f"{parts} formations, each of which is anchored", "", path)
+        yield Finding("note", "parts", f"{parts} formations, each of which is anchored", "", path)
     elif parts > 1 and apart:
         message = f"{parts} formations that know of each other only to keep clear"
-        yield Claim("note", "parts", message, "", path)
+        yield Finding("note", "parts", message, "", path)
     elif parts > 1:
         message = f"the network falls into {parts} parts that know nothing of each other"
-        problems.append(Claim("error", "parts", message, "join them by links, or make them separate experiments", path))
+        problems.append(
+            Finding("error", "parts", message, "join them by links, or make them separate experiments", path)
+        )
     isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
     if isolated:
         message = f"{join_names(isolated)} has no links: it takes no part in the formation"
-        problems.append(Claim("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
+        problems.append(Finding("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
     for name in leaders:
         if names.index(name) not in links.sender:
             message, remedy = f"no robot receives from the leader {name}", f'add "{name} > ..." for one of the others'
-            problems.append(Claim("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path))
+            problems.append(
+                Finding("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path)
+            )
     yield from problems
     if not problems:
         whole = "the network is whole; " if analysis.parts == 1 else ""
         reached = f"every robot is reached by {join_names(leaders)}"
         led = reached if leaders else "no leader: the formation finds its own place"
-        yield Claim("note", "connected", whole + led)
+        yield Finding("note", "connected", whole + led)
 
 
-def realisation(analysis: Analysis) -> Iterator[Claim]:
+def realisation(analysis: Analysis) -> Iterator[Finding]:
     """Check that the targets of links and anchors can be met with held heights, at the start and after changes."""
     shape = analysis.shape
     if shape is None:
         return
     if shape.worst <= OFF:
-        yield Claim("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
+        yield Finding("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
     else:
         yield from _unrealisable(analysis, shape)
     for number, later in _later_shapes(analysis):
@@ -90,7 +94,7 @@ def realisation(analysis: Analysis) -> Iterator[Claim]:
             worst = analysis.link(int(later.error.argmax()))
             message = f"the shape after this change cannot be met: at best, {worst} is {1e3 * later.worst:.1f} mm off"
             remedy = "change the other links with it, or by less; heights are held"
-            yield Claim(severity, "change-not-realisable", message, remedy, ("formation", "changes", number))
+            yield Finding(severity, "change-not-realisable", message, remedy, ("formation", "changes", number))
 
 
 def _asked(analysis: Analysis) -> str:
@@ -107,14 +111,14 @@ def _later_shapes(analysis: Analysis) -> list[tuple[int, Shape]]:
     return list(zip(sorted(range(len(given)), key=lambda k: given[k].at_s), analysis.later, strict=False))
 
 
-def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
+def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
     severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
     anchors = analysis.assignment.anchors
     if anchors is not None and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
         name = analysis.names[int(anchors.row[shape.anchored.argmax()])]
         message = f"{name} cannot keep the distance of its anchor: at best, it is {1e3 * shape.worst:.1f} mm off"
         remedy = "change it, or the links of this robot; it holds its height, and distances are in space"
-        yield Claim(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
+        yield Finding(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
         return
     off = f"at best, {analysis.link(int(shape.error.argmax()))} is {1e3 * shape.worst:.1f} mm off"
     rings = contradictions(analysis.asked.take(analysis.standing))
@@ -124,7 +128,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart; {off}"
         link = int(np.flatnonzero(analysis.standing)[ring.link])
         remedy = "give offsets of one drawing: those around a ring add up to zero"
-        yield Claim(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
+        yield Finding(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
     found = conflicts(analysis.asked.take(_measured(analysis)), np.nan_to_num(analysis.assignment.hover))
     heights = [each for each in found if math.isfinite(each.ceiling)]
     for high in list(dict.fromkeys(each.high for each in heights)):
@@ -136,7 +140,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         sides = _sides(analysis, conflict)
         message = f"{sides} make no triangle: the longest is longer than the others together; {off}"
         remedy = f"shorten {analysis.link(longest)}, or lengthen the other two"
-        yield Claim(severity, "no-triangle", message, remedy, analysis.link_path(longest))
+        yield Finding(severity, "no-triangle", message, remedy, analysis.link_path(longest))
     if not found and not rings:
         worst = [int(k) for k in np.argsort(-shape.error) if shape.error[k] > shape.worst / 2]
         at_fault = join_names(list(dict.fromkeys(_pair(analysis, k) for k in worst)))
@@ -144,7 +148,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Claim]:
         remedy = f"give {_asked(analysis)[4:]} that one drawing has, or fewer of them"
         if len(analysis.without_neighbours) > 1:
             remedy += "; the leaders' own places count as well"
-        yield Claim(severity, "not-realisable", message, remedy, analysis.link_path(worst[0]))
+        yield Finding(severity, "not-realisable", message, remedy, analysis.link_path(worst[0]))
 
 
 def _measured(analysis: Analysis) -> Mask:
@@ -172,16 +176,16 @@ def _sides(analysis: Analysis, conflict: Conflict) -> str:
     return ", ".join(sides.values())
 
 
-def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Claim:
+def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Finding:
     names = analysis.names
     subject = join_names([names[row] for row in conflict.high])
     held = max(float(np.nan_to_num(analysis.assignment.hover[row])) for row in conflict.high)
     message = f"{subject} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
     remedy = f"hover lower than {conflict.ceiling:.3f} m, or lengthen these links"
-    return Claim("error", "too-high", message, remedy, ("robots", names[conflict.high[0]], "hover"))
+    return Finding("error", "too-high", message, remedy, ("robots", names[conflict.high[0]], "hover"))
 
 
-def rigidity(analysis: Analysis) -> Iterator[Claim]:
+def rigidity(analysis: Analysis) -> Iterator[Finding]:
     """Check rigidity in the motions that the robots have."""
     planar, spatial = analysis.planar, analysis.spatial
     if planar is None or not analysis.standing.any() or analysis.parts > 1:
@@ -192,17 +196,17 @@ def rigidity(analysis: Analysis) -> Iterator[Claim]:
         asked = {"the distances": "every distance"}.get(_asked(analysis), _asked(analysis))
         message = f"the formation is not rigid, {rank}: it can change its shape and still meet {asked}"
         remedy = f"add {more} link{'s' * (more > 1)} at least, between robots that are not linked yet"
-        yield Claim("warning", "not-rigid", message, remedy, ("formation", "links"))
+        yield Finding("warning", "not-rigid", message, remedy, ("formation", "links"))
     else:
         flying = (
             ""
             if spatial is None or spatial.rigid
             else f"; in space {spatial.rank} of {spatial.needed}, not needed while heights are held"
         )
-        yield Claim("note", "rigid", f"the formation is rigid, {rank}{flying}")
+        yield Finding("note", "rigid", f"the formation is rigid, {rank}{flying}")
 
 
-def presence(analysis: Analysis) -> Iterator[Claim]:
+def presence(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network stays connected along the predicted motion while links come and go."""
     pattern, prediction = analysis.pattern, analysis.prediction
     there = pattern.present(prediction.time, prediction.position)
@@ -214,7 +218,7 @@ def presence(analysis: Analysis) -> Iterator[Claim]:
     count = there.sum(axis=1)
     if not len(broken):
         message = f"links come and go, {count.min()} to {count.max()} at a time, and the network is always whole"
-        yield Claim("note", "whole", message)
+        yield Finding("note", "whole", message)
         return
     first = int(broken[0])
     end = float(prediction.time[begins[first + 1]]) if first + 1 < len(begins) else analysis.experiment.duration_s
@@ -225,7 +229,7 @@ def presence(analysis: Analysis) -> Iterator[Claim]:
     near = analysis.experiment.formation.proximity is not None
     remedy = "start nearer to each other, or give a longer range" if near else "let links overlap in time"
     path: Path = ("formation", "proximity", "range") if near else ("formation", "links")
-    yield Claim("warning", "comes-apart", message, remedy, path)
+    yield Finding("warning", "comes-apart", message, remedy, path)
 
 
 def _runs(there: Mask) -> Mask:
@@ -233,14 +237,14 @@ def _runs(there: Mask) -> Mask:
     return np.asarray(there[np.concatenate([[True], (there[1:] != there[:-1]).any(axis=1)])])
 
 
-def redundancy(analysis: Analysis) -> Iterator[Claim]:
+def redundancy(analysis: Analysis) -> Iterator[Finding]:
     """Report the single links and robots that the formation can lose and stay rigid."""
     spare = analysis.spare
     if spare is None or analysis.parts > 1:
         return
     links = _lost("link", spare.pairs, [analysis.pair(int(k)) for k in np.flatnonzero(~spare.pairs)])
     robots = _lost("robot", spare.robots, [analysis.names[int(row)] for row in np.flatnonzero(~spare.robots)])
-    yield Claim("note", "redundancy", f"{links}; {robots}")
+    yield Finding("note", "redundancy", f"{links}; {robots}")
 
 
 def _lost(what: str, spare: Mask, needed: list[str]) -> str:
@@ -266,7 +270,7 @@ def strength(analysis: Analysis) -> str:
     return f"the law's own parameters ({', '.join(plugin.__struct_fields__) or 'it has none yet'})"
 
 
-def stability(analysis: Analysis) -> Iterator[Claim]:
+def stability(analysis: Analysis) -> Iterator[Finding]:
     """Check that the sampled loop is stable near the shape."""
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF:
@@ -279,7 +283,7 @@ def stability(analysis: Analysis) -> Iterator[Claim]:
         what = f"for {bad} no number" if bad else "numbers that jump between neighbouring places"
         message = f"the law '{choice}' gives {what} where the formation is met"
         remedy = "look for a length of 0 and for fields of `links` that are NaN (docs/plugins.md)"
-        yield Claim("error", "not-finite", message, remedy, ("formation", "law"))
+        yield Finding("error", "not-finite", message, remedy, ("formation", "law"))
         return
     name = "gain" if _measured(analysis).any() or not analysis.standing.any() else "stiffness"
     path, gain = ("formation", name), float(getattr(formation, name))
@@ -290,14 +294,14 @@ def stability(analysis: Analysis) -> Iterator[Claim]:
         calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
         path = ("formation", "law")
     if loop.gain >= HUNTS:
-        yield Claim("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
+        yield Finding("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:
         message = f"the formation drifts away from its shape: an error grows by {loop.radius:.4f} with every decision"
         remedy = "give more links both ways; a ring of one-way links can turn for ever"
-        yield Claim("error", "unstable", message, remedy, ("formation", "links"))
+        yield Finding("error", "unstable", message, remedy, ("formation", "links"))
     elif loop.gain > RINGS:
-        yield Claim(
+        yield Finding(
             "warning", "rings", f"the formation rings: {took}, and its sign changes before it fades", calm, path
         )
     else:
-        yield Claim("note", "stable", f"the loop settles: {took}, less than {RINGS:g}")
+        yield Finding("note", "stable", f"the loop settles: {took}, less than {RINGS:g}")

@@ -19,7 +19,6 @@ from experiments.definition.experiment import Arena, Part
 from experiments.file import structure
 from experiments.file import text as syntax
 from experiments.file.consistency import arena_faults
-from experiments.file.overrides import merged
 from experiments.file.problems import Fault, Text, refusal
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
@@ -53,14 +52,6 @@ def arena_file_name(document: Mapping[str, Any]) -> str | None:
     arena = document.get("arena")
     name = arena.get("file") if isinstance(arena, dict) else None
     return name if isinstance(name, str) else None
-
-
-def with_arena_file(document: Mapping[str, Any], file: ArenaFile | None) -> dict[str, Any]:
-    """Merge an arena file into the [arena] of a document, which then names no file."""
-    if file is None:
-        return dict(document)
-    own = {key: value for key, value in document["arena"].items() if key != "file"}
-    return {**document, "arena": merged(file.table, own, ("arena",))}
 
 
 def load(name: str, folder: Path) -> ArenaFile:

@@ -213,7 +213,7 @@ def _resolved(file: Path, source: Source, content: _Table) -> tuple[dict[str | N
 
 
 def _with_arena_file(file: Path, source: Source, document: _Table, case: str | None) -> _Table:
-    """Merge the arena file of a document."""
+    """Merge the arena file into the [arena] of a document, which then names no file."""
     name, files = arena_file.arena_file_name(document), source.arenas
     if name is None:
         return document
@@ -224,7 +224,8 @@ def _with_arena_file(file: Path, source: Source, document: _Table, case: str | N
         path = error.fault.path if case is None else ("cases", case, *error.fault.path)
         source.refuse([replace(error.fault, path=path)])
         raise
-    return deepcopy(arena_file.with_arena_file(document, own))
+    table = {key: value for key, value in document["arena"].items() if key != "file"}
+    return deepcopy({**document, "arena": merged(own.table, table, ("arena",))})
 
 
 def _unused(override: Override, known: Sequence[str]) -> Problem:

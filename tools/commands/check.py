@@ -30,7 +30,8 @@ from tools.commands.options import (
 
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
-    from experiments.check.check import Figures, Finding
+    from experiments.check.check import Figures
+    from experiments.check.findings import Finding
     from experiments.file.document import Document
     from experiments.file.reference import Entry
     from experiments.real_time.conductor.preflight_checks import RobotChecks
@@ -207,7 +208,7 @@ def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figur
 
 
 def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
-    from experiments.check.check import MARK, ORDER
+    from experiments.check.findings import MARK
 
     width = _width()
     lines = [f"{given.path}: {given.experiment.title}", ""]
@@ -219,7 +220,7 @@ def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str
                 remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
             )
     lines += ["", *_rows(numbers), ""]
-    count = {severity: sum(each.severity == severity for each in found) for severity in ORDER}
+    count = {severity: sum(each.severity == severity for each in found) for severity in MARK}
     lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
     _print_text("\n".join(lines))
 
