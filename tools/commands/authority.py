@@ -158,20 +158,9 @@ def _found(folder: Path) -> Authority:
     # a name of its own: with that of the one before, which of the two signed would be found out by trying
     title = f"zenpark {folder.name[:MOST_OF_NAME]} {now:%Y-%m-%d %H:%M:%S.%f}"
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - CLOCKS)
-        .not_valid_after(now + timedelta(days=AUTHORITY_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs=True), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    _write(folder / f"{AUTHORITY}.key", _private(key), 0o600)
-    _write(folder / f"{AUTHORITY}.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    builder = _builder(name, name, key, now, now + timedelta(days=AUTHORITY_DAYS), signs=True)
+    certificate = builder.sign(key, hashes.SHA256())
+    _write_pair(folder / AUTHORITY, key, certificate)
     return Authority(folder, certificate, key)
 
 
@@ -219,31 +208,30 @@ def _certified(authority: Authority, name: str, identity: Identity, days: float)
     now = datetime.now(UTC)
     end = min(now + timedelta(days=days), authority.certificate.not_valid_after_utc)
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if identity.hosts else [])]
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)]))
-        .issuer_name(authority.certificate.subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, end) - CLOCKS)
-        .not_valid_after(end)
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-    )
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, identity.common_name)])
+    builder = _builder(subject, authority.certificate.subject, key, min(now, end), end, signs=False)
+    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
     if identity.hosts:
         names = x509.SubjectAlternativeName([_alternative(host) for host in identity.hosts])
         builder = builder.add_extension(names, critical=False)
     certificate = builder.sign(authority.key, hashes.SHA256())
-    _write(authority.folder / f"{name}.key", _private(key), 0o600)
-    _write(authority.folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    _write_pair(authority.folder / name, key, certificate)
     return msgspec.structs.replace(
         identity, serial=f"{certificate.serial_number:x}", until=end.isoformat(timespec="seconds")
     )
 
 
-def _usage(*, signs: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    begin: datetime,
+    end: datetime,
+    *,
+    signs: bool,
+) -> x509.CertificateBuilder:
+    """A certificate of the authority itself, which `signs` others, or of an identity."""
+    usage = x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,
         crl_sign=signs,
@@ -253,6 +241,17 @@ def _usage(*, signs: bool) -> x509.KeyUsage:
         key_agreement=False,
         encipher_only=False,
         decipher_only=False,
+    )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begin - CLOCKS)
+        .not_valid_after(end)
+        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
+        .add_extension(usage, critical=True)
     )
 
 
@@ -267,10 +266,13 @@ def _alternative(host: str) -> x509.GeneralName:
     return x509.DNSName(host)
 
 
-def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+def _write_pair(place: Path, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+    """Write a key and its certificate."""
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    _write(
+        place.with_name(f"{place.name}.key"), key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain), 0o600
     )
+    _write(place.with_name(f"{place.name}.pem"), certificate.public_bytes(pem), 0o644)
 
 
 def _write(file: Path, content: bytes, mode: int) -> None:

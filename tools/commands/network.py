@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Final
@@ -213,17 +214,12 @@ class Cadence:
     """Counts samples per key, window by window; an interval belongs to the window in which it ends."""
 
     _last: dict[str, float] = field(default_factory=dict)
-    _intervals: dict[str, list[float]] = field(default_factory=dict)
-    _sizes: dict[str, list[int]] = field(default_factory=dict)
+    _samples: defaultdict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, key: str, stamp: float, size: int) -> None:
         """A sample of `size` bytes, stamped [s]."""
-        if key in self._last:
-            self._intervals[key].append(stamp - self._last[key])
-        else:
-            self._intervals[key], self._sizes[key] = [], []
+        self._samples[key].append((stamp - self._last.get(key, math.nan), size))
         self._last[key] = stamp
-        self._sizes[key].append(size)
 
     def window(self, length_s: float) -> list[Rate]:
         """The rates of the window of this length that ends now, by key; the next window begins."""
@@ -231,19 +227,10 @@ class Cadence:
 
         rates = []
         for key in sorted(self._last):
-            gaps, sizes = self._intervals[key], self._sizes[key]
-            rates.append(
-                Rate(
-                    key,
-                    len(sizes) / length_s,
-                    sum(sizes) / length_s,
-                    statistics.fmean(gaps) if gaps else math.nan,
-                    statistics.pstdev(gaps) if gaps else math.nan,
-                    min(gaps, default=math.nan),
-                    max(gaps, default=math.nan),
-                )
-            )
-            self._intervals[key], self._sizes[key] = [], []
+            samples = self._samples.pop(key, [])
+            gaps = [gap for gap, _ in samples if not math.isnan(gap)]
+            times = [of(gaps) if gaps else math.nan for of in (statistics.fmean, statistics.pstdev, min, max)]
+            rates.append(Rate(key, len(samples) / length_s, sum(size for _, size in samples) / length_s, *times))
         return rates
 
 
