@@ -64,7 +64,9 @@ def report(
         form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
         return _report_sweep(Path(runs[0]), out, width, metrics, form, as_json=as_json)
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
-    _refuse_labels(labels, runs)
+    if len(labels) != len(runs):
+        message = f"{len(labels)} labels for {len(runs)} runs"
+        raise refusal("--label", message, "give one for each run, in their order")
     read = [reopen_seeds(folder) for folder in runs]
     for folder, seeds in zip(runs, read, strict=True):
         if not seeds[0].traces:
@@ -163,15 +165,6 @@ def _report_sweep(
     figures = target / "figures"
     print_result({"figures": figures, "cells": len(rows)}, str(figures), as_json=as_json)
     return 0
-
-
-def _refuse_labels(labels: Sequence[str], runs: Sequence[str]) -> None:
-    """Raise DocumentError unless each run has a label."""
-    from experiments.file.problems import refusal
-
-    if len(labels) != len(runs):
-        message = f"{len(labels)} labels for {len(runs)} runs"
-        raise refusal("--label", message, "give one for each run, in their order")
 
 
 def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
@@ -435,30 +428,23 @@ def runs(
     as_json: AsJson = False,
 ) -> None:
     """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
-    if past or words or below:
-        return _show_past(words or [], below, as_json=as_json)
-    return _show_running(as_json=as_json)
-
-
-def _show_running(*, as_json: bool) -> None:
     import msgspec
 
     from agents.runtime import run_registry
 
+    if past or words or below:
+        return _show_past(words or [], below, as_json=as_json)
     found = run_registry.runs()
-    if as_json:
-        print_json([{**msgspec.to_builtins(run), "alive": run.alive} for run in found])
-        return
+    lines = []
     for run in found:
         since = time.strftime("%H:%M:%S", time.localtime(run.since))
         died = "" if run.alive else "; its process has died"
-        print(f"{run.title}  since {since}, pid {run.pid}, at {run.where}, realm {run.realm}{died}")
-        if run.folder:
-            print(f"  {run.folder}")
-        if run.robots:
-            print("  " + ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items()))
-    if not found:
-        print("no run is up on this machine")
+        lines.append(f"{run.title}  since {since}, pid {run.pid}, at {run.where}, realm {run.realm}{died}")
+        robots = ", ".join(f"{name} ({body})" if body else name for name, body in run.robots.items())
+        lines += [f"  {each}" for each in (run.folder, robots) if each]
+    shown = [{**msgspec.to_builtins(run), "alive": run.alive} for run in found]
+    print_result(shown, *(lines or ["no run is up on this machine"]), as_json=as_json)
+    return None
 
 
 def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:

@@ -28,6 +28,7 @@ from tools.commands.options import (
     check_bodies,
     example,
     print_json,
+    print_result,
     warn,
 )
 from tools.commands.results import summary, write_figures_of_merit, write_report
@@ -119,10 +120,10 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
     from experiments.file.document import load
     from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
+    from experiments.report import verdict
 
     read = load(origin.file, *origin.changes)
-    _refuse(options, virtual=origin.virtual, seeds=origin.seeds)
-    _refuse_view(show, virtual=origin.virtual, seeds=origin.seeds)
+    _refuse(options, show, virtual=origin.virtual, seeds=origin.seeds)
     if not sound(read, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
     folder = new_folder(read, show.out)
@@ -144,7 +145,9 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         _write(runs, folder, show)
         if stopped:
             print(f"zenpark: {stopped}", file=sys.stderr)
-        code = code or _report_failures(runs)
+        if not code and (failures := verdict.failures([case for each in runs for case in each.metrics.values()])):
+            warn([finding.text for finding in failures])
+            code = FAILED
         return code if former is None else max(code, _print_differences(folder, former))
     finally:
         remove_unused(folder)
@@ -222,27 +225,6 @@ def _print_differences(folder: Path, former: Path) -> int:
     return int(bool(found))
 
 
-def _report_failures(runs: Sequence[Run]) -> int:
-    """Print which robots did not do their part; returns the exit code."""
-    from experiments.report import verdict
-
-    found = verdict.failures([case for each in runs for case in each.metrics.values()])
-    warn([finding.text for finding in found])
-    return FAILED if found else 0
-
-
-def _refuse_view(show: _Shown, *, virtual: bool, seeds: int) -> None:
-    """Raise DocumentError for a view that there cannot be, before anything is started."""
-    from experiments.file.problems import refusal
-
-    if show.pace is not None and not (virtual and show.view):
-        raise refusal("--pace", "is for --virtual --view", "add both, or leave it out")
-    if show.view:
-        viewing.require_viser()
-        if seeds > 1:
-            raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
-
-
 def _simulate(read: Document, folder: Path, options: RunOptions, seeds: int, watch: Watch) -> list[Run]:
     """Run in virtual time, one run for each seed from the file's on."""
     from experiments.run import simulate_seeds
@@ -296,16 +278,14 @@ def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
 
     write_figures_of_merit(runs, folder)
     page = write_report(runs, folder) if show.report else None
-    if show.as_json:
-        print_json(summary(runs))
-    else:
-        _print(runs, summary(runs), page)
+    found = summary(runs)
+    print_result(found, *_lines(runs, found, page), as_json=show.as_json)
     if show.open_report and page is not None:
         webbrowser.open(page.resolve().as_uri())
 
 
-def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
-    """Raises DocumentError for options that do not go together."""
+def _refuse(options: RunOptions, show: _Shown, *, virtual: bool, seeds: int) -> None:
+    """Raise DocumentError for options that do not go together, before anything is started."""
     from experiments.file.problems import refusal
 
     if seeds > 1 and not virtual:
@@ -315,6 +295,12 @@ def _refuse(options: RunOptions, *, virtual: bool, seeds: int) -> None:
     for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
             raise refusal(option, "is for real time", "leave out --virtual")
+    if show.pace is not None and not (virtual and show.view):
+        raise refusal("--pace", "is for --virtual --view", "add both, or leave it out")
+    if show.view:
+        viewing.require_viser()
+        if seeds > 1:
+            raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
 def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool) -> bool:
@@ -357,28 +343,23 @@ def _command(origin: RunOrigin, options: RunOptions) -> str:
     return " ".join([*parts, *(["--anyway"] if origin.anyway else [])])
 
 
-def _print(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> None:
-    """Print the results in a few lines."""
+def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Iterator[str]:
+    """The results in a few lines."""
     from experiments.report import verdict
 
-    for finding in verdict.interruptions([case for each in runs for case in each.metrics.values()]):
-        print(finding.text)
-    for name in found["cases"]:
-        print(_case_line(name, runs, found))
     cases = [case for each in runs for case in each.metrics.values()]
+    yield from (finding.text for finding in verdict.interruptions(cases))
+    yield from (_case_line(name, runs, found) for name in found["cases"])
     if any(case.leaders for case in cases):
-        print(verdict.left_out(cases))
-    for finding in verdict.contacts(cases):
-        if finding.mark == "bad":
-            print(finding.text)
+        yield verdict.left_out(cases)
+    yield from (finding.text for finding in verdict.contacts(cases) if finding.mark == "bad")
     if len(runs) > 1:
-        print(f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)")
-    for note in runs[0].notes:
-        print(f"note: {note}")
-    print(f"run: {runs[0].folder}")
+        yield f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)"
+    yield from (f"note: {note}" for note in runs[0].notes)
+    yield f"run: {runs[0].folder}"
     if page is not None:
-        print(f"report: {page}")
-    print(f"replay in the browser: ./zenpark view {runs[0].folder}")
+        yield f"report: {page}"
+    yield f"replay in the browser: ./zenpark view {runs[0].folder}"
 
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
