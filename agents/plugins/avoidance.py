@@ -106,28 +106,11 @@ class Potential(Avoidance, frozen=True):
     """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from near things.
 
     Each thing k within d0 pushes with F_k = η (1/d_k − 1/d0) / d_k² along the horizontal unit vector from it to the
-    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k. The paper leaves open:
-
-    - d is measured from surface to surface, so that robots of any radii keep the same gap (a range reading of a Khepera
-      is counted from its edge as well). F points away from the thing's axis.
-    - h, "the period of the controller", is the time in which the body closes an error of position, 1/response: that is
-      the shift that makes the body move at v along F. (A shift of a tick of 10 ms times v would be millimetres.)
-    - v is the robot's own speed limit unless given, and the goal is first brought as near as that limit lets the robot
-      go anyway: so no goal, however far behind the thing it lies, pulls harder than the thing pushes.
-    - η has no influence after the normalisation of (4); it is kept to compare forces.
-
-    Two additions, without which 4 of 120 pairs on wheels waited for ever:
-
-    - By (4) the push jumps to its full size at d0. Robots on wheels cannot follow a goal that jumps to and fro there:
-      they change ends in place. In a layer of `LAYER` it grows in proportion to ‖F‖ instead (Slotine and Sastry,
-      "Tracking control of non-linear systems using sliding surfaces", Int. J. Control 38(2), 1983).
-    - Where pull and push are opposite, no way around is sought. The part of the pull against F therefore also pulls
-      aside, by `ASIDE`, to the side on which the goal lies; straight ahead, or nearly so, to the right, so that two
-      that meet pass each other (a vortex field: De Luca and Oriolo, "Local incremental planning for nonholonomic
-      mobile robots", ICRA 1994).
-
-    There is no guarantee: a robot can be caught between two pushes, and things behind it may be nearer than those that
-    push it.
+    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k; d is measured from surface to surface. In a layer of
+    `LAYER` below d0 the shift grows in proportion to ‖F‖ (Slotine and Sastry, "Tracking control of non-linear systems
+    using sliding surfaces", Int. J. Control 38(2), 1983), and the part of the pull against F also pulls aside, by
+    `ASIDE` (a vortex field: De Luca and Oriolo, "Local incremental planning for nonholonomic mobile robots", ICRA
+    1994). docs/plugins.md says why, and how what the paper leaves open is read.
     """
 
     reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
