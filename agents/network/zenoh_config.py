@@ -57,7 +57,11 @@ def settings(
     there is no lab, or the lab has no such identity, or its router no rights to enforce.
     """
     for endpoint in (*connect, *listen):
-        _check_form(endpoint)
+        protocol, slash, address = endpoint.partition("/")
+        if not (protocol and slash and address and endpoint.isprintable()):
+            raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
+        if why := refusal(lab.bare([endpoint])[0]):
+            raise EndpointError(why)
     try:
         of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
     except lab.LabError as error:
@@ -112,14 +116,6 @@ def _of_lab(
         settings["low_pass_filter"] = access_control.sizes(rights)
         settings["transport/link/rx/max_message_size"] = MOST_BYTES
     return settings, folder
-
-
-def _check_form(endpoint: str) -> None:
-    protocol, slash, address = endpoint.partition("/")
-    if not (protocol and slash and address and endpoint.isprintable()):
-        raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
-    if why := refusal(lab.bare([endpoint])[0]):
-        raise EndpointError(why)
 
 
 def check_loopback(endpoint: str) -> None:

@@ -136,13 +136,9 @@ def _by_distance(offset: Array, links: Links, dead_zone: float) -> Array:
     """½ μ (d² − ‖x‖²) x of each link (E, 3); within the dead zone 0, beyond it as if ‖x‖ were nearer to d by it."""
     square = np.asarray(np.vecdot(offset, offset))
     if dead_zone > 0.0:
-        length = np.sqrt(square)
-        square = (links.distance - _beyond_dead_zone(links.distance - length, dead_zone)) ** 2
+        error = links.distance - np.sqrt(square)
+        square = (links.distance - (error - clamp(error, -dead_zone, dead_zone))) ** 2
     return np.asarray((0.5 * links.gain * (links.distance**2 - square))[:, None] * offset)
-
-
-def _beyond_dead_zone(error: Array, dead_zone: float) -> Array:
-    return np.asarray(error - clamp(error, -dead_zone, dead_zone))
 
 
 def _by_relative(offset: Array, links: Links) -> Array:

@@ -167,7 +167,11 @@ class Runtime:
         failures: list[Exception] = []
         if self._in_the_air(failures) and (self.agent.lifecycle.phase < Phase.DONE).any():  # else it was stopped
             error = sys.exception()
-            why = "it did not land in time" if error is None else f"its control loop broke: {_error_text(error)}"
+            why = (
+                "it did not land in time"
+                if error is None
+                else f"its control loop broke: {type(error).__name__}: {error}"
+            )
             self._watchdog.call_for_help(why)
             self._order_down(self._body.land, max(FAREWELL_S, self._descent_s))
         if failures:
@@ -563,7 +567,3 @@ def _noted(failures: list[Exception]) -> Iterator[None]:
         yield
     except Exception as error:  # noqa: BLE001
         failures[:] = failures or [error]
-
-
-def _error_text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"

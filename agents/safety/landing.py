@@ -92,15 +92,11 @@ class Landing:
         nearest = int(mine[self._apart[mine].argmin()])
         return f"{self._assignment.robots[links.sender[nearest]]}; it goes aside first"
 
-    def _under(self, row: Index | int, state_z: Array | float, place: Array, lost: Mask) -> Mask:
-        """Places (E, 3) of robots under rows, or beside them: lost ones may have come down."""
-        return np.asarray((place[:, 2] <= state_z + self._height[row]) | lost)
-
     def _must_wait(self, state: BodyState, place: Array, lost: Mask) -> Mask:
         """Rows (N,) that would land on a robot, or still move."""
         row = self._receiver
         gap = norm(state.position[row, :2] - place[:, :2]) - self._radius[row] - self._their_radius
-        under = self._under(row, state.position[row, 2], place, lost)
+        under = (place[:, 2] <= state.position[row, 2] + self._height[row]) | lost  # lost ones may have come down
         self._apart = np.where(under & np.isfinite(gap), gap, np.inf)
         moving = self.aside & (norm(state.velocity) > SLOW)
         # a row on its way aside goes on until it has more room than would have sent it
