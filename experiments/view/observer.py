@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, nan
@@ -204,7 +204,7 @@ class Observer:
         now, stage = time.monotonic(), self.stage
         reports = [self.robots[name] for name in stage.names]
         states = [report.state for report in reports]
-        position = _vectors([None if s is None else s.true_position or s.position for s in states])
+        position = _rows([None if s is None else s.true_position or s.position for s in states])
         elapsed = self.elapsed
         error = self._tracker.errors(elapsed, position)
         self._trail.add(now, position)
@@ -214,7 +214,7 @@ class Observer:
         return Moment(
             position=position,
             yaw=np.array([_number(None if s is None else s.yaw if s.true_yaw is None else s.true_yaw) for s in states]),
-            goal=_vectors(under_way),
+            goal=_rows(under_way),
             condition=np.array(conditions, dtype=np.intp),
             silent_for=np.array([now - report.sent_at for report in reports]),
             error=error,
@@ -222,7 +222,7 @@ class Observer:
             obstacles=stage.obstacles_at(elapsed or 0.0, self.world),
             trail=self._trail.points,
             attitude=_rows([None if s is None else s.attitude for s in states], 4),
-            shadow=_rows([None if s is None else s.shadow_position for s in states], 3),
+            shadow=_rows([None if s is None else s.shadow_position for s in states]),
             shadow_yaw=np.array([_number(None if s is None else s.shadow_yaw) for s in states]),
             time=elapsed,
         )
@@ -232,12 +232,6 @@ def _number(value: float | None) -> float:
     return nan if value is None else value
 
 
-def _vectors(values: list[messages.Vector | None]) -> Array:
-    return np.array([(nan, nan, nan) if each is None else each for each in values], dtype=float).reshape(-1, 3)
-
-
-def _rows(values: list[tuple[float, ...] | None], width: int) -> Array | None:
-    """Optional vectors as rows (N, width); None if there is none."""
-    if not any(values):
-        return None
-    return np.array([(nan,) * width if each is None else each for each in values], dtype=float)
+def _rows(values: Sequence[tuple[float, ...] | None], width: int = 3) -> Array:
+    """Optional vectors as rows (N, width)."""
+    return np.array([(nan,) * width if each is None else each for each in values], dtype=float).reshape(-1, width)

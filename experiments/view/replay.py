@@ -50,7 +50,6 @@ class Film:
         trail = np.stack([track.positions(t - self._ages) for track in tracks])
         position = trail[:, 0]
         conditions = np.array([_condition(track, k, t) for track, k in zip(tracks, at, strict=True)], dtype=np.intp)
-        attitude, shadow = _taken(tracks, at, "attitude", 4), _taken(tracks, at, "shadow", 3)
         goal = _taken(tracks, at, "goal", 3)
         goal[np.isin(conditions, (Condition.WAITING, Condition.DONE))] = nan
         return Moment(
@@ -63,8 +62,8 @@ class Film:
             broken=self.stage.broken_links(conditions, [_last_status(track.statuses, t) for track in tracks]),
             obstacles=self.stage.obstacles_at(t, _last_status(self.tracks.world, t)),
             trail=trail,
-            attitude=attitude if np.isfinite(attitude).any() else None,
-            shadow=shadow if np.isfinite(shadow).any() else None,
+            attitude=_taken(tracks, at, "attitude", 4),
+            shadow=_taken(tracks, at, "shadow", 3),
             shadow_yaw=_taken(tracks, at, "shadow_yaw", 1)[:, 0],
             time=t,
         )

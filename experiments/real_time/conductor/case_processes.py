@@ -57,11 +57,7 @@ class CaseProcesses:
         self._abroad: dict[str, Process] = {}  # by host and group
 
     def prepare(self, *, recorder: bool = True) -> None:
-        """Start all but router and robots: the recorder, if one is wanted, then what robots need.
-
-        Raises:
-            StandInError: If a protocol twin or a positioning system does not start in time.
-        """
+        """Start all but router and robots: the recorder, if one is wanted, then what robots need."""
         context = self._context
         if recorder:
             files = str(context.file), str(context.recording)

@@ -98,11 +98,7 @@ def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision
 
 
 def embody(read: Document, staging: RunOptions) -> dict[str, Experiment]:
-    """The chosen cases of an experiment, with the bodies and on the machines that are asked for.
-
-    Raises:
-        DocumentError: If there is no such case, or robots that run on hosts are to be put behind protocol twins.
-    """
+    """The chosen cases of an experiment, with the bodies and on the machines that are asked for."""
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
         raise refusal("--bodies protocol", "protocol twins cannot be seen from hosts", hint)

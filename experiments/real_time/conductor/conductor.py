@@ -95,11 +95,7 @@ class Conductor(CaseRun):
     """Runs one case."""
 
     def run(self) -> CaseResult:
-        """Run the case to its end, or until the user interrupts it; the robots are down in any case.
-
-        Raises:
-            RunFailed: If robots are not ready in time and the file says that the run must not go on without them.
-        """
+        """Run the case to its end, or until the user interrupts it; the robots are down in any case."""
         began = time.monotonic()
         self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
         clocks = self._context.hosts.join(self._experiment)

@@ -34,11 +34,7 @@ class Spares:
         self.used = {}
 
     def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
-        """The robot with the name `name` from now on, and the name of the spare, if it is one.
-
-        Raises:
-            Refused: If there is no such spare or body, or it cannot be what `robot` was.
-        """
+        """The robot with the name `name` from now on, and the name of the spare, if it is one."""
         spare = order.spare
         if spare is None and order.body is None:
             spare = self._first_spare(name, robot.kind)

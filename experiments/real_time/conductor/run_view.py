@@ -117,11 +117,7 @@ class NetworkView:
     """The network as the conductor of a case sees it."""
 
     def __init__(self, stack: ExitStack, context: CaseContext, progress: Progress) -> None:
-        """Join the network; `stack` leaves it.
-
-        Raises:
-            Unreachable: If no router answers.
-        """
+        """Join the network; `stack` leaves it."""
         self.clock, self.robots, self._progress = progress.clock, progress.robots, progress
         self._launcher, self._begun = context.launcher, time.monotonic()
         experiment, endpoints = context.experiment, context.endpoints

@@ -79,9 +79,6 @@ class Station:
             launcher: Starts the ssh, and keeps its lifeline.
             routers: As this machine reaches them; those on loopback go through this connection. Of a lab, if any is.
             run: By which the station finds the run's processes.
-
-        Raises:
-            HostError: If a router cannot be reached through ssh.
         """
         assert host.address is not None
         self.name, self.host, self.address = name, host, host.address
@@ -126,9 +123,6 @@ class Station:
 
         Args:
             address: How hosts know this machine; left out: as ssh came from there.
-
-        Raises:
-            HostError: If the host cannot be reached, or zenpark does not run there.
         """
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
         ports = iter(ssh.allocated(self.process.output))
@@ -147,11 +141,7 @@ class Station:
         return router.at(here) if router.is_wildcard else router
 
     def ask(self, question: Question, limit_s: float = ANSWER_S) -> tuple[Answer, float, float]:
-        """The answer, when the question left, and when the answer was here, UTC [s].
-
-        Raises:
-            HostError: If none comes in time.
-        """
+        """The answer, when the question left, and when the answer was here, UTC [s]."""
         if self._silent or self._out.closed or self._in.closed:
             raise HostError(self._broken())  # its end was noticed before
         deadline = time.monotonic() + limit_s
@@ -205,12 +195,7 @@ class Station:
         return self.ask(Question("certificates", lab=self.folder, names=list(names)))[0].holds
 
     def distrusted(self, names: Sequence[str]) -> list[str]:
-        """Reasons why its robots and a router would refuse each other, in a lab, each with its remedy.
-
-        Raises:
-            HostError: If it does not answer.
-            LabError: If the register of the lab cannot be read.
-        """
+        """Reasons why its robots and a router would refuse each other, in a lab, each with its remedy."""
         if self.lab is None:
             return []
         answer = self.ask(Question("certificates", lab=self.folder, names=list(names)))[0]
@@ -258,11 +243,7 @@ class Hosts:
         self.by_robot: dict[str, Station] = {}  # of the case
 
     def join(self, experiment: Experiment) -> list[HostClock]:
-        """Connect the hosts of a case that have robots and an address; return their clocks.
-
-        Raises:
-            HostError: With all obstacles of every host.
-        """
+        """Connect the hosts of a case that have robots and an address; return their clocks. Errors name all obstacles."""
         wanted = {name: host for name, host in experiment.hosts.items() if host.address is not None and host.robots}
         fresh = []
         for name, host in wanted.items():

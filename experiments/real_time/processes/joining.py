@@ -50,12 +50,7 @@ class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     lifeline: Annotated[bool, msgspec.Meta(description="end when standard input ends or is silent")] = False
 
     def read(self) -> tuple[Experiment, list[str]]:
-        """The chosen case of the file, and the routers to use.
-
-        Raises:
-            DocumentError: If the file is wrong, or has no such case.
-            EndpointError: If a router cannot be used.
-        """
+        """The chosen case of the file, and the routers to use."""
         read = document.read(self.file)
         experiment = chosen_case(read, self.case)
         return experiment, router_endpoints(experiment, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]

@@ -113,11 +113,7 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
 
 
 def read_experiment() -> str:
-    """The first line of standard input; the following ones belong to the lifeline.
-
-    Raises:
-        DocumentError: If none comes in time.
-    """
+    """The first line of standard input; the following ones belong to the lifeline."""
     deadline = time.monotonic() + EXPERIMENT_S
     waiting = select.poll()
     waiting.register(0, select.POLLIN)

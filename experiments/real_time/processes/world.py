@@ -78,8 +78,8 @@ class WorldProcess:
         self._pace = Pace()
         self.paused = False
         names = zip(population.names, population.carried.tolist(), strict=True)
-        self._carried = [name for name, here in names if here]
-        self._farewell = Farewell(session, self._keys, self._carried, lost)
+        self.carried = [name for name, here in names if here]
+        self._farewell = Farewell(session, self._keys, self.carried, lost)
 
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
@@ -165,7 +165,7 @@ class WorldProcess:
             factor=round(self._pace.factor, 4),
             load=round(self._pace.load, 4),
             paused=self.paused,
-            robots=self._carried,
+            robots=self.carried,
             mirrored=exchange.mirrored(),
             obstacles=[messages.ObstaclePose(name, pose) for name, pose in population.obstacles().items()],
             contacts=exchange.contacts,
@@ -214,19 +214,17 @@ def serve(launch: WorldLaunch) -> int:
         world = WorldProcess(experiment, population, joint.session, lost, ownership=own, endpoints=endpoints)
         joint.declared.append(world)
         back = world.exchange.restore_positions(there)
-        print(_ready(experiment, population, endpoints, back), flush=True)
+        print(_ready(experiment, world.carried, endpoints, back), flush=True)
         world.run(over)
     return 0
 
 
-def _ready(experiment: Experiment, population: Population, endpoints: Sequence[str], back: Sequence[str]) -> str:
-    parted: tuple[list[str], list[str]] = ([], [])
-    for name, here in zip(population.names, population.carried.tolist(), strict=True):
-        parted[0 if here else 1].append(name)
-    carried, mirrored = (", ".join(names) or "none" for names in parted)
+def _ready(experiment: Experiment, carried: Sequence[str], endpoints: Sequence[str], back: Sequence[str]) -> str:
+    mirrored = ", ".join(name for name in experiment.robots if name not in carried) or "none"
     return (
         f"world ready: {registry.split(experiment.world.engine)[0]} at {experiment.rates.body_hz:g} Hz "
-        f"carries {carried}; mirrors {mirrored}; realm {experiment.network.realm} at {', '.join(endpoints)}"
+        f"carries {', '.join(carried) or 'none'}; mirrors {mirrored}; "
+        f"realm {experiment.network.realm} at {', '.join(endpoints)}"
         + (f"; {', '.join(back)} where they were" if back else "")
     )
 

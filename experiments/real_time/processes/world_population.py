@@ -117,11 +117,7 @@ class Population:
     # ------------------------------------------------------------------ back to the start
 
     def reset(self, name: str | None) -> None:
-        """Puts a robot back to its start, or all robots and pushed obstacles; a flying robot keeps its height.
-
-        Raises:
-            Refused: If there is no such robot, or something else stands at its start.
-        """
+        """Puts a robot back to its start, or all robots and pushed obstacles; a flying robot keeps its height."""
         before = self.body.engine
         if name is None:
             rows = np.flatnonzero(self.carried).tolist()
