@@ -243,7 +243,7 @@ class Hosts:
         self.by_robot: dict[str, Station] = {}  # of the case
 
     def join(self, experiment: Experiment) -> list[HostClock]:
-        """Connect the hosts of a case that have robots and an address; return their clocks. Errors name all obstacles."""
+        """Connect the hosts of a case with robots and an address; return their clocks. Errors name all obstacles."""
         wanted = {name: host for name, host in experiment.hosts.items() if host.address is not None and host.robots}
         fresh = []
         for name, host in wanted.items():
