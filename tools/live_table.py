@@ -69,11 +69,12 @@ class _Counters:
 
     status: Status
     cpu: float | None = None
+    rate: float = 0.0  # [1/s] of transmitted poses
     grew: dict[str, float] = field(default_factory=dict)  # [s, UTC] last growth, by counter
 
 
 class Trends:
-    """Differences of statuses: share of a core, and counters that grow."""
+    """Differences of statuses: share of a core, rate of poses, and counters that grow."""
 
     def __init__(self) -> None:
         self._known: dict[str, _Counters] = {}
@@ -87,6 +88,7 @@ class Trends:
         if span_s >= WINDOW_S:
             before = known.status
             known.cpu = max(0.0, status.cpu_s - before.cpu_s) / span_s
+            known.rate = max(0, status.sent - before.sent) / span_s
             for word, now, then in (
                 ("late", status.missed, before.missed),
                 ("lost", sum(status.lost.values()), sum(before.lost.values())),
@@ -103,7 +105,6 @@ class Trends:
         *,
         now: float,
         error: float | None,
-        rate: float,
         gone: str = "",
         lost: bool = False,
     ) -> Row:
@@ -112,7 +113,6 @@ class Trends:
         Args:
             now: [s, UTC], by the clock of the statuses' stamps.
             error: [m]
-            rate: [1/s] of transmitted poses.
             gone: Why the run goes on without it; empty while it takes part.
             lost: It should take part: process or token have vanished.
         """
@@ -132,7 +132,7 @@ class Trends:
         if status.malformed:
             note += f" {status.malformed} malformed"
         return Row(
-            name, phase, rank, error, rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
+            name, phase, rank, error, trend.rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
             status.sent, note.strip(), growing, status.pid,
         )  # fmt: skip
 

@@ -98,9 +98,7 @@ def _drawn(progress: Progress, trends: Trends, console: Console) -> RenderableTy
 
 def _row(trends: Trends, name: str, view: RobotView, now: float) -> Row:
     because = view.left_because
-    return trends.row(
-        name, view.status, now=now, error=view.error, rate=view.rate, gone=because, lost=because == "lost"
-    )
+    return trends.row(name, view.status, now=now, error=view.error, gone=because, lost=because == "lost")
 
 
 def _silence(progress: Progress) -> str:

@@ -165,7 +165,7 @@ class _Top:
                 self._trends.row(
                     name, status, now=now,
                     error=report.state.error if report.state is not None and (name in linked or not linked) else None,
-                    rate=report.rate, gone="stopped" if stopped else "lost" if lost else "", lost=lost,
+                    gone="stopped" if stopped else "lost" if lost else "", lost=lost,
                 )
             )  # fmt: skip
         return rows

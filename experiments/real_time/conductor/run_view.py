@@ -42,11 +42,9 @@ class RobotView:
     status: messages.Status | None = None  # last received
     error: float | None = None  # [m] formation error by its own knowledge; None until it reports one
     linked: bool = True  # it has an error: it is not guided, and has links
-    rate: float = 0.0  # [1/s] transmitted poses over the last second
     alive: bool = False  # its liveliness token stands
     # why the run goes on without it: process ended or token vanished, taken out, or not asked for yet
     left_because: Literal["", "lost", "removed", "standby"] = ""
-    counted: tuple[float, int] = (0.0, 0)  # stamp and number of transmitted poses at the last `rate`
     vanished: float = inf  # [s, monotonic] loss of its token; infinity while it stands, and once that was reported
     behind: float = inf  # [s] least time from a stamp to its arrival: small, if its clock is right
     last_incident: int = 0  # number of the last reported incident
@@ -72,8 +70,7 @@ class RobotView:
         """Forget the process that has ended, but for its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
-        self.rate, self.counted, self.behind, self.last_incident = 0.0, (0.0, 0), inf, 0
-        self.began = None
+        self.behind, self.last_incident, self.began = inf, 0, None
 
 
 @dataclass
@@ -249,10 +246,6 @@ class NetworkView:
         if note != view.note:
             view.note = note
             self.report("body", status.robot, status.body or "no trouble any more")
-        since, sent = view.counted
-        if status.stamp - since >= 0.9:
-            view.rate = max(0.0, (status.sent - sent) / (status.stamp - since)) if since else 0.0
-            view.counted = (status.stamp, status.sent)
         if status.phase == Phase.RUNNING.word and view.phase != status.phase:
             view.began = status.stamp
         view.status = status

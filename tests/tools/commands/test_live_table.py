@@ -29,7 +29,7 @@ def rows(count: int) -> list[Row]:
 def test_the_table_fits_the_terminal_and_names_are_whole(width, height, count):
     held = msgspec.structs.replace(STATUS, hazard="hold: minimum separation: 0.18 m from robot-03 (limit 0.25 m)")
     all_rows = rows(count)
-    all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0, rate=1.0)
+    all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0)
     drawn = [line.plain for line in lines(heading("event: formation", 5.3, 15.0), all_rows, EVENTS, width, height)]
     assert max(map(len, drawn)) <= width
     assert len(drawn) <= height
@@ -64,27 +64,28 @@ def test_rows_that_fit_stay_in_their_order():
 
 def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
     trends = Trends()
-    first = trends.row("robot-01", STATUS, now=10.0, error=None, rate=0.0)
+    first = trends.row("robot-01", STATUS, now=10.0, error=None)
     assert (first.cpu, first.growing) == (None, frozenset())
     later = msgspec.structs.replace(STATUS, stamp=12.0, cpu_s=2.1, missed=2, lost={"robot-02": 5}, battery=0.2)
-    row = trends.row("robot-01", later, now=12.0, error=0.01, rate=3.0)
-    assert row.cpu == pytest.approx(0.05)
+    later = msgspec.structs.replace(later, sent=STATUS.sent + 6)
+    row = trends.row("robot-01", later, now=12.0, error=0.01)
+    assert (row.cpu, row.rate) == (pytest.approx(0.05), 3.0)
     assert row.growing == {"late", "lost"}
     assert row.rank == Rank.LOW
     styles = {line.plain[part.start : part.end].strip(): str(part.style) for line in lines("t", [row], [], 140, 10)
               for part in line.spans}  # fmt: skip
     assert styles["2"] == styles["5"] == styles["20 %"] == "yellow"
-    flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01, rate=3.0)
-    held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01, rate=3.0)
-    gone = trends.row("gone-one", STATUS, now=12.0, error=None, rate=0.0, gone="lost", lost=True)
+    flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01)
+    held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01)
+    gone = trends.row("gone-one", STATUS, now=12.0, error=None, gone="lost", lost=True)
     styles = {line.plain[part.start : part.end].strip(): str(part.style)
               for line in lines("t", [flat, held, gone], [], 140, 10) for part in line.spans}  # fmt: skip
     assert (styles["5 %"], styles["held-one"], styles["gone-one"]) == ("bold red", "yellow", "bold red")
     repeated = msgspec.structs.replace(later, stamp=20.0)
-    calm = trends.row("robot-01", repeated, now=20.0, error=0.01, rate=3.0)
+    calm = trends.row("robot-01", repeated, now=20.0, error=0.01)
     assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
     restarted = msgspec.structs.replace(later, stamp=21.0, pid=8, cpu_s=0.1)
-    assert trends.row("robot-01", restarted, now=21.0, error=None, rate=0.0).cpu is None
+    assert trends.row("robot-01", restarted, now=21.0, error=None).cpu is None
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
 )
 def test_what_a_robot_needs(changed, now, gone, rank, phase):
     status = msgspec.structs.replace(STATUS, **changed)
-    row = Trends().row("robot-01", status, now=now, error=None, rate=0.0, gone=gone, lost=gone == "lost")
+    row = Trends().row("robot-01", status, now=now, error=None, gone=gone, lost=gone == "lost")
     assert (row.rank, row.phase) == (rank, phase)
 
 
