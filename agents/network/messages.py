@@ -143,6 +143,11 @@ class Status(Message, frozen=True):
     incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
     stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one, or of a former process
 
+    def incidents_since(self, before: Status | None) -> list[Incident]:
+        """Incidents since an earlier status; all, if that is of another process."""
+        known = before.incidents if before is not None and before.pid == self.pid else []
+        return [each for each in self.incidents if not known or each.seq > known[-1].seq]
+
 
 class Position(Message, frozen=True, omit_defaults=True):
     """Pose of a robot, measured or known from outside of it."""

@@ -43,8 +43,6 @@ class RobotReport:
     sent: int = 0  # poses since the rate was computed
     rate: float = 0.0  # [1/s] of transmitted poses, over the last second
     delay: dict[str, float] = field(default_factory=dict)  # [s] of the last pose, by sender
-    last_incident: int = 0
-    pid: int = 0
 
 
 class Observer:
@@ -143,13 +141,9 @@ class Observer:
 
     def _receive_status(self, status: messages.Status, now: float) -> None:
         report = self._report(status.robot)
-        if status.pid != report.pid:
-            report.pid, report.last_incident = status.pid, 0
-        for incident in status.incidents:
-            if incident.seq > report.last_incident:
-                report.last_incident = incident.seq
-                if not self.conducted:  # else it says so
-                    self.events.append(messages.Event(incident.stamp, "hazard", status.robot, incident.text))
+        if not self.conducted:  # else the conductor says so
+            for incident in status.incidents_since(report.status):
+                self.events.append(messages.Event(incident.stamp, "hazard", status.robot, incident.text))
         report.status, report.heard_at, report.known = status, now, True
 
     def _read_states(self) -> None:

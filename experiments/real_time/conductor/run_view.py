@@ -47,7 +47,6 @@ class RobotView:
     left_because: Literal["", "lost", "removed", "standby"] = ""
     vanished: float = inf  # [s, monotonic] loss of its token; infinity while it stands, and once that was reported
     behind: float = inf  # [s] least time from a stamp to its arrival: small, if its clock is right
-    last_incident: int = 0  # number of the last reported incident
     note: str = ""  # last reported note of its body, without numbers
     place: messages.Vector | None = None  # [m] last known
     origin: messages.Setpoint | None = None  # start of the robot, or of its plan: x, y, z [m], yaw [rad]
@@ -70,7 +69,7 @@ class RobotView:
         """Forget the process that has ended, but for its last place and its origin."""
         self.former = self.status.pid if self.status is not None else self.former
         self.status, self.alive, self.vanished = None, False, inf
-        self.behind, self.last_incident, self.began = inf, 0, None
+        self.behind, self.began = inf, None
 
 
 @dataclass
@@ -234,12 +233,8 @@ class NetworkView:
             return
         if view.status is not None and (view.status.phase, view.status.reason) != (status.phase, status.reason):
             self.report("robot", status.robot, status.phase + (f": {status.reason}" if status.reason else ""))
-        if view.status is not None and view.status.pid != status.pid:
-            view.last_incident = 0
-        for incident in status.incidents:
-            if incident.seq > view.last_incident:
-                view.last_incident = incident.seq
-                self.report("hazard", status.robot, incident.text)
+        for incident in status.incidents_since(view.status):
+            self.report("hazard", status.robot, incident.text)
         if _fell_out(view.status, status):
             self.report("hazard", status.robot, f"land: {status.reason}")
         note = re.sub(r"[\d.]+", "", status.body)  # of a silence whose seconds count up, one is reported
