@@ -151,7 +151,8 @@ class Flight:
     def _land(self) -> None:
         height = self._telemetry.pose[2] - FLOOR
         span = max(min(LONGEST_S, height / DESCENT), SHORTEST_S)  # an unknown height is a large one
-        self._command_planner(HighLevel.LAND, lambda: self._planner.land(FLOOR, span, yaw=None))
+        planner = self.link.cf.high_level_commander
+        self._command_planner(HighLevel.LAND, lambda: planner.land(FLOOR, span, yaw=None))
         self._enter(Phase.LANDING)
         self._span = span
 
@@ -270,10 +271,6 @@ class Flight:
     def _flying(self) -> bool:
         """Whether the supervisor reports that the motors turned within the last two seconds."""
         return Info.FLYING in self._telemetry.info
-
-    @property
-    def _planner(self):  # type: ignore[no-untyped-def]  # noqa: ANN202 - cflib's own object
-        return self.link.cf.high_level_commander
 
     def _enter(self, phase: Phase) -> None:
         self.phase, self._since = phase, time.monotonic()

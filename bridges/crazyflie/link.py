@@ -192,10 +192,6 @@ class CrazyflieLink:
             if now > deadline or end.is_set():
                 raise LinkError("the connection was not set up in time")
 
-    def has_variable(self, variable: str) -> bool:
-        """Whether the firmware logs a variable."""
-        return self.cf.log.toc.get_element_by_complete_name(variable) is not None
-
     def start_log(self, name: str, rate_hz: float, variables: Mapping[str, str], logged: LogCallback) -> None:
         """Start a log block.
 
@@ -210,7 +206,7 @@ class CrazyflieLink:
 
         block = LogConfig(name, PERIODS_MS * max(1, round(1000.0 / rate_hz / PERIODS_MS)))
         for variable, type_ in variables.items():
-            if self.has_variable(variable):
+            if self.cf.log.toc.get_element_by_complete_name(variable) is not None:
                 block.add_variable(variable, type_)
         if not block.variables:
             return

@@ -37,7 +37,7 @@ class Camera:
     def occlude(self, seconds):
         """From now on, and for so long, nothing is seen."""
         with self._lock:
-            self.twin.set_faults(Faults(occluded_from_s=time.monotonic() - self._zero, occluded_for_s=seconds))
+            self.twin.link.faults = Faults(occluded_from_s=time.monotonic() - self._zero, occluded_for_s=seconds)
 
     def kill(self):
         """The end of the server."""

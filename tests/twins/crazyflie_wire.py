@@ -55,7 +55,8 @@ class Wire:
             self.ticks += 1
             self.flock.advance(self.t)
             self.sent.clear()
-            self.drone.send_logs(self.t)
+            for packet in self.drone.logs.due(self.t):
+                self.drone.send(Port.LOG, 2, packet)
             packets += self.sent
         return packets
 

@@ -81,7 +81,7 @@ class ViconTwin:
         """
         self._subjects = list(subjects)
         self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
-        self._link = FaultyLink[bytes](faults or Faults())
+        self.link = FaultyLink[bytes](faults or Faults())
         self._position = np.zeros((len(self._subjects), 3))
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
         self._visible = np.zeros(len(self._subjects), dtype=bool)
@@ -104,10 +104,6 @@ class ViconTwin:
         """Make a subject invisible."""
         self._visible[row] = False
 
-    def set_faults(self, faults: Faults) -> None:
-        """Replace the injected faults."""
-        self._link.faults = faults
-
     def sockets(self) -> Sequence[socket.socket]:
         return [self._listener, *self._clients]
 
@@ -119,13 +115,13 @@ class ViconTwin:
 
     def advance(self, t: float) -> None:
         """Send the frame that is due at `t` [s], if any."""
-        self._link.t = t
+        self.link.t = t
         due = int(t * self._rate + 1e-6)
         if due > self._frames:
             self._frames = due  # missed frames are not repeated
-            if not self._link.silent(t):
-                self._link.put(self._frame(t))
-        for frame in self._link.due():
+            if not self.link.silent(t):
+                self.link.put(self._frame(t))
+        for frame in self.link.due():
             self._send(frame)
         for connection, client in list(self._clients.items()):
             self._flush(connection, client)
@@ -151,7 +147,7 @@ class ViconTwin:
             received = connection.recv(65536)
             if not received:
                 raise ConnectionResetError
-            if self._link.silent(t):
+            if self.link.silent(t):
                 return
             for body in client.framer.feed(received):
                 for kind, payload in vicon_datastream.blocks(body):
@@ -174,7 +170,7 @@ class ViconTwin:
         position = self._position
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
-        seen = self._visible & (not self._link.faults.occluded(t))
+        seen = self._visible & (not self.link.faults.occluded(t))
         frame = [
             vicon_datastream.pack_frame_number(self._frames),
             vicon_datastream.pack_latency([("Data Collected", self.latency_s)]),

@@ -126,7 +126,7 @@ class PlanarEngine(Models):
         alone = len(self._copies) == 1
         self._state = self._copies[0].state if alone else np.concatenate([copy.state for copy in self._copies])
         self._bodies = span(bodies)
-        self._bodies_in_air, self._bodies_on_floor = span(bodies[self.in_air]), span(bodies[self.on_floor])
+        self._bodies_in_air = span(bodies[self.in_air])
         self._wheels = span(wheels[self.on_floor])
         self._movable = np.array(movable, dtype=np.intp)
         self._things = np.array(things, dtype=np.intp).reshape(len(self._copies), -1)

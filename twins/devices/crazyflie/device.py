@@ -151,7 +151,8 @@ class CrazyflieTwin:
                 drone.console("SUP: Locked, reboot required\n")
             if not line.connected:
                 drone.logs.reset()
-            drone.send_logs(t)
+            for packet in drone.logs.due(t):
+                line.send(Port.LOG, 2, packet)
             line.send_due()
 
     def truth(self) -> tuple[Array, Array]:

@@ -123,11 +123,6 @@ class Drone:
         for begin in range(0, len(encoded), crtp.MTU):
             self.send(Port.CONSOLE, 0, encoded[begin : begin + crtp.MTU])
 
-    def send_logs(self, t: float) -> None:
-        """Send the log blocks that are due at `t` [s]."""
-        for packet in self.logs.due(t):
-            self.send(Port.LOG, 2, packet)
-
     # ------------------------------------------------------------------ connection
 
     def _link(self, channel: int, data: bytes) -> bytes | None:

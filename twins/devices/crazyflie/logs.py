@@ -47,7 +47,7 @@ class LogBlocks:
 
     def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: Table) -> None:
         self._blocks: dict[int, Block] = {}
-        known = _variables(flock, row, parameter)
+        known = _motion(flock, row) | _system(flock, row, parameter)  # the others are constants of the table
         self._read: list[Read] = [
             known.get(variable.name, partial(float, variable.value)) for variable in table.variables
         ]
@@ -110,11 +110,6 @@ class LogBlocks:
         return Status.OK
 
 
-def _variables(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[str, Read]:
-    """Functions that read the log variables that are simulated; the others are constants of the table."""
-    return _motion(flock, row) | _system(flock, row, parameter)
-
-
 def _motion(flock: Flock, row: int) -> dict[str, Read]:
     """Estimates, sensors of motion, setpoints."""
     quadrotor = flock.quadrotor
@@ -132,7 +127,7 @@ def _motion(flock: Flock, row: int) -> dict[str, Read]:
         return np.array([cos * of[0] + sin * of[1], cos * of[1] - sin * of[0], of[2]])
 
     def angles() -> Array:
-        return np.degrees([*flock.attitude[row], _wrap(quadrotor.yaw[row])])
+        return np.degrees([*flock.attitude[row], math.remainder(quadrotor.yaw[row], 2.0 * math.pi)])
 
     def force() -> Array:
         """Specific force [g], which is measured; none in free fall."""
@@ -221,10 +216,6 @@ def _system(flock: Flock, row: int, parameter: Callable[[str], float]) -> dict[s
         "ranging.state": lambda: sum(1 << anchor for anchor in memories.anchors()),
     }
     return read
-
-
-def _wrap(angle: float) -> float:
-    return math.remainder(angle, 2.0 * math.pi)
 
 
 def _distance(flock: Flock, row: int, bearing: float) -> float:

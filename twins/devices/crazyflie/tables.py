@@ -140,16 +140,14 @@ def _sections(text: str) -> Iterator[list[Variable]]:
             flags = FLAGS[kind.lstrip("abcdefghijklmnopqrstuvwxyz0123456789")]
             for word in names.split():
                 name, _, value = word.partition("=")
-                several = RANGE.fullmatch(name)
-                every = [name] if several is None else _numbered(*several.groups())
+                every = [name]
+                if several := RANGE.fullmatch(name):
+                    stem, first, last = several.groups()
+                    every = [f"{stem}{number}" for number in range(int(first), int(last) + 1)]
                 variables += [
                     Variable(f"{group}.{each}", kind.rstrip("!*"), float(value or 0.0), flags) for each in every
                 ]
         yield variables
-
-
-def _numbered(name: str, first: str, last: str) -> list[str]:
-    return [f"{name}{number}" for number in range(int(first), int(last) + 1)]
 
 
 def _flags(element: LogTocElement) -> int:
