@@ -50,25 +50,25 @@ def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
     monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", flight.endpoint())  # whoever else uses this machine
     assert results.runs(as_json=True) is None
     assert [run["robots"] for run in json.loads(capsys.readouterr().out)] == [{"CF01": "", "KH01": ""}] * 2
-    assert order_commands.estop(reason="person in arena") == 0
+    assert order_commands.estop() == 0
     assert capsys.readouterr().out.splitlines() == [
         f"stopped: CF01, KH01 (two that stay together, {each.folder}, at {endpoint})"
         for each, (endpoint,) in zip((flight, other), up, strict=True)
     ]
-    other.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
+    other.until_said(r"stop conductor: emergency stop by operator: zenpark estop; the run ends here")
     assert other.finish()[0] == 1
-    flight.until_said(r"stop conductor: emergency stop by operator: person in arena; the run ends here")
+    flight.until_said(r"stop conductor: emergency stop by operator: zenpark estop; the run ends here")
     code, _ = flight.finish()
     assert run_registry.runs() == []
     said = flight.said()
     assert code == 1
-    assert "zenpark: emergency stop by operator: person in arena" in said
+    assert "zenpark: emergency stop by operator: zenpark estop" in said
     assert "second: " not in said
     assert [each.name for each in folder.glob("*.mcap")] == ["first.mcap"]
     trace = playback.read(folder / "first.mcap").trace
     assert ("stop", "conductor") in {(event.kind, event.source) for event in trace.events}
     ends = {event.source: event.text for event in trace.events if event.kind == "robot" and "done" in event.text}
-    assert ends["CF01"] == "done: emergency stop by operator: person in arena"
+    assert ends["CF01"] == "done: emergency stop by operator: zenpark estop"
 
 
 @pytest.mark.mechanism("emergency stop of a run")

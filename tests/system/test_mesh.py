@@ -74,7 +74,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
         assert all(not watcher.status[name].missing for name in begun if "CF02" not in hears[name])
     finally:
         watcher.close()
-    assert orders.estop(connect=endpoints, realm="park", reason="a test", identity="operator") == 0
+    assert orders.estop(connect=endpoints, realm="park", identity="operator") == 0
     assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))}\n"
     flight.finish()
     run = reopen(flight.folder)
