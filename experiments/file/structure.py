@@ -155,7 +155,7 @@ def _table(
             _, note = _plain(field.type, "")
             hint = _REMEDY.get(name) or f"add {name} = ... ({note})"
             found.append(Fault(path, f"'{name}' is missing{_place_in_file(path)}", hint))
-    return found or _judged(value, struct, path, "", fields)
+    return found or _own_checks(value, struct, path)
 
 
 @cache
@@ -203,13 +203,18 @@ def _kind_with(group: str, keys: Sequence[str]) -> str | None:
     return next((kind for kind in registry.names(group) if set(keys) <= set(parameters(group, kind))), None)
 
 
-def _judged(
-    value: object,
-    annotation: object,
-    path: Path,
-    note: str,
-    fields: Mapping[str, msgspec.structs.FieldInfo] | None = None,
-) -> list[Fault]:
+def _own_checks(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:
+    """Faults of a table whose values are right one by one; the struct's own check can name a field in words alone."""
+    try:
+        msgspec.convert(value, struct)
+    except msgspec.ValidationError as error:
+        text, _, hint = str(error).partition(" - at `")[0].partition("; ")
+        named = [name for name in _fields_of(struct) if name in value and re.search(rf"\b{re.escape(name)}\b", text)]
+        return [Fault((*path, *named[:1]), text, hint)]
+    return []
+
+
+def _judged(value: object, annotation: object, path: Path, note: str) -> list[Fault]:
     """Faults that msgspec finds in a value, in words."""
     try:
         msgspec.convert(value, annotation)
@@ -217,17 +222,6 @@ def _judged(
         text, _, where = str(error).partition(" - at `")
         for step in re.findall(r"\[(\d+)\]", where):
             path, value = (*path, int(step)), value[int(step)] if isinstance(value, list) else None
-        if fields is not None:  # a struct's own check can only name its field in words
-            named = next(
-                (
-                    name
-                    for name in fields
-                    if isinstance(value, dict) and name in value and re.search(rf"\b{re.escape(name)}\b", text)
-                ),
-                None,
-            )
-            text, _, hint = text.partition("; ")
-            return [Fault(path if named is None else (*path, named), text, hint or note)]
         return [_in_words(text, value, annotation, path, note)]
     return []
 
@@ -249,7 +243,7 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
         limit = " of letters, digits and _ that begins with a letter"
     if isinstance(value, bool) or not isinstance(value, list | dict):
         limit += f", not {shown(value)}"
-    tables = [part for part in (plain, *get_args(plain)) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
+    tables = [part for part in (plain, *get_args(plain)) if _is_struct(part)]
     for table in tables[:1] if not isinstance(value, dict) else []:
         fields = msgspec.structs.fields(table)
         needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]
