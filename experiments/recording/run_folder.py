@@ -7,7 +7,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -205,13 +205,3 @@ def _formatted(value: object) -> str:
     if value in (None, [], {}):
         return "-"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def age_days(run: PastRun, now: float) -> float:
-    """Age of a run at `now` [s, UTC], in days."""
-    return (now - run.made) / 86400.0
-
-
-def day_of(run: PastRun) -> str:
-    """When a run was made, to the minute, in UTC."""
-    return f"{datetime.fromtimestamp(run.made, UTC):%Y-%m-%d %H:%M}"

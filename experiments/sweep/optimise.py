@@ -272,7 +272,7 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
 
 
 def _known(name: str, place: str) -> str:
-    known = (*MEANS, *(name for name in ("f", "acquired")))
+    known = (*MEANS, "f", "acquired")
     if name.lower() not in known:
         raise refusal(place, f"no index is called '{name}'", did_you_mean(name, known))
     return {"f": "f_hz", "acquired": "acquired_s"}.get(name.lower(), name.lower())

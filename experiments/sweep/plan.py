@@ -25,8 +25,8 @@ from agents.plugins.registry import TRIGGERS
 from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen
-from experiments.file.overrides import parse
-from experiments.file.problems import DocumentError, Path, Problem, refusal
+from experiments.file.overrides import Override, parse
+from experiments.file.problems import DocumentError, Problem, refusal
 from experiments.file.structure import group_of
 from experiments.sweep.runs import digest
 
@@ -37,7 +37,6 @@ MOST_CELLS: Final = 20_000
 MOST_SEEDS: Final = 100_000
 HOW: Final = "write PATH=LOW:HIGH:log12 (or lin12), or PATH=A,B,C; for example trigger.threshold=0.002:0.05:log12"
 Scale = Literal["log", "lin"]
-_Parsed = tuple[Path, Any, str | None]  # a path, the value there, and the case if it is for one
 
 _RANGE: Final = re.compile(r"\s*([^:,]+):([^:,]+):(log|lin)([0-9]*)\s*")
 _NUMBER: Final = re.compile(r"\s*[+-]?(\d|\.\d)")
@@ -174,8 +173,8 @@ def combination(
         (first, compared_with[first], others),
         *((name, changed[name], values) for name in names),
     ):
-        own = [axis for axis in given if paths[axis][2] in (None, name) and _path_exists(experiment, paths[axis][0])]
-        mine = {axis.path: paths[axis][1] for axis in own}
+        own = [axis for axis in given if _has(name, experiment, paths[axis])]
+        mine = {axis.path: paths[axis].value for axis in own}
         yield Cell(name, mine, experiment, reference, digest(experiment))
 
 
@@ -186,10 +185,10 @@ def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> 
         raise DocumentError([_renamed(problem, values) for problem in error.problems]) from None
 
 
-def _of_trigger(parsed: _Parsed) -> bool:
+def _of_trigger(parsed: Override) -> bool:
     """Whether it changes the triggers of all cases."""
-    path, _, case = parsed
-    return case is None and any(group_of(path[:end]) == TRIGGERS for end in range(1, len(path) + 1))
+    parts = range(1, len(parsed.path) + 1)
+    return parsed.case is None and any(group_of(parsed.path[:end]) == TRIGGERS for end in parts)
 
 
 def compared(read: Document) -> str:
@@ -247,18 +246,20 @@ def _parts(text: str) -> list[str]:
     return parts
 
 
-def _parsed(axis: Axis, value: str, read: Document) -> _Parsed:
+def _parsed(axis: Axis, value: str, read: Document) -> Override:
     """Path, value and case of an axis at a value."""
     try:
-        override = parse(f"{axis.path}={value}", {"cases": read.experiment.cases})
+        return parse(f"{axis.path}={value}", {"cases": read.experiment.cases})
     except DocumentError as error:
         (problem,) = error.problems
         raise refusal(axis.argument, problem.message, problem.hint.replace("--set ", "")) from None
-    return override.path, override.value, override.case
 
 
-def _path_exists(experiment: Experiment, path: Path) -> bool:
-    """Whether a path leads to something in an experiment: a parameter of a plug-in does if that plug-in has it."""
+def _has(case: str, experiment: Experiment, parsed: Override) -> bool:
+    """Whether a case has what is changed: a parameter of a plug-in if it has chosen that plug-in."""
+    path = parsed.path
+    if parsed.case not in (None, case):
+        return False
     for end in range(1, len(path)):
         if group_of(path[:end]) is not None:
             choice: Any = experiment

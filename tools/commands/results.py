@@ -391,15 +391,17 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     traces = [trace for each in runs for trace in each.traces.values()]
     recorded = len({trace.seed for trace in traces}) == len(runs)
     place = Path(runs[0].folder or folder) / "figures" / metrics_files.BANDS
-    bands = {} if recorded else metrics_files.read_bands(place)
+    kept = {} if recorded else metrics_files.read_bands(place)
+    bands = kept or figures.error_bands(traces)
+    of_all = recorded or bool(kept)  # seeds
     drawn = figures.every(every, traces, width, bands)
-    stays = [] if recorded or bands else ["errors"]  # the one that is there is of all seeds
+    stays = [] if of_all else ["errors"]  # the one that is there is of all seeds
     drawings = {
         name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name)[0].read_text("utf-8")
         for name, figure in drawn.items()
     }
-    if len(runs) > 1 and (bands or recorded):
-        metrics_files.write_bands(folder / "figures" / metrics_files.BANDS, bands or figures.error_bands(traces))
+    if len(runs) > 1 and of_all:
+        metrics_files.write_bands(folder / "figures" / metrics_files.BANDS, bands)
     return pages.write(
         folder,
         traces,
@@ -456,7 +458,6 @@ def _past_runs(words: Sequence[str], below: list[str] | None) -> list[PastRun]:
 
 def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) -> None:
     from experiments.metrics.statistics import spread
-    from experiments.recording.run_folder import day_of
     from experiments.report.page import NONE, interval
     from tools.progress import columns
 
@@ -474,16 +475,20 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     rows = []
     for run in found:
         clock = " (virtual)" * run.origin.virtual
-        first = [day_of(run), f"{run.folder}{clock}"]
+        first = [_minute(run.made), f"{run.folder}{clock}"]
         for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
             values = [interval(spread([*by_seed.values()])) for by_seed in figures.values()] or [NONE] * 4
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
     print("\n".join(columns([head, *rows])) if rows else "no run")
     for folder in sweeps:
-        day = time.strftime("%Y-%m-%d %H:%M", time.gmtime((folder / SWEEP).stat().st_mtime))
-        print(f"{day}  {folder}  a sweep: `./zenpark report {folder}`")
+        print(f"{_minute((folder / SWEEP).stat().st_mtime)}  {folder}  a sweep: `./zenpark report {folder}`")
     print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB; sweeps: {len(sweeps)}")
+
+
+def _minute(at: float) -> str:
+    """A time [s, UTC], to the minute."""
+    return time.strftime("%Y-%m-%d %H:%M", time.gmtime(at))
 
 
 def _sweep_as_json(folder: Path) -> dict[str, Any]:
@@ -515,7 +520,6 @@ def clean(
     import shutil
 
     from agents.runtime import run_registry
-    from experiments.recording.run_folder import age_days
 
     if not words and older is None:
         raise typer.BadParameter("say which: words, or --older DAYS (0: all)")
@@ -525,7 +529,7 @@ def clean(
         run
         for run in _past_runs(words or [], below)
         if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
-        if older is None or age_days(run, now) > older
+        if older is None or now - run.made > 86400.0 * older
     ]
     shown = []
     for run in chosen:
