@@ -73,7 +73,7 @@ class GoalComputer:
     def update_links(self, t: float) -> None:
         """Update the active links at `t` [s] for neighbours that appeared or were lost."""
         if self.neighbours.incomplete:
-            self._links_changed(self.neighbours.update_active(t))
+            self.require_update(self.neighbours.update_active(t))
 
     def without_neighbours(self) -> Mask:
         """Rows (N,) for which the law has no input: all their neighbours are lost."""
@@ -111,7 +111,7 @@ class GoalComputer:
         return next(filter(None, (itinerary.origin(row) for itinerary in self._itineraries)), None)
 
     def require_update(self, rows: Index) -> None:
-        """Rows with old goals compute the law at the next decision, whatever a trigger decides."""
+        """Rows with old goals, or new targets, compute the law at the next decision, whatever a trigger decides."""
         if self._updating is not None:
             self._updating.require_update(rows)
 
@@ -129,7 +129,7 @@ class GoalComputer:
         if self._reshaping is not None:
             everywhere = self.neighbours.extrapolate_all(self._assignment.predictor, t)
             self._reshaping.advance(t - start, position, everywhere)
-            self._links_changed(self.neighbours.set_targets(self._reshaping.links, self._reshaping.present))
+            self.require_update(self.neighbours.set_targets(self._reshaping.links, self._reshaping.present))
         if self._updating is not None:
             view = self.control_view(t, position, velocity, start)
             due = running & (~self._gated | self._updating.due(view))
@@ -190,11 +190,6 @@ class GoalComputer:
             law=lambda: self.law_offset(t, position),
             errors=lambda: self.errors(t, position),
         )  # fmt: skip
-
-    def _links_changed(self, rows: Index) -> None:
-        """Rows whose links or targets changed compute the law at once."""
-        if len(rows):
-            self.require_update(rows)
 
 
 class StationKeeping:

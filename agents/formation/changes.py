@@ -116,10 +116,6 @@ class Presence(Columns, frozen=True):
         ever = np.full(more, np.inf)
         return Presence.joined([self, Presence(-ever, ever, ever, ever)])
 
-    def present_at_start(self) -> Mask:
-        """Links (E,) that exist before any distance is known."""
-        return self.planned_at(0.0)
-
     def planned_at(self, elapsed: float) -> Mask:
         """Links (E,) that exist at a time [s] whatever the distance of the robots."""
         return (self.since <= elapsed + ROUNDING_S) & (self.until > elapsed + ROUNDING_S) & np.isinf(self.reach)
@@ -141,7 +137,7 @@ class Reshaping:
         """Start from `links` (E) with the targets of the beginning."""
         self._given, self._changes, self._presence = links, tuple(changes), presence
         self.links = links
-        self.present: Mask = np.ones(len(links), dtype=bool) if presence is None else presence.present_at_start()
+        self.present: Mask = np.ones(len(links), dtype=bool) if presence is None else presence.planned_at(0.0)
 
     def advance(self, since_start: Array, position: Array, sender_position: Array) -> None:
         """Advance to now: `since_start` (N,) [s], `position` (N, 3) of the rows and of the senders (E, 3) [m]."""

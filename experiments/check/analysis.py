@@ -205,7 +205,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     aloft[:, 2] = np.nan_to_num(assignment.hover)
     anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
     silent = np.setdiff1d(np.arange(rows), np.concatenate([links.receiver, anchored]))
-    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.present_at_start()
+    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.planned_at(0.0)
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
     asked = targets_of_law(assignment.law, links)

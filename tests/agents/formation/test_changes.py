@@ -94,9 +94,9 @@ def test_links_by_the_clock():
     one, far = presence(since=5.0, until=8.0), np.array([np.nan])
     seen = [bool(one.present_now(np.array([t]), far, np.array([False]))[0]) for t in (0.0, 4.9, 5.0, 7.9, 8.0, 20.0)]
     assert seen == [False, False, True, True, False, False]
-    assert not one.present_at_start()[0]
-    assert presence().present_at_start()[0]
-    assert not presence(reach=1.0).present_at_start()[0]
+    assert not one.planned_at(0.0)[0]
+    assert presence().planned_at(0.0)[0]
+    assert not presence(reach=1.0).planned_at(0.0)[0]
 
 
 def test_links_by_range_do_not_flicker():
