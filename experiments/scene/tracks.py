@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, nan
+from itertools import pairwise
+from math import nan
 from pathlib import Path
 from typing import Any, Final
 
@@ -159,13 +160,10 @@ def _sample(state: State) -> tuple[float, ...]:
     )
 
 
-def _incidents(tracks: Sequence[Track]) -> list[Event]:
-    """Incidents that robots report, each once."""
-    found: dict[tuple[str, int, int], Event] = {}
+def _incidents(tracks: Sequence[Track]) -> Iterator[Event]:
+    """Incidents that robots report from their start on, each once."""
     for track in tracks:
-        for status in track.statuses:
-            for each in status.incidents:
-                shifted = each.stamp - (status.started if status.started > 0.0 else inf)
-                event = Event(max(shifted, -inf), "hazard", status.robot, each.text)
-                found.setdefault((status.robot, status.pid, each.seq), event)
-    return [event for event in found.values() if event.stamp > -inf]
+        for before, status in pairwise((None, *track.statuses)):
+            if status is not None and status.started > 0.0:
+                for each in status.incidents_since(before):
+                    yield Event(each.stamp - status.started, "hazard", status.robot, each.text)

@@ -80,12 +80,11 @@ class Observer:
         """Takes in what has arrived; returns whether another case has begun, with another stage."""
         now = time.monotonic()
         changed = self._read_experiment()
-        for token in received(self._watch.handler):
-            name = self._keys.whose(str(token.key_expr))
-            if name is not None:
+        for token, there in self._watch.changes():
+            if (name := self._keys.whose(token)) is not None:
                 report = self._report(name)
-                report.alive = token.kind == zenoh.SampleKind.PUT
-                report.known |= report.alive
+                report.alive = there
+                report.known |= there
         for _, there in self._conductor.changes():
             self.conducted = there
         for status in self._statuses.read():
