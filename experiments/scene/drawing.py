@@ -78,11 +78,7 @@ class SceneDrawing:
     """One case in a scene."""
 
     def __init__(self, server: viser.ViserServer, stage: Stage, look: Look, root: str = "/case") -> None:
-        """Draws what does not move.
-
-        Args:
-            root: Name of the node that carries everything; `offset` moves it.
-        """
+        """Draws what does not move; `root` is the name of the node that carries everything, which `offset` moves."""
         self._scene, self.stage, self._look, self._root = server.scene, stage, look, root
         self.shown = Shown()
         self._round = 0

@@ -94,13 +94,7 @@ PALED: Final = (Condition.SILENT, Condition.STOPPED, Condition.DEAD)
 
 
 def condition(status: Status | None, *, alive: bool, age_s: float) -> Condition:
-    """Condition of a robot.
-
-    Args:
-        status: Its last one; None if it never sent any.
-        alive: Whether its liveliness token stands.
-        age_s: Time since that status [s].
-    """
+    """Condition of a robot by its last status, if any, which is `age_s` [s] old; `alive`: its token stands."""
     if status is None:
         return Condition.WAITING if alive else Condition.DEAD
     phase = status.phase

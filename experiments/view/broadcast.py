@@ -44,14 +44,7 @@ class Broadcast:
     """The messages of one recording, in order of time, on the network."""
 
     def __init__(self, session: zenoh.Session, path: Path, realm: str | None = None) -> None:
-        """Reads the recording.
-
-        Args:
-            realm: First chunk of the keys; None: that of the run.
-
-        Raises:
-            RecordingError: If the file is no recording, or of another version.
-        """
+        """Reads the recording; its keys begin with `realm`, or with that of the run."""
         records = Records(path)
         made = {codec(topic.recorded).name: (topic, codec(topic.recorded)) for topic in TOPICS}
         self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
@@ -81,15 +74,10 @@ class Broadcast:
         self._declared: list[object] = []
 
     def run(self, ended: threading.Event, clock: Clock, endpoints: Sequence[str] = ()) -> int:
-        """Plays; returns the number of messages that were sent.
-
-        Args:
-            ended: Ends it when set.
-            clock: From 0 to the length of the recording [s]; its speed, loop and pauses are followed.
+        """Plays until `ended`, by a clock from 0 to the recording's length [s]; returns the number of messages sent.
 
         Raises:
             Occupied: If a run or a robot is up in the realm, before or while it plays.
-            Unreachable: If no router answers.
         """
         keys, names = self.keys, [self.keys.alive(name) for name in self.experiment.robots]
         began, mine = Utc().utc(), str(self._session.zid())

@@ -44,11 +44,7 @@ ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
 
 @contextmanager
 def served(port: int, *, dark: bool) -> Iterator[viser.ViserServer]:
-    """Serve a page that is reached from this machine alone, without a button that would share it.
-
-    Args:
-        port: Preferred; the next free one is taken if it is not free.
-    """
+    """Serve a page to this machine alone, without a button that would share it, at `port` or the next free one."""
     import viser  # noqa: PLC0415 - an extra
 
     with redirect_stdout(StringIO()):  # its own banner
@@ -180,13 +176,7 @@ class LiveView:
     def __init__(
         self, server: viser.ViserServer, session: zenoh.Session, watched: Watched, *, dark: bool, acting: Acting | None
     ) -> None:
-        """Draws an empty page.
-
-        Args:
-            session: On the network of the run.
-            watched: The run.
-            acting: Orders of the page; None for an observer, which sees no buttons.
-        """
+        """Draws an empty page; without `acting` that of an observer, which sees no buttons."""
         self._server, self._session, self._watched, self._acting = server, session, watched, acting
         self.observer = Observer(session, Keys(watched.realm))
         self._page = Page(server, dark=dark)

@@ -184,12 +184,7 @@ class ReplayView:
     """The page of the recordings of a run."""
 
     def __init__(self, server: viser.ViserServer, films: Sequence[Film], where: str, *, dark: bool) -> None:
-        """Draws all cases beside one another.
-
-        Args:
-            films: The cases, at least one.
-            where: Which run it is, for people.
-        """
+        """Draws all cases beside one another; `where` says which run it is."""
         self._server, self._films, self._where = server, list(films), where
         self.clock = Clock(min(film.tracks.begin for film in films), max(film.tracks.end for film in films))
         self._drawn: object = None

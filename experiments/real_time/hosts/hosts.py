@@ -119,11 +119,7 @@ class Station:
         return ["env", f"{RUN}={self._run}", self.host.zenpark.removeprefix("~/"), *arguments]
 
     def greet(self, address: str | None = None) -> None:
-        """Wait until the station answers.
-
-        Args:
-            address: How hosts know this machine; left out: as ssh came from there.
-        """
+        """Wait until the station answers; `address` is how hosts know this machine, by default as ssh came from."""
         self.hello, _, _ = self.ask(Question("hello"), HELLO_S)
         ports = iter(ssh.allocated(self.process.output))
         here = address or self.hello.seen_from or "127.0.0.1"
@@ -232,11 +228,7 @@ class Hosts:
     """The hosts of one run."""
 
     def __init__(self, launcher: Launcher, routers: Sequence[str]) -> None:
-        """No host is connected yet.
-
-        Args:
-            routers: As this machine reaches them, those that listen everywhere as they listen.
-        """
+        """Connect no host yet; `routers` as this machine reaches them, or as they listen if that is everywhere."""
         self._launcher, self.routers = launcher, list(routers)
         self._run = secrets.token_hex(8)
         self._stations: dict[str, Station] = {}
