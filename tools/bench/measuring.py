@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -16,12 +16,6 @@ import msgspec
 import numpy as np
 
 from experiments.file.document import load
-from experiments.real_time.conductor.case_context import CaseContext
-from experiments.real_time.conductor.conductor import CaseResult, Conductor
-from experiments.real_time.conductor.run_view import Progress
-from experiments.real_time.hosts.hosts import Hosts
-from experiments.real_time.hosts.launcher import Launcher
-from experiments.recording.run_folder import SOURCE
 from experiments.run import simulate, simulate_seeds
 
 REPEATS: Final = 5
@@ -47,28 +41,6 @@ def median(clock: Callable[[], float], work: Callable[[], object], repeats: int 
         work()
         taken.append(clock() - begin)
     return statistics.median(taken)
-
-
-def fly(
-    launcher: Launcher,
-    folder: Path,
-    endpoints: Sequence[str],
-    look: Callable[[Progress], None],
-    *,
-    duration_s: float,
-) -> CaseResult:
-    """Fly the reference experiment over routers that run: real time, periodic poses (50 Hz), no plan of the leader.
-
-    Args:
-        look: Is given the run's progress some ten times a second.
-        duration_s: From the common start [s].
-    """
-    read = load("robotic-park", f"duration_s={duration_s}", "timeline=[]", "trigger.period_s=0.02")
-    source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
-    source.write_text(read.text, encoding="utf-8")
-    experiment = read.cases()["periodic"]
-    context = CaseContext(experiment, "periodic", folder, source, endpoints, launcher, hosts)
-    return Conductor(context, look).run()
 
 
 def start() -> Iterator[Figure]:

@@ -18,10 +18,14 @@ from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from experiments.definition.plan import Plan
 from experiments.file.document import load
+from experiments.real_time.conductor.case_context import CaseContext
+from experiments.real_time.conductor.conductor import Conductor
 from experiments.real_time.conductor.run_view import Progress
 from experiments.real_time.conductor.support import start_router
+from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
-from tools.bench.measuring import Figure, fly
+from experiments.recording.run_folder import SOURCE
+from tools.bench.measuring import Figure
 from tools.reliability.run_process import Usage, usage_of
 
 FLIGHT_S: Final = 20.0
@@ -48,8 +52,12 @@ class Meter:
 
 
 def process() -> Iterator[Figure]:
-    """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both."""
-    experiment = load("robotic-park").experiment
+    """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both.
+
+    In real time, with periodic poses at 50 Hz and no plan of the leader.
+    """
+    read = load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
+    experiment = read.cases()["periodic"]
     plan = Plan(experiment)
     robots, bare = Meter(), Meter()
     first, last = dict[str, messages.Status](), dict[str, messages.Status]()
@@ -76,29 +84,20 @@ def process() -> Iterator[Figure]:
                     f"bare-{robot}", "tools.bench.bare_process", robot, rate, *senders, "--connect", endpoints[0]
                 )
                 beside[robot] = started.handle.pid
-            result = fly(launcher, folder, endpoints, look, duration_s=FLIGHT_S)
+            source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
+            source.write_text(read.text, encoding="utf-8")
+            context = CaseContext(experiment, "periodic", folder, source, endpoints, launcher, hosts)
+            result = Conductor(context, look).run()
     assert result.ready_s is not None
     yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
     of_robots, of_bare = robots.shares(), bare.shares()
-    yield Figure(
-        "process",
-        "CPU of a bare process (50 Hz pose)",
-        statistics.median(of_bare.values()),
-        "% of a core",
-        1.0,
-        "yardstick",
-    )
+    cpu = statistics.median(of_bare.values())
+    yield Figure("process", "CPU of a bare process (50 Hz pose)", cpu, "% of a core", 1.0, "yardstick")
     rates = {name: (last[name].sent - first[name].sent) / (last[name].stamp - first[name].stamp) for name in of_robots}
     pose_hz = experiment.rates.pose_hz
     ratio = statistics.median(of_robots[name] / rates[name] * pose_hz / of_bare[name] for name in rates)
-    yield Figure(
-        "process",
-        "CPU of a robot (50 Hz pose, 100 Hz body)",
-        statistics.median(of_robots.values()),
-        "% of a core",
-        ratio,
-        "× bare process, each pose",
-    )
+    cpu, of = statistics.median(of_robots.values()), "× bare process, each pose"
+    yield Figure("process", "CPU of a robot (50 Hz pose, 100 Hz body)", cpu, "% of a core", ratio, of)
     memory = max(usage.rss_mb for _, usage in bare.last.values())
     yield Figure("process", "largest resident memory of a bare process", memory, "MB", 1.0, "yardstick")
     larger = max(usage.rss_mb for _, usage in robots.last.values())

@@ -6,7 +6,6 @@ what the robots count, and how long their poses take. Everything is written down
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated, Final
 
 import typer
@@ -44,12 +43,7 @@ def soak(
     read.keep(folder / SOURCE)
     request = Request(str(folder / SOURCE), str(folder), name, changes, bodies)
     with interrupts() as interrupted:
-        soaked = sample(
-            experiment,
-            request,
-            interrupted=interrupted,
-            show=lambda line: print(line, file=sys.stderr, flush=True),
-        )
+        soaked = sample(experiment, request, interrupted)
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)
     page = soak_verdict.write(folder, soaked, findings, f"./zenpark soak {file} --minutes {minutes:g}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -85,14 +86,8 @@ def rows(found: Mapping[int, str], receiver: Receiver, t: float, recording: Path
         yield receiver.sampled(row)
 
 
-def sample(  # noqa: PLR0915 - one loop that follows one run
-    experiment: Experiment,
-    request: Request,
-    *,
-    interrupted: Callable[[], bool],
-    show: Callable[[str], None],
-) -> Soaked:
-    """Run a case and sample it until it is over.
+def sample(experiment: Experiment, request: Request, interrupted: Callable[[], bool]) -> Soaked:  # noqa: PLR0915
+    """Run a case and sample it until it is over; print a line a minute on standard error.
 
     Raises:
         RunFailed: If it does not begin.
@@ -145,7 +140,7 @@ def sample(  # noqa: PLR0915 - one loop that follows one run
                 printed = time.monotonic()
                 lost, memory = sum(row.lost or 0 for row in fresh), sum(row.rss_mb for row in fresh)
                 minutes = f"{(now - start) / 60.0:6.1f} of {duration / 60.0:g} min"
-                show(f"{minutes}: {len(fresh)} processes, {memory:.0f} MB, {lost} poses lost")
+                print(f"{minutes}: {len(fresh)} processes, {memory:.0f} MB, {lost} poses lost", file=sys.stderr)
         asked = interrupted()
         watched.end()
         code = watched.process.handle.poll()
