@@ -95,7 +95,8 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
             f"robots of kind {kind.name} need a spacing of {needed:.2f} m or more, not {distance.min():.2f} m"
         )
     scatter = round(FREE * wanted.spacing, 3) if wanted.scatter is None else wanted.scatter
-    names = _names(len(made), kind)
+    digits = max(2, len(str(len(made))))
+    names = [f"{PREFIX.get(kind.name, 'R')}{number:0{digits}d}" for number in range(1, len(made) + 1)]
     size = _arena(position, kind, scatter)
     width = max(len(f"{x:.3f}, {y:.3f}") for x, y in position[:, :2])
     robots = []
@@ -183,11 +184,6 @@ def _rounded(made: Layout, kind: Kind) -> Array:
     elif not made.position[:, 2].any():
         position[:, 2] = HOVER
     return position
-
-
-def _names(count: int, kind: Kind) -> list[str]:
-    digits = max(2, len(str(count)))
-    return [f"{PREFIX.get(kind.name, 'R')}{number:0{digits}d}" for number in range(1, count + 1)]
 
 
 def _arena(position: Array, kind: Kind, scatter: float) -> Array:

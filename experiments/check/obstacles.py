@@ -39,7 +39,8 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
     radius = np.array([kind.radius for kind in analysis.assignment.kinds])
     low, high = _heights(analysis, prediction.position[..., 2])
     poses = scene.along(prediction.time)
-    avoids = _avoids(analysis)
+    robots = analysis.experiment.robots.values()
+    avoids = np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
     met = []
     for number in range(len(scene.names)):
         gap = outlines.distance(scene, number, poses[:, None, number], prediction.position[..., :2]) - radius
@@ -148,12 +149,6 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
         subject = f"{join_names(alone)} {'is' if len(alone) == 1 else 'are'}"
         message = f'in real time {subject} in no common place and without range sensors, unless body = "world"'
         yield Finding("note", "alone", message, "", ("robots", alone[0]))
-
-
-def _avoids(analysis: Analysis) -> Mask:
-    """Mask (N,) of the rows with avoidance."""
-    robots = analysis.experiment.robots.values()
-    return np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
 
 
 def _sensors(robot: Robot) -> tuple[str, ...]:

@@ -88,7 +88,9 @@ def realisation(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
     else:
         yield from _unrealisable(analysis, shape)
-    for number, later in _later_shapes(analysis):
+    given = analysis.experiment.formation.changes
+    in_order = sorted(range(len(given)), key=lambda k: given[k].at_s)  # their numbers in the file
+    for number, later in zip(in_order, analysis.later, strict=False):
         if later.worst > OFF and shape.worst <= OFF:
             severity: Severity = "error" if later.worst > FAR_OFF else "warning"
             worst = analysis.link(int(later.error.argmax()))
@@ -103,12 +105,6 @@ def _asked(analysis: Analysis) -> str:
     found = {BY_DISTANCE} if wants is None else set(wants[analysis.standing].tolist())
     words = {BY_DISTANCE: "distances", BY_RELATIVE: "offsets", BY_BEARING: "bearings"}
     return "the " + " and ".join([word for want, word in words.items() if want in found] or ["anchors"])
-
-
-def _later_shapes(analysis: Analysis) -> list[tuple[int, Shape]]:
-    """The shape after each change, with the number that the change has in the file."""
-    given = analysis.experiment.formation.changes
-    return list(zip(sorted(range(len(given)), key=lambda k: given[k].at_s), analysis.later, strict=False))
 
 
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
@@ -212,8 +208,8 @@ def presence(analysis: Analysis) -> Iterator[Finding]:
     there = pattern.present(prediction.time, prediction.position)
     if there is None or analysis.parts > 1:
         return
-    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in _runs(there)])
     begins = np.concatenate([[0], 1 + np.flatnonzero((there[1:] != there[:-1]).any(axis=1))])
+    apart = np.array([components(pattern.links.take(mask), len(analysis.names)) for mask in there[begins]])
     broken = np.flatnonzero(apart > 1)
     count = there.sum(axis=1)
     if not len(broken):
@@ -230,11 +226,6 @@ def presence(analysis: Analysis) -> Iterator[Finding]:
     remedy = "start nearer to each other, or give a longer range" if near else "let links overlap in time"
     path: Path = ("formation", "proximity", "range") if near else ("formation", "links")
     yield Finding("warning", "comes-apart", message, remedy, path)
-
-
-def _runs(there: Mask) -> Mask:
-    """First mask of every run of equal masks (T, E) over time."""
-    return np.asarray(there[np.concatenate([[True], (there[1:] != there[:-1]).any(axis=1)])])
 
 
 def redundancy(analysis: Analysis) -> Iterator[Finding]:

@@ -10,7 +10,7 @@ from experiments.catalogue import index
 from experiments.file import arena_file
 from experiments.file.arena_file import ArenaFile
 from experiments.file.json_schema import write_schema
-from experiments.file.problems import DocumentError, Problem, refusal
+from experiments.file.problems import DocumentError, refusal
 from experiments.file.text import reason
 
 
@@ -22,7 +22,7 @@ def names() -> list[tuple[str, str]]:
 def path(name: str) -> Path:
     """The file of a catalogue entry; raises DocumentError if there is none of that name."""
     if name not in index.names():
-        raise DocumentError([no_entry(name)])
+        raise no_entry(name)
     return _entry(name)
 
 
@@ -74,12 +74,10 @@ def _entry(name: str) -> Path:
     return index.FOLDER / f"{name}.toml"
 
 
-def no_entry(name: str) -> Problem:
-    """Problem of a name that is neither a file nor an entry."""
-    hint = did_you_mean(name, index.names())
-    return Problem(
-        name, 0, 0, "neither a file nor an experiment of the catalogue", f"{hint} (./zenpark new copies one)"
-    )
+def no_entry(name: str) -> DocumentError:
+    """Error of a name that is neither a file nor an entry."""
+    hint = f"{did_you_mean(name, index.names())} (./zenpark new copies one)"
+    return refusal(name, "neither a file nor an experiment of the catalogue", hint)
 
 
 def find_file(name: str | Path) -> Path:

@@ -81,7 +81,7 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     try:
         text = content(file, label)
     except FileNotFoundError:
-        raise DocumentError([catalogue.no_entry(label)]) from None
+        raise catalogue.no_entry(label) from None
     return _document(file, label, text, overrides)
 
 

@@ -19,6 +19,7 @@ from agents.body.kinds import KINDS
 from experiments.authoring.robotic_park.file import PLACES, SURFACES, Park, Relation, Robot, Task, read, starts_from
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
+from experiments.check.findings import join_names
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.consistency import divisor
@@ -161,7 +162,7 @@ def _note_robots(park: Park, notes: list[str]) -> None:
 
     def those(what: Callable[[Robot], object], note: str) -> None:
         if names := [robot.name for robot in park.robots if what(robot)]:
-            notes.append(note.format(_shorten_names(names), "is" if len(names) == 1 else "are"))
+            notes.append(note.format(join_names(names), "is" if len(names) == 1 else "are"))
 
     those(
         lambda robot: robot.place != "virtual" and not _body(robot),
@@ -224,7 +225,7 @@ def _formation_table(
         table["gain"] = _rounded(usual["distance"])
         if scaled := [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]:
             notes.append(
-                f"gain of {_shorten_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
+                f"gain of {join_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
                 " the distance that is wanted and weaker beyond"
             )
     if "pose" in usual:
@@ -270,11 +271,6 @@ def _words(value: object) -> str:
     if isinstance(value, tuple):
         return "threshold {:g} + {:g}·|·|".format(*value)
     return "no threshold" if value is None else f"{value:g}"
-
-
-def _shorten_names(names: Sequence[str]) -> str:
-    """Names for a sentence, the first ones of many."""
-    return ", ".join(names) if len(names) <= 3 else f"{', '.join(names[:2])} and {len(names) - 2} more"
 
 
 def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> dict[str, Any]:
