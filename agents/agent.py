@@ -258,7 +258,7 @@ class Agent:
         else:
             own, near = self._perception.sense(t, state, self.neighbours.poses)
             inputs, wanted = (goal, own, near, 1.0 / self.assignment.body_hz), goal
-            goal = call("avoidance", avoidance.deviate, *inputs, shape=goal.shape, each="a goal per row")
+            goal = call("avoidance", avoidance, "deviate", *inputs, shape=goal.shape, each="a goal per row")
             setpoint = self._controller.setpoint(goal, self.goal_yaw, state.position, state.yaw)
             filtered = self._safety.check(
                 setpoint, state.position, state.yaw, age, where=where, avoidance=(avoidance, own, near)

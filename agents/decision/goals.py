@@ -160,7 +160,7 @@ class GoalComputer:
         law, neighbours, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
         inputs = position, believed, neighbours.links
-        offset = call("law", law.offset, *inputs, shape=position.shape, each="a vector for each robot")
+        offset = call("law", law, "offset", *inputs, shape=position.shape, each="a vector for each robot")
         return offset if anchors is None else offset + anchors.offset(position)
 
     def errors(self, t: float, position: Array) -> tuple[Array, Array]:
@@ -171,7 +171,7 @@ class GoalComputer:
         law, neighbours = self._assignment.law, self.neighbours
         believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
         inputs, shape = (position, believed, neighbours.links), neighbours.links.receiver.shape
-        error = call("law", law.error, *inputs, shape=shape, each="one value for each link")
+        error = call("law", law, "error", *inputs, shape=shape, each="one value for each link")
         both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
         anchors = self._assignment.anchors
         if anchors is not None:

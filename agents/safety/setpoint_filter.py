@@ -105,8 +105,9 @@ class SetpointFilter:
         self._limit(safe, here, yaw, age)
         avoided = no_row
         if avoidance is not None:
-            restrain, own, near = avoidance[0].restrain, *avoidance[1:]
-            wished = call("avoidance", restrain, safe.copy(), own, near, shape=safe.shape, each="a setpoint per row")
+            rule, own, near = avoidance
+            inputs, each = (safe.copy(), own, near), "a setpoint per row"
+            wished = call("avoidance", rule, "restrain", *inputs, shape=safe.shape, each=each)
             other = np.asarray((wished != safe).any(axis=1) & np.isfinite(wished).all(axis=1))
             other &= ~(invalid | not_finite)
             if some(other):
