@@ -149,28 +149,23 @@ class Bar:
 
     def _draw(self, what: str, done: int, of: int) -> None:
         if self._bar is None:
-            self._bar = _bar(transient=self._passing)
+            from rich import progress as rich
+            from rich.console import Console
+
+            columns = (rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn())
+            self._bar = rich.Progress(
+                *columns,
+                rich.TimeElapsedColumn(),
+                rich.TimeRemainingColumn(),
+                console=Console(stderr=True),
+                transient=self._passing,
+                get_time=time.monotonic,
+            )
             self._bar.start()
         if self._task is None or self._bar.tasks[-1].description != what:
             self._task = self._bar.add_task(what, total=of, completed=done)
             self._bar.tasks[-1].start_time = self._began  # it may have gone on for a while before it is shown
         self._bar.update(self._task, completed=done)
-
-
-def _bar(*, transient: bool) -> Any:  # noqa: ANN401 - rich is imported only here
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
-    return Progress(*columns, TimeRemainingColumn(), console=console, transient=transient, get_time=time.monotonic)
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
