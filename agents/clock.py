@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final
 
@@ -34,17 +33,12 @@ def correction_line(correction_s: float) -> bytes:
     return _WORD + f"{correction_s:.6f}\n".encode()
 
 
-@dataclass
 class Clock:
     """UTC of the experiment."""
 
-    # added to this machine's UTC where stamps are made, so that their readers need no machine [s]
-    correction_s: float = 0.0
-    _wanted: float = field(init=False, repr=False)
-    _zero: float = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._wanted = self.correction_s
+    def __init__(self, correction_s: float = 0.0) -> None:
+        # added to this machine's UTC where stamps are made, so that their readers need no machine [s]
+        self.correction_s = self._wanted = correction_s
         shared = os.environ.get(READING)
         self._zero = time.time() - time.monotonic() if shared is None else float(shared)
 

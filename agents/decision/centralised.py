@@ -45,7 +45,7 @@ class Centre:
         rows = len(assignment.names)
         self.assignment, self.guided = assignment, assignment.guided
         self.goal_computer = GoalComputer(assignment, self.guided)
-        self.poses, self.yaw = NeighbourPoses.none_received(rows), np.zeros(rows)
+        self.poses, self.yaw = NeighbourPoses(rows), np.zeros(rows)
         self._holding = StationKeeping(self.goal_computer.ground)
         self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
         self._pose_stamp, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, PoseTable, every, some
@@ -11,22 +9,17 @@ from agents.formation.graph import Links
 from agents.plugins.predictors import HOLD, Predictor
 
 
-@dataclass
 class NeighbourPoses:
     """Last pose received on each link (E), and liveliness of its sender."""
 
-    position: Array  # (E, 3) [m], NaN before the first pose
-    velocity: Array  # (E, 3) [m/s]
-    stamp: Array  # (E,) time of measurement, limited to plausible values [s]; −inf before the first pose
-    arrival: Array  # (E,) time of reception [s]
-    # (E,) loss of the sender [s]; inf: alive; −inf: liveliness token never seen, a pose is no sign of life
-    lost_since: Array
-
-    @classmethod
-    def none_received(cls, count: int) -> NeighbourPoses:
-        """State before any pose or token."""
-        never = np.full(count, -np.inf)
-        return cls(np.full((count, 3), np.nan), np.zeros((count, 3)), never, never.copy(), never.copy())
+    def __init__(self, links: int) -> None:
+        self.position: Array = np.full((links, 3), np.nan)  # (E, 3) [m], NaN before the first pose
+        self.velocity: Array = np.zeros((links, 3))  # (E, 3) [m/s]
+        # (E,) time of measurement, limited to plausible values [s]; −inf before the first pose
+        self.stamp: Array = np.full(links, -np.inf)
+        self.arrival: Array = np.full(links, -np.inf)  # (E,) time of reception [s]
+        # (E,) loss of the sender [s]; inf: alive; −inf: liveliness token never seen, a pose is no sign of life
+        self.lost_since: Array = np.full(links, -np.inf)
 
     def receive(self, received: PoseTable) -> PoseTable:
         """Store poses received on links (H), in order of arrival; returns those that are newer than the known ones."""
@@ -78,7 +71,7 @@ class NeighbourStates:
 
     def __init__(self, links: Links, avoidance_only: Mask | None, silence_s: float) -> None:
         """Start without poses; `avoidance_only` (E,) links never enter the law, lost ones leave after `silence_s`."""
-        self.poses = NeighbourPoses.none_received(len(links))
+        self.poses = NeighbourPoses(len(links))
         self.incomplete = True
         self.clock_lag = None
         self._all, self._avoidance_only, self._silence_s = links, avoidance_only, silence_s

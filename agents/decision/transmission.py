@@ -34,7 +34,7 @@ class Transmitter:
         self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
     ) -> None:
         """Without `kinds` rows are smoothed as robots on wheels are."""
-        self.trigger, self.last_event = trigger, LastEvent.none(rows)
+        self.trigger, self.last_event = trigger, LastEvent(rows)
         self._kinds = kinds
         self._predictor, self._state = predictor, trigger.state(rows)
         self._smoothed: LowPass | None = None

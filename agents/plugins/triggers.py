@@ -26,24 +26,18 @@ Place = Literal["communication", "control"]
 ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this
 
 
-@dataclass
 class LastEvent:
     """State at the last event of each row (N): its last transmission, or the last computation of its law.
 
     Rows without an event have an infinite position and a time of minus infinity.
     """
 
-    position: Array  # (N, 3) transmitted [m]
-    velocity: Array  # (N, 3) transmitted [m/s]
-    time: Array  # (N,) of the event [s]
-    offset: Array  # (N, 3) of the law [m]
-    energy: Array  # (N,) of the formation error [m²]
-
-    @classmethod
-    def none(cls, rows: int) -> LastEvent:
-        """State before any event."""
-        zeros = np.zeros((rows, 3))
-        return cls(np.full((rows, 3), np.inf), zeros, np.full(rows, -np.inf), zeros.copy(), np.zeros(rows))
+    def __init__(self, rows: int) -> None:
+        self.position: Array = np.full((rows, 3), np.inf)  # (N, 3) transmitted [m]
+        self.velocity: Array = np.zeros((rows, 3))  # (N, 3) transmitted [m/s]
+        self.offset: Array = np.zeros((rows, 3))  # (N, 3) of the law [m]
+        self.time: Array = np.full(rows, -np.inf)  # (N,) of the event [s]
+        self.energy: Array = np.zeros(rows)  # (N,) of the formation error [m²]
 
     def record(self, rows: Index, view: View) -> None:
         """Record an event of `rows` with the values of `view`."""

@@ -86,7 +86,7 @@ class Runtime:
         self._mime = messages.MIME[setup.encoding]
         self._dt = 1.0 / assignment.body_hz
         self._state_every = round(assignment.body_hz / setup.state_hz)
-        self._counts = Counts.nothing(len(self._names))
+        self._counts = Counts(len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were ordered to leave the run

@@ -10,7 +10,6 @@ import resource
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ import numpy as np
 import zenoh
 
 from agents.agent import Actions, Agent
-from agents.arrays import Array, Index
+from agents.arrays import Array
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
@@ -33,21 +32,15 @@ WORDS: Final = tuple(phase.word for phase in Phase)
 UNDER_WAY: Final = ("airborne", "running")
 
 
-@dataclass
 class Counts:
     """Counters of a process of n rows; ticks and interventions since the common start."""
 
-    sent: list[int]  # (n) poses
-    interventions: Index  # (n,) ticks on which safety changed the decision
-    avoided: Index  # (n,) ticks on which avoidance did
-    refused: int = 0  # orders
-    ticks: int = 0
-    missed: int = 0  # skipped ticks
-    late_s: float = 0.0  # [s] largest lateness of a tick since the last status
-
-    @classmethod
-    def nothing(cls, rows: int) -> Counts:
-        return cls([0] * rows, *np.zeros((2, rows), dtype=np.intp))
+    def __init__(self, rows: int) -> None:
+        self.sent = [0] * rows  # (n) poses
+        self.interventions: Index = np.zeros(rows, dtype=np.intp)  # (n,) ticks on which safety changed the decision
+        self.avoided: Index = np.zeros(rows, dtype=np.intp)  # (n,) ticks on which avoidance did
+        self.refused = self.ticks = self.missed = 0  # orders, ticks, skipped ticks
+        self.late_s = 0.0  # [s] largest lateness of a tick since the last status
 
     def begin(self) -> None:
         """Resets the counters that begin at the common start."""

@@ -56,7 +56,7 @@ def test_of_samples_that_arrive_together_the_newest_stays(order):
 
 
 def test_nothing_heard_is_nothing():
-    heard = NeighbourPoses.none_received(2)
+    heard = NeighbourPoses(2)
     assert np.isnan(heard.position).all()
     assert (heard.stamp == -np.inf).all()
     assert (heard.lost_since == -np.inf).all()

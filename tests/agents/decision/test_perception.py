@@ -28,7 +28,7 @@ def state(position, yaw=0.0, velocity=0.0, time=0.0, rays=None):
 
 def heard(position, velocity=0.0, stamp=0.0):
     place = np.array(position, dtype=float).reshape(-1, 3)
-    told = NeighbourPoses.none_received(len(place))
+    told = NeighbourPoses(len(place))
     told.position[:], told.velocity[:] = place, velocity
     told.stamp[:] = told.arrival[:] = stamp
     told.lost_since[:] = np.inf  # they live
@@ -61,7 +61,7 @@ def alone(kind=KHEPERA4):
 
 def placed(sight, t, now, told=None):
     """Places of the things that one row sees."""
-    return sight.sense(t, now, NeighbourPoses.none_received(0) if told is None else told)[1].position
+    return sight.sense(t, now, NeighbourPoses(0) if told is None else told)[1].position
 
 
 # ---------------------------------------------------------------- oneself
@@ -69,14 +69,14 @@ def placed(sight, t, now, told=None):
 
 @pytest.mark.parametrize("absurd", [np.nan, np.inf, -np.inf, 51.0, -1e8, 1e38])
 def test_a_velocity_that_no_robot_has_is_not_known(absurd):
-    own, _ = alone().sense(0.0, state([[0, 0, 0]], velocity=[[0.1, absurd, 0.2]]), NeighbourPoses.none_received(0))
+    own, _ = alone().sense(0.0, state([[0, 0, 0]], velocity=[[0.1, absurd, 0.2]]), NeighbourPoses(0))
     np.testing.assert_array_equal(own.velocity, [[0.1, 0.0, 0.2]])
 
 
 def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
     sight = perception((KHEPERA4, TELLO, CRAZYFLIE), (KHEPERA4,), links([], [], []))
     now = state([[0, 0, 0], [1, 0, 1], [2, 0, 1]], yaw=[1, 2, 3], velocity=[[0.1, 0, 0], [np.nan] * 3, [0, 0.2, 0]])
-    own, near = sight.sense(0.0, now, NeighbourPoses.none_received(0))
+    own, near = sight.sense(0.0, now, NeighbourPoses(0))
     assert own.speed.tolist() == [KHEPERA4.speed, 0.5, 0.5]
     assert own.takes == ("twist", "velocity", "position")
     assert own.by_twist.tolist() == [True, False, False]
@@ -123,7 +123,7 @@ def test_who_is_far_or_was_never_heard_is_not_near():
     sight, now = pair(), state([0, 0, 0], time=9.0)
     assert len(placed(sight, 9.0, now, heard([REACH - 0.01, 0, 0], stamp=9.0))) == 1
     assert len(placed(sight, 9.0, now, heard([REACH + 0.01, 0, 0], stamp=9.0))) == 0
-    assert len(placed(sight, 9.0, now, NeighbourPoses.none_received(1))) == 0
+    assert len(placed(sight, 9.0, now, NeighbourPoses(1))) == 0
 
 
 def test_who_is_gone_is_in_the_way_where_it_was_heard_last():
@@ -171,7 +171,7 @@ def test_who_does_not_know_where_it_is_or_does_not_avoid_knows_of_nothing():
 
 def test_a_ray_ends_where_it_points_from_the_pose_of_the_robot():
     now = state([1.0, 2.0, 0.0], yaw=0.5, rays=rays([0, 0, 0], [0.0, math.pi / 2, 1.0], [0.4, 0.9, np.nan]))
-    _, near = alone().sense(0.0, now, NeighbourPoses.none_received(0))
+    _, near = alone().sense(0.0, now, NeighbourPoses(0))
     c, s = math.cos(0.5), math.sin(0.5)
     np.testing.assert_allclose(near.position, [[1 + 0.4 * c, 2 + 0.4 * s], [1 - 0.9 * s, 2 + 0.9 * c]])
     assert not near.radius.any()
@@ -214,7 +214,7 @@ def test_old_readings_are_none():
 
 def test_rays_that_look_up_and_what_is_over_or_under_the_robot_are_left_out():
     now = state([0, 0, 1.0], rays=rays([0, 0, 0], 0.0, [0.3, 0.3, 0.3], elevation=[math.pi / 2, 0.2, -0.6]))
-    _, near = alone(TELLO).sense(0.0, now, NeighbourPoses.none_received(0))
+    _, near = alone(TELLO).sense(0.0, now, NeighbourPoses(0))
     np.testing.assert_allclose(near.position, [[0.3 * math.cos(0.2), 0.0]])
     np.testing.assert_allclose(near.low, [1.0 + 0.5 * TELLO.height + 0.3 * math.sin(0.2)])
     np.testing.assert_array_equal(near.low, near.high)
@@ -231,7 +231,7 @@ def test_a_robot_that_was_heard_is_not_seen_a_second_time():
     _, near = pair().sense(0.0, now, heard([*at, 0.0]))
     assert near.is_robot.sum() == 1
     assert (~near.is_robot).sum() == (~hits).sum() == 10
-    _, near = pair().sense(0.0, now, NeighbourPoses.none_received(1))
+    _, near = pair().sense(0.0, now, NeighbourPoses(1))
     assert len(near) == len(bearing)
     high = pair(KHEPERA4, CRAZYFLIE).sense(0.0, now, heard([*at, 1.0]))[1]  # a drone overhead is not what the ray met
     assert len(high) == len(bearing)

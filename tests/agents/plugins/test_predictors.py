@@ -54,7 +54,7 @@ def test_constant_velocity_goes_on_until_its_horizon():
 
 
 def test_what_was_heard_is_carried_on_from_the_time_of_its_sample():
-    heard = NeighbourPoses.none_received(3)
+    heard = NeighbourPoses(3)
     heard.position[:2], heard.velocity[:2] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]
     heard.stamp[:2], heard.arrival[:2] = [4.0, 4.5], [4.4, 4.9]  # the delay of the network is made up for
     both = np.array([0, 1])

@@ -48,7 +48,7 @@ def view(position, last_event, *, t=0.0, error=0.0):
 
 def last_event(position, t=0.0):
     """Everybody said this at `t`."""
-    said = LastEvent.none(len(position))
+    said = LastEvent(len(position))
     said.position[:], said.time[:] = position, t
     return said
 
@@ -155,7 +155,7 @@ def test_send_on_delta_speaks_beyond_the_threshold_and_not_at_it():
 )
 def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, length_s, expected):
     trigger = Periodic(period_s=period)
-    said, state, sent = LastEvent.none(1), trigger.state(1), 0
+    said, state, sent = LastEvent(1), trigger.state(1), 0
     moment = view([[0.0] * 3], said)
     for tick in range(begin_s * hz, (begin_s + length_s) * hz):
         moment.t = tick / hz
@@ -167,7 +167,7 @@ def test_periodic_counts_are_exact_however_long_it_runs(period, hz, begin_s, len
 
 def test_a_trigger_must_say_when_it_fires():
     with pytest.raises(TypeError, match="Trigger must define `fires`"):
-        Trigger().due(view([[0.0] * 3], LastEvent.none(1)), Trigger().state(1))
+        Trigger().due(view([[0.0] * 3], LastEvent(1)), Trigger().state(1))
 
 
 def test_what_fires_must_be_one_bool_per_row():
@@ -176,7 +176,7 @@ def test_what_fires_must_be_one_bool_per_row():
             return np.array([True])
 
     with pytest.raises(ValueError, match=r"`fires` must give one bool per row, \(2,\), not \(1,\)"):
-        Wrong().due(view(np.zeros((2, 3)), LastEvent.none(2)), Wrong().state(2))
+        Wrong().due(view(np.zeros((2, 3)), LastEvent(2)), Wrong().state(2))
 
 
 def test_the_table_of_the_docs_has_every_family_with_its_defaults():

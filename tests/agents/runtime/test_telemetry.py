@@ -50,7 +50,7 @@ class Robot:
         self.neighbours = PoseInbox(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
         self.telemetry = Telemetry(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
-            agent=self.agent, neighbours=self.neighbours, counts=Counts.nothing(1), malformed=lambda: 0, ranged=[True],
+            agent=self.agent, neighbours=self.neighbours, counts=Counts(1), malformed=lambda: 0, ranged=[True],
         )  # fmt: skip
         self.telemetry.utc = UTC
 
