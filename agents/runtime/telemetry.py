@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 
 from agents.agent import Actions, Agent
-from agents.arrays import Array
+from agents.arrays import Array, Index
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
