@@ -22,7 +22,6 @@ from experiments.check.findings import FORGIVEN
 from experiments.check.ideal_run import Prediction, closed_shares
 from experiments.check.realisation import (
     Shape,
-    algebraic_connectivity,
     find_shapes,
     formation_redundancy,
     formation_rigidity,
@@ -54,7 +53,6 @@ class Analysis:
     without_neighbours: Index  # rows without neighbours
     start: Array  # (N, 3) on the floor [m]
     parts: int  # of the network
-    fiedler: float  # algebraic connectivity
     asked: Links  # the links of the beginning, with what the law takes them to ask for
     standing: Mask  # (E,) those that are there at the beginning, however far the robots are from each other
     # places that were tried for the last stage of the formation, the best of which is to be its end
@@ -98,7 +96,7 @@ class Analysis:
     @property
     def legs(self) -> list[tuple[int, str, Planner]]:
         """Number in the timeline, robot and planner of each leg."""
-        built = {name: iter(legs) for (rows, legs) in self.assignment.legs for name in [self.names[rows[0]]]}
+        built = {name: iter(legs) for name, legs in self.plan.legs_by_robot.items()}
         return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.experiment.timeline)]
 
     @property
@@ -230,7 +228,6 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         without_neighbours=silent,
         start=start,
         parts=components(links, rows),
-        fiedler=algebraic_connectivity(links, rows),
         asked=asked,
         standing=standing,
         shapes=tuple(stages[-1]) if stages else (),

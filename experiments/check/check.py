@@ -19,6 +19,7 @@ from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
 from experiments.check.findings import FORGIVEN, MARK, Finding, first_of_each_code
 from experiments.check.ideal_run import message_rate, predict, undisturbed
+from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
 from experiments.file.document import Document, Source, chosen
@@ -171,7 +172,7 @@ def _figures(analysis: Analysis) -> Figures:
         edges=len(edges(assignment.links)),
         parts=analysis.parts,
         leaders=analysis.plan.leaders,
-        algebraic_connectivity=analysis.fiedler,
+        algebraic_connectivity=algebraic_connectivity(assignment.links, len(analysis.names)),
         rank=planar.rank if planar else None,
         rank_needed=planar.needed if planar else None,
         rank_space=spatial.rank if spatial else None,
