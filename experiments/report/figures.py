@@ -47,7 +47,6 @@ from experiments.report.style import (
     panel_height,
     plain,
     robot_lines,
-    save,
     styled,
     svg,
     thinned,
@@ -61,7 +60,7 @@ WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
 MOST_SEEDS: Final = 50  # of a case, for the range of its errors
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
 
-__all__ = ["formation", "plan_view", "save", "svg"]  # besides those of this module
+__all__ = ["formation", "plan_view", "svg"]  # besides those of this module
 
 
 def every(

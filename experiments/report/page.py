@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -154,6 +153,7 @@ def render(
         facts=facts,
         command=command,
         findings=verdict,
+        marks=MARKS,
         sections=sections,
         foot=version.provenance().words[:2] if foot is None else foot,
         replay=replay,
@@ -167,18 +167,7 @@ MARKS: Final[dict[Mark, str]] = {"good": "✓", "fair": "!", "bad": "✗", "plai
 
 def fragment(title: str, verdict: Sequence[Finding], tables: Sequence[Table]) -> str:
     """Verdict and tables as HTML without a page around it, for the end of a notebook's cell."""
-
-    def cell(value: Cell) -> str:
-        return escape(value) if isinstance(value, str) else f"{escape(value[0])} <small>{escape(value[1])}</small>"
-
-    parts = [f"<b>{escape(title)}</b>"]
-    parts += [f"<div>{MARKS[finding.mark]} {escape(finding.text)}</div>" for finding in verdict]
-    for table in tables:
-        head = "".join(f"<th>{escape(each)}</th>" for each in table.head)
-        rows = "".join(f"<tr>{''.join(f'<td>{cell(each)}</td>' for each in row.cells)}</tr>" for row in table.rows)
-        parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>")
-        parts.append(f"<small>{escape(table.note)}</small>")
-    return "".join(parts)
+    return template("fragment.html.jinja").render(title=title, findings=verdict, tables=tables, marks=MARKS)
 
 
 def numbered(drawn: Iterable[tuple[Figure | str, str]], first: int = 1) -> tuple[PageFigure, ...]:

@@ -269,7 +269,7 @@ def test_whatever_is_unknown_can_be_drawn(draw):
 
 def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path):
     figure = figures.intervals([park(duration=3.0)])
-    drawing, page = figures.save(figure, tmp_path / "figures", "intervals")
+    drawing, page = style.save(figure, tmp_path / "figures", "intervals")
     assert drawing.read_text() == figures.svg(figures.intervals([park(duration=3.0)]))
     assert "<text" not in drawing.read_text()
     assert set(re.findall(r"https?://[^\"]*", drawing.read_text().split("<svg")[1])) <= {
