@@ -30,18 +30,12 @@ def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
 class External:
     """The last external pose of each row, and a filtered derivative of it."""
 
-    time: Array  # (n,) [s], minus infinity before the first pose
-    position: Array  # (n, 3) [m], NaN before the first pose
-    velocity: Array  # (n, 3) [m/s]
-    yaw: Array  # (n,) [rad]
-    refused: int  # poses that jumped farther than a robot can move
-
     def __init__(self, rows: int) -> None:
-        self.time = np.full(rows, -np.inf)
-        self.position = np.full((rows, 3), np.nan)
-        self.velocity = np.zeros((rows, 3))
-        self.yaw = np.full(rows, np.nan)
-        self.refused = 0
+        self.time: Array = np.full(rows, -np.inf)  # (n,) [s], minus infinity before the first pose
+        self.position: Array = np.full((rows, 3), np.nan)  # (n, 3) [m], NaN before the first pose
+        self.velocity: Array = np.zeros((rows, 3))  # (n, 3) [m/s]
+        self.yaw: Array = np.full(rows, np.nan)  # (n,) [rad]
+        self.refused = 0  # poses that jumped farther than a robot can move
 
     def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
         """Stores a pose; returns False if it is old, or jumps farther than a robot can move."""

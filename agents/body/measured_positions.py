@@ -17,20 +17,16 @@ from agents.network.keys import Keys
 class MeasuredPositions:
     """Subscriptions to the keys `position` of some rows; polled."""
 
-    # (N,) [s] stamp of the last position of each row less the time of its arrival: the clock of its source is ahead by
-    # at least so much, or, where negative, behind or late; NaN before the first
-    ahead: Array
-    malformed: list[int]  # (N,) refused positions
-    trouble: list[str]  # (N,) reason of the last refusal
-
     def __init__(
         self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int], reach: messages.Vector
     ) -> None:
         """Subscribes for `rows` of the robots `names`; positions beyond `reach` [m] are refused."""
         self._names, self._reach = tuple(names), reach
-        self.ahead = np.full(len(self._names), nan)
-        self.malformed = [0] * len(self._names)
-        self.trouble = [""] * len(self._names)
+        # (N,) [s] stamp of the last position of each row less the time of its arrival: the clock of its source is ahead
+        # by at least so much, or, where negative, behind or late; NaN before the first
+        self.ahead: Array = np.full(len(self._names), nan)
+        self.malformed = [0] * len(self._names)  # (N,) refused positions
+        self.trouble = [""] * len(self._names)  # (N,) reason of the last refusal
         self._inboxes = {
             row: pubsub.Inbox(
                 pubsub.subscriber(session, keys.position(self._names[row]), 32),

@@ -32,28 +32,23 @@ class CentreGoals:
 class Centre:
     """Central controller of the rows `assignment.guided` among all robots (N) of an experiment."""
 
-    poses: NeighbourPoses  # last received of each robot (N)
-    yaw: Array  # (N,) last received [rad]
-    needed: Index  # rows whose poses are needed: the guided ones and their senders
-    goal_computer: GoalComputer
-    decisions: int  # since the first guided robot began
-    updates: Index  # (N,) decisions at which the goal of each row was computed anew
-
     def __init__(self, assignment: Assignment) -> None:
         """Take the `assignment` of all robots, with links, anchors and plans of the guided ones."""
         assert assignment.guided is not None
         rows = len(assignment.names)
         self.assignment, self.guided = assignment, assignment.guided
         self.goal_computer = GoalComputer(assignment, self.guided)
-        self.poses, self.yaw = NeighbourPoses(rows), np.zeros(rows)
+        self.poses = NeighbourPoses(rows)  # last received of each robot (N)
+        self.yaw: Array = np.zeros(rows)  # (N,) last received [rad]
         self._holding = StationKeeping(self.goal_computer.ground)
         self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
         self._pose_stamp, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)
-        self.decisions = 0
-        self.updates = np.zeros(rows, dtype=np.intp)
+        self.decisions = 0  # since the first guided robot began
+        # (N,) decisions at which the goal of each row was computed anew
+        self.updates: Index = np.zeros(rows, dtype=np.intp)
         sends = np.zeros(rows, dtype=bool)
         sends[assignment.links.sender] = True
-        self.needed = np.flatnonzero(self.guided | sends)
+        self.needed: Index = np.flatnonzero(self.guided | sends)  # rows whose poses are needed
 
     def receive(self, received: PoseTable) -> None:
         """Store poses, whose `link` is the row of the robot, in order of arrival; outdated ones are dropped."""
@@ -140,20 +135,15 @@ class Centre:
 class Guidance:
     """Goals received from the central controller, one per row (N), their age, and liveliness of the controller."""
 
-    guided: Mask  # (N,)
-    goal: Array  # (N, 3) last received [m]
-    goal_yaw: Array  # (N,) wanted there [rad], NaN for any
-    stamp: Array  # (N,) time of its decision [s]; minus infinity before the first
-    fresh: Mask  # (N,) goals not used yet
-    lost_since: float  # loss of the controller [s]; infinity while it is alive
-
     def __init__(self, guided: Mask, flies: Mask, silence_s: float) -> None:
         """Start without goals; those on wheels are on the floor, those older than `silence_s` [s] are ignored."""
         rows = len(guided)
         self.guided, self._flies, self._silence_s = guided, flies, silence_s
-        self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
-        self.stamp, self.lost_since = np.full(rows, -np.inf), np.inf
-        self.fresh = np.zeros(rows, dtype=bool)
+        self.goal: Array = np.full((rows, 3), np.nan)  # (N, 3) last received [m]
+        self.goal_yaw: Array = np.full(rows, np.nan)  # (N,) wanted there [rad], NaN for any
+        self.stamp: Array = np.full(rows, -np.inf)  # (N,) time of its decision [s]; minus infinity before the first
+        self.fresh: Mask = np.zeros(rows, dtype=bool)  # (N,) goals not used yet
+        self.lost_since = np.inf  # loss of the controller [s]; infinity while it is alive
 
     def receive(self, rows: Index, goal: Array, yaw: Array, stamp: Array) -> Mask:
         """Store goals (H, 3) of `rows` (H,), each once, decided at `stamp` (H,) [s]; returns which were new (H,)."""

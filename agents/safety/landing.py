@@ -31,10 +31,6 @@ WAYS: Final = np.arange(16) * (2.0 * np.pi / 16)  # [rad] and their directions
 class Landing:
     """Rows on their way to a place where they can land."""
 
-    aside: Mask  # (N,) rows that must land and are not at their place yet
-    any_aside: bool
-    place: Array  # (N, 3) their landing place [m]
-
     def __init__(self, assignment: Assignment) -> None:
         """Of the rows of an assignment; the senders on their links, for the law or for avoidance, are considered."""
         rows, links = len(assignment.names), assignment.links
@@ -47,8 +43,8 @@ class Landing:
         self._their_height = np.array([kind.height for kind in senders])
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._no_row: Mask = np.zeros(rows, dtype=bool)
-        self.aside, self.any_aside = self._no_row, False
-        self.place = np.full((rows, 3), np.nan)
+        self.aside, self.any_aside = self._no_row, False  # (N,) rows that must land and are not at their place yet
+        self.place: Array = np.full((rows, 3), np.nan)  # (N, 3) their landing place [m]
         self._until = np.full(rows, -np.inf)
         self._apart = np.full(len(links), np.inf)
 
