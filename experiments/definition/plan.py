@@ -196,20 +196,17 @@ class Plan:
         experiment = self.experiment
         return experiment.world.patience_s if experiment.robots[name].body == WORLD else experiment.safety.blind_s
 
-    def assignment(self, names: Sequence[str] | None = None, copies: int = 1) -> Assignment:
+    def assignment(self, names: Sequence[str] | None = None, copies: int = 1, *, centrally: bool = False) -> Assignment:
         """The part of some robots, or of all; with `copies`, all robots side by side for as many repetitions.
+
+        Args:
+            centrally: The part of the central controller: links, anchors and plans are those of robots that it guides.
 
         Raises:
             ValueError: If copies are asked for but not of all robots: their links would point nowhere.
         """
-        return self._assignment(self.names if names is None else names, copies, centrally=False)
-
-    def centre_assignment(self, copies: int = 1) -> Assignment:
-        """The part of the central controller: all robots, with links, anchors and plans of those that it guides."""
-        return self._assignment(self.names, copies, centrally=True)
-
-    def _assignment(self, names: Sequence[str], copies: int, *, centrally: bool) -> Assignment:
         experiment, all_names, guided = self.experiment, self.names, self.guided
+        names = all_names if names is None else names
         if copies > 1 and tuple(names) != all_names:
             raise ValueError("only the whole experiment can be repeated")
         rows = self.rows(names)

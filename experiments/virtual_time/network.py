@@ -80,7 +80,7 @@ class VirtualCentre:
     """
 
     def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
-        self.centre = Centre(Plan(experiment).centre_assignment(len(seeds)))
+        self.centre = Centre(Plan(experiment).assignment(copies=len(seeds), centrally=True))
         self.centre.mark_alive(self.centre.needed)  # all robots are there from the beginning
         self._sent: list[PoseTable] = []
         self._followed: list[PoseTable] = []

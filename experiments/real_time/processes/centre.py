@@ -57,7 +57,7 @@ class CentreProcess:
         endpoints: Sequence[str] = (),
     ) -> None:
         """Declares all but the token, which tells that orders are received. `endpoints` are those of the session."""
-        assignment = Plan(experiment).centre_assignment()
+        assignment = Plan(experiment).assignment(centrally=True)
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
         self._ownership = ownership

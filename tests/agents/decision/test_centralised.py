@@ -29,7 +29,7 @@ class Desk:
     """A centre, and poses to tell it."""
 
     def __init__(self, experiment, copies=1, seed=3):
-        self.centre = Centre(Plan(experiment).centre_assignment(copies))
+        self.centre = Centre(Plan(experiment).assignment(copies=copies, centrally=True))
         self.centre.mark_alive(self.centre.needed)
         self.rows = len(self.centre.guided)
         rng = np.random.default_rng(seed)
