@@ -65,15 +65,12 @@ def chaos(
     read.keep(folder / SOURCE)
     (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(planned), indent=1))
 
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
-    say(f"{faults} faults in rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}")
+    print(f"{faults} faults in rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}", file=sys.stderr)
     waiting, barren = list(planned), 0
     outcomes: list[FaultResult] = []
     ends: list[RoundResult] = []
     with interrupts() as interrupted:
-        setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted, say)
+        setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted)
         while waiting and not interrupted() and barren < BARREN:
             flown = ChaosRound(setting, take_round(waiting, experiment.duration_s), len(ends) + 1)
             ends.append(flown.run())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Set
 from contextlib import ExitStack
@@ -120,7 +121,7 @@ class ChaosRound:
         if self._started is not None:
             self._wrong += recording_faults(run.recording, self.outcomes, disk_full=self._disk_full)
         for each in self._wrong:
-            setting.say(f"round {self._number}: {each}")
+            print(f"round {self._number}: {each}", file=sys.stderr)
         kept = folder.name if run.recording.exists() else ""
         return RoundResult(self._number, self._left, self._wrong, round(nearest, 4), round(gone_s, 1), missed, kept)
 
@@ -243,7 +244,7 @@ class ChaosRound:
         )
         self.outcomes.append(outcome)
         self._now = None
-        self._setting.say(line(outcome))
+        print(line(outcome), file=sys.stderr, flush=True)
 
     def _run_is_over(self) -> bool:
         """Whether the run's time is over: then the conductor lands all robots, and lets none in again."""

@@ -45,7 +45,6 @@ class Setting:
     changes: Sequence[str]  # as behind `--set`
     seed: int  # of nonsense, which the script leaves open
     interrupted: Callable[[], bool]  # by the user
-    say: Callable[[str], None]
 
 
 class SpoiltRun:
