@@ -118,17 +118,8 @@ def _closer(known: Approach | None, time: Array, gap: Array, between: tuple[str,
 
 def _overlaps(time: Array, gap: Array, between: tuple[str, str]) -> list[Collision]:
     """Collisions: one for each maximal time in which a gap (T,) is negative."""
-    inside = gap < -TOUCH_M
-    if not inside.any():
-        return []
-    spans = _spans(inside)
+    spans = np.flatnonzero(np.diff(gap < -TOUCH_M, prepend=False, append=False)).reshape(-1, 2).tolist()
     return [Collision(float(time[begin]), *between, None, -float(gap[begin:end].min())) for begin, end in spans]
-
-
-def _spans(inside: Mask) -> list[tuple[int, int]]:
-    """First and last + 1 of each run."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 
 
 def _to_things(trace: Trace, solid: _Cylinders) -> Iterator[tuple[str, Array]]:
