@@ -20,7 +20,6 @@ from agents.decision.assignment import Assignment
 from agents.decision.centralised import Guidance
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, BodyCommands, Lifecycle, Phase
-from agents.decision.neighbours import NeighbourStates
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
@@ -54,51 +53,35 @@ CENTRE = "centre"  # missing neighbour of guided rows without guidance
 class Agent:
     """Decision of N rows."""
 
-    tick: int  # number of the next tick; 0 at the common start, so that robots decide together
-    goal: Array  # (N, 3) pursued [m]
-    goal_yaw: Array  # (N,) wanted at the goal [rad], NaN for any
-    error: Array  # (N,) Σ of the link errors as the rows know them [m]; 0 for guided rows, NaN without a position
-    offset: Array  # (N, 3) decided last, before it was clamped [m]
-    decisions: int  # since the common start
-    updates: Index  # (N,) decisions at which each row computed its goal anew; of guided rows, received goals
-    begun: bool  # whether the first row has begun to run
-    decision_due: bool  # whether goals are decided on this tick; known from its first half on
-    goal_computer: GoalComputer  # of rows that are not guided
-    neighbours: NeighbourStates  # received poses, and the links that enter the law
-    guidance: Guidance | None  # goals of the guided rows; None: no row is guided
-    all_guided: bool
-    transmitter: Transmitter
-    lifecycle: Lifecycle
-    landing: Landing
-    hazards: Hazards
-    origins: dict[int, Setpoint]  # of restarted rows, from their start orders
-    health: ProcessHealth  # set by the process around the decision
-
     def __init__(self, assignment: Assignment) -> None:
         rows = len(assignment.names)
         self.assignment = assignment
-        self.tick = 0
-        self.goal = np.full((rows, 3), np.nan)
-        self.goal_yaw = np.full(rows, np.nan)
-        self.error, self.offset = np.zeros(rows), np.zeros((rows, 3))
-        self.decisions = 0
-        self.updates = np.zeros(rows, dtype=np.intp)
-        self.decision_due = False
+        self.tick = 0  # number of the next tick; 0 at the common start, so that robots decide together
+        self.goal: Array = np.full((rows, 3), np.nan)  # (N, 3) pursued [m]
+        self.goal_yaw: Array = np.full(rows, np.nan)  # (N,) wanted at the goal [rad], NaN for any
+        # (N,) Σ of the link errors as the rows know them [m]; 0 for guided rows, NaN without a position
+        self.error: Array = np.zeros(rows)
+        self.offset: Array = np.zeros((rows, 3))  # (N, 3) decided last, before it was clamped [m]
+        self.decisions = 0  # since the common start
+        # (N,) decisions at which each row computed its goal anew; of guided rows, received goals
+        self.updates: Index = np.zeros(rows, dtype=np.intp)
+        self.decision_due = False  # whether goals are decided on this tick; known from its first half on
         self._flies = flies = np.array([kind.flies for kind in assignment.kinds])
         self._guided = np.zeros(rows, dtype=bool) if assignment.guided is None else assignment.guided
-        self.guidance = None
+        self.guidance: Guidance | None = None  # goals of the guided rows; None: no row is guided
         if some(self._guided):
             self.guidance = Guidance(self._guided, flies, assignment.limits.link_silence_s)
-        self.goal_computer = GoalComputer(assignment, ~self._guided)
+        self.goal_computer = GoalComputer(assignment, ~self._guided)  # of rows that are not guided
         self.neighbours = self.goal_computer.neighbours
         self.all_guided = bool(self._guided.all())
         self._holding = StationKeeping(self.goal_computer.ground)
         self.lifecycle = Lifecycle(flies, assignment.hover, assignment.duration)
         self.transmitter = Transmitter(assignment.trigger, rows, assignment.predictor, kinds=assignment.kinds)
         self._setpoint = np.full((rows, 4), np.nan)
-        self.health, self.hazards = ProcessHealth(), Hazards(flies, assignment.limits)
+        self.health = ProcessHealth()  # set by the process around the decision
+        self.hazards = Hazards(flies, assignment.limits)
         self._detector, self._preflight = Detector(assignment), Preflight(assignment)
-        self.begun = False
+        self.begun = False  # whether the first row has begun to run
         self._decided = self._asked = -1
         self._commands: BodyCommands | None = None
         self._ordered = np.zeros(rows, dtype=bool)
@@ -106,7 +89,7 @@ class Agent:
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
         self._perception = None if assignment.avoidance is None else Perception(assignment)
         self.landing = Landing(assignment)
-        self.origins = {}
+        self.origins: dict[int, Setpoint] = {}  # of restarted rows, from their start orders
         self._no_row: Mask = np.zeros(rows, dtype=bool)
         self._every_row: Mask = np.ones(rows, dtype=bool)
         self._not_finite = self._no_row

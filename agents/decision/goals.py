@@ -31,20 +31,16 @@ class GoalDecision(msgspec.Struct, frozen=True):
 class GoalComputer:
     """Goals of some of N rows."""
 
-    neighbours: NeighbourStates
-    clamp: float  # largest step of a goal per axis and decision [m]
-    tracking_gain: float  # k of (7) [1/(m² decision)]
-    ground: Array  # (N,) heights that rows hold [m]; 0 for ground robots
-
     def __init__(self, assignment: Assignment, mine: Mask) -> None:
         """Compute goals of the rows `mine` (N,); links, anchors and plans of the others are not used."""
         rows = len(assignment.names)
         self._assignment, links = assignment, assignment.links
         self.neighbours = NeighbourStates(links, assignment.avoidance_only, assignment.limits.link_silence_s)
-        self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
+        self.clamp = assignment.clamp  # largest step of a goal per axis and decision [m]
+        self.tracking_gain = assignment.tracking_gain  # k of (7) [1/(m² decision)]
         self._updating = None if assignment.update is None else ControlUpdates(assignment.update, rows, links)
         self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self.ground = np.where(self._flies, assignment.hover, 0.0)
+        self.ground: Array = np.where(self._flies, assignment.hover, 0.0)  # (N,) heights that rows hold [m]
         self._anchored = np.zeros(rows, dtype=bool)
         if assignment.anchors is not None:
             self._anchored[assignment.anchors.row] = True

@@ -63,22 +63,18 @@ class NeighbourPoses:
 class NeighbourStates:
     """Neighbours of rows: received poses, and which links enter the law."""
 
-    poses: NeighbourPoses  # of all links (E)
-    active: Index  # (K,) links in the law: pose received, sender not lost for long, part of the formation now
-    links: Links  # the active links with their current targets
-    clock_lag: Array | None  # (E,) age of poses on arrival [s] where the sender's clock lags, else 0; None: nowhere
-    incomplete: bool  # a sender is missing or lost, so that time alone can change the active links
-
     def __init__(self, links: Links, avoidance_only: Mask | None, silence_s: float) -> None:
         """Start without poses; `avoidance_only` (E,) links never enter the law, lost ones leave after `silence_s`."""
-        self.poses = NeighbourPoses(len(links))
-        self.incomplete = True
-        self.clock_lag = None
+        self.poses = NeighbourPoses(len(links))  # of all links (E)
+        self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
+        # (E,) age of poses on arrival [s] where the sender's clock lags, else 0; None: nowhere
+        self.clock_lag: Array | None = None
         self._all, self._avoidance_only, self._silence_s = links, avoidance_only, silence_s
         self._present: Mask = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._in_law = self._available = np.zeros(len(links), dtype=bool)
-        self.active = np.zeros(0, dtype=np.intp)
-        self.links = links.take(self.active)
+        # (K,) links in the law: pose received, sender not lost for long, part of the formation now
+        self.active: Index = np.zeros(0, dtype=np.intp)
+        self.links = links.take(self.active)  # the active links with their current targets
 
     def receive(self, received: PoseTable) -> None:
         self.poses.receive(received)

@@ -47,16 +47,6 @@ class ReceivedPose(msgspec.Struct, frozen=True):
 class NeighbourSubscription:
     """Subscription to one robot: drops duplicates, counts losses, tracks liveliness."""
 
-    name: str  # of the robot
-    links: Index  # (K,) links with this sender
-    numbers: list[int]  # the same
-    lost: int  # lost poses; counted by the caller, which knows from when on they matter
-    stale: int  # poses that were dropped: older than a known one, or of a former session
-    # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
-    # longest delay of a network; else 0
-    behind: float
-    tokens: Collection[zenoh.Sample]  # queued for `token_changes`, nearly always none
-
     def __init__(
         self,
         session: zenoh.Session,
@@ -73,11 +63,12 @@ class NeighbourSubscription:
         `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s], and
         `depth` of them may wait.
         """
-        self.name, self.links, self.numbers, self._reach, self._rate = name, links, links.tolist(), reach, rate
+        self.name, self.links, self._reach, self._rate = name, links, reach, rate
+        self.numbers: list[int] = links.tolist()
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
-        self.tokens = self._alive.waiting
+        self.tokens = self._alive.waiting  # queued for `token_changes`, nearly always none
         self._now = 0.0  # of the last poll (UTC [s])
         self._seq, self._stamp = 0, 0.0
         self._life: str | None = None  # session of the robot's process, as far as it is known
@@ -86,7 +77,10 @@ class NeighbourSubscription:
         self._vanished = False
         self._received_at = -inf  # last new pose (UTC [s])
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
-        self.lost = self.stale = 0
+        self.lost = 0  # poses; counted by the caller, which knows from when on they matter
+        self.stale = 0  # poses that were dropped: older than a known one, or of a former session
+        # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
+        # longest delay of a network; else 0
         self.behind = 0.0
 
     @property
@@ -179,11 +173,6 @@ NEWS: Final = 20_000  # poses that wait for telemetry, which empties them severa
 class ModelledInbox:
     """Poses of several robots through the modelled channel, and their liveliness; polled."""
 
-    senders: list[NeighbourSubscription]
-    dropped: Index  # (E,) samples that the modelled channel dropped
-    arrived: int  # poses before the modelled channel, without those of robots of this process
-    changed: bool  # a sender appeared or vanished since the caller reset this
-
     def __init__(
         self,
         session: zenoh.Session,
@@ -206,7 +195,9 @@ class ModelledInbox:
             NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth)
             for name, mine in links.items()
         ]
-        self.dropped, self.arrived, self.changed = self._channel.dropped, 0, False
+        self.dropped: Index = self._channel.dropped  # (E,) samples that the channel dropped
+        self.arrived = 0  # poses before the modelled channel, without those of robots of this process
+        self.changed = False  # a sender appeared or vanished since the caller reset this
 
     @property
     def malformed(self) -> int:
