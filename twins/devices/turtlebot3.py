@@ -8,7 +8,7 @@ for cmd_vel. `watchdog_s` in the robot's settings adds such a limit.
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, inf, nan, pi, sin
 from typing import Final
@@ -31,14 +31,6 @@ from twins.models.disturbance import Drift, Measurement
 from twins.models.noise import Noise
 
 JOIN_S: Final = 5.0  # deadline of the router's answer
-
-Surroundings = Callable[[Array, float, Array], Array]
-"""Distances (360,) [m] around a robot, inf: none; from position (3,) [m], yaw and world bearings (360,) [rad]."""
-
-
-def nothing(position: Array, yaw: float, bearing: Array) -> Array:
-    """An empty world."""
-    return np.full(len(bearing), inf)
 
 
 @dataclass
@@ -76,8 +68,6 @@ class TurtleBot3Twin:
         self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
         random = np.random.default_rng([body.seeds[0], 0x7B3])
         self._link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
-        self._bearing: Array = np.arange(turtlebot3.RAYS, dtype=float) * (2.0 * pi / turtlebot3.RAYS)
-        self.surroundings: Surroundings = nothing  # for the laser scanners
         self.commands_received = [0] * rows  # executed commands
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
         self._rows: list[_Row] = []
@@ -209,22 +199,19 @@ class TurtleBot3Twin:
             self._publish(row.odometry, row.types, message)
 
     def _scan(self) -> None:
-        now = self._clock.utc()
-        for index, row in enumerate(self._rows):
-            yaw = float(self._model.yaw[index])
-            distance = self.surroundings(self._model.position[index], yaw, self._bearing + yaw)
-            seen = (distance >= turtlebot3.NEAREST) & (distance <= turtlebot3.FARTHEST)
+        now, step = self._clock.utc(), 2.0 * pi / turtlebot3.RAYS
+        for row in self._rows:
             message = row.types.make(
                 ros2.LASER_SCAN,
                 header=row.types.header(now, "base_scan"),
                 angle_min=0.0,
-                angle_max=float(self._bearing[-1]),
-                angle_increment=float(self._bearing[1]),
+                angle_max=step * (turtlebot3.RAYS - 1),
+                angle_increment=step,
                 time_increment=1.0 / (turtlebot3.SCAN_HZ * turtlebot3.RAYS),
                 scan_time=1.0 / turtlebot3.SCAN_HZ,
                 range_min=turtlebot3.NEAREST,
                 range_max=turtlebot3.FARTHEST,
-                ranges=np.where(seen, distance, inf).astype(np.float32),
+                ranges=np.full(turtlebot3.RAYS, inf, np.float32),  # nothing is in reach
                 intensities=np.zeros(turtlebot3.RAYS, np.float32),
             )
             self._publish(row.scan, row.types, message)

@@ -84,19 +84,14 @@ class Firmware:
         self._position, self._velocity = Pid(POSITION, rows, OUTER * dt), Pid(VELOCITY, rows, OUTER * dt)
         self._attitude, self._rate = Pid(ATTITUDE, rows, dt), Pid(RATE, rows, dt)
         self._thrust = np.full(rows, BASE)
-        self._angles = np.zeros((rows, 3))
+        self.angles = np.zeros((rows, 3))  # roll and pitch setpoints of the velocity loops, and 0 [deg]
         self._tick = 0
-
-    @property
-    def tilt(self) -> Array:
-        """(n, 2) roll and pitch setpoints of the velocity loops [rad]."""
-        return np.radians(self._angles[:, :2])
 
     def reset(self, rows: Index | Mask) -> None:
         """Reset rows at the start of their motors."""
         for loop in (self._position, self._velocity, self._attitude, self._rate):
             loop.reset(rows)
-        self._thrust[rows], self._angles[rows] = BASE, 0.0
+        self._thrust[rows], self.angles[rows] = BASE, 0.0
 
     def preset_hover(self, rows: Index, share: Array) -> None:
         """Initialise rows in hover, with the share (len(rows),) of their motors' full thrust."""
@@ -124,8 +119,8 @@ class Firmware:
         moving = _to_level_frame(velocity, cos, sin)
         output = self._velocity.advance(reference - moving, moving)
         # forward is nose down, to the left is left side down
-        self._angles = np.stack([-output[:, 1], output[:, 0], np.zeros(len(yaw))], axis=1)
-        self._angles = clamp(self._angles, -TILT, TILT)
+        self.angles = np.stack([-output[:, 1], output[:, 0], np.zeros(len(yaw))], axis=1)
+        self.angles = clamp(self.angles, -TILT, TILT)
         lift = clamp(output[:, 2], -0.5 * FULL / THRUST_SCALE, 0.5 * FULL / THRUST_SCALE)
         self._thrust = clamp(BASE + THRUST_SCALE * lift, LEAST, FULL)
 
@@ -138,7 +133,7 @@ class Firmware:
             heading: (n,) yaw setpoint [rad].
         """
         measured, turning = np.degrees(angles), np.degrees(rates)
-        error = self._angles - measured
+        error = self.angles - measured
         error[:, 2] = (np.degrees(heading) - measured[:, 2] + 180.0) % 360.0 - 180.0
         rate = self._attitude.advance(error, measured)
         torque = clamp(self._rate.advance(rate - turning, turning), -TORQUE_LIMIT, TORQUE_LIMIT)

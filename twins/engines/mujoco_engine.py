@@ -130,11 +130,6 @@ class Drones(OnboardFlight):
         """(n, 4) unit quaternion w, x, y, z from robot to world."""
         return self._state[:, TURN]
 
-    @property
-    def thrust(self) -> Array:
-        """(n, 4) of each motor [N]."""
-        return self._state[:, LIFT]
-
     def takeoff(self, rows: Index, height: Array) -> None:
         """See `Engine.takeoff`; no effect on a drone that lies on its side or back."""
         upright = self._tilt_cosine(rows) > TIPPED

@@ -39,20 +39,20 @@ def test_a_pid_is_its_formula():
 
 
 def test_ahead_is_nose_down_and_left_is_left_side_down():
-    roll, pitch = np.degrees(guided([[0.1, 0.0, 0.0]]).tilt[0])
+    roll, pitch = guided([[0.1, 0.0, 0.0]]).angles[0, :2]
     assert pitch == pytest.approx(25.0 * 0.2 + 1.0 * 0.2 * OUTER * DT)
     assert roll == 0.0
-    roll, pitch = np.degrees(guided([[0.0, 0.1, 0.0]]).tilt[0])
+    roll, pitch = guided([[0.0, 0.1, 0.0]]).angles[0, :2]
     assert roll == pytest.approx(-(25.0 * 0.2 + 0.2 * OUTER * DT))
     assert pitch == 0.0
-    turned = np.degrees(guided([[0.0, 0.1, 0.0]], yaw=math.pi / 2).tilt[0])  # what is left of the room is ahead of it
+    turned = guided([[0.0, 0.1, 0.0]], yaw=math.pi / 2).angles[0, :2]  # what is left of the room is ahead of it
     np.testing.assert_allclose(turned, [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT], atol=1e-12)
 
 
 def test_limits_of_speed_tilt_and_thrust():
     far = guided([[9.0, 0.0, 0.0]], [[SPEED - 0.1, 0.0, 0.0]])
-    assert np.degrees(far.tilt[0, 1]) == pytest.approx(25.0 * 0.1 + 0.1 * OUTER * DT)  # only 0.1 m/s are missing
-    assert np.degrees(guided([[9.0, -9.0, 0.0]]).tilt[0]).tolist() == pytest.approx([TILT, TILT])
+    assert far.angles[0, 1] == pytest.approx(25.0 * 0.1 + 0.1 * OUTER * DT)  # only 0.1 m/s are missing
+    assert guided([[9.0, -9.0, 0.0]]).angles[0, :2].tolist() == pytest.approx([TILT, TILT])
     level = (NONE, NONE, np.zeros(1))
     up = guided([[0.0, 0.0, 9.0]]).advance_inner_loops(*level)
     lift = 25.0 * SPEED + 15.0 * SPEED * OUTER * DT
@@ -65,7 +65,7 @@ def test_limits_of_speed_tilt_and_thrust():
 
 def test_velocities_are_flown_instead_of_positions():
     made = guided([[9.0, 9.0, 9.0]], wanted=[0.2, 0.0, 0.0])
-    np.testing.assert_allclose(np.degrees(made.tilt[0]), [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT])
+    np.testing.assert_allclose(made.angles[0, :2], [0.0, 25.0 * 0.2 + 0.2 * OUTER * DT])
 
 
 def test_torques_turn_the_right_way():
@@ -103,12 +103,12 @@ def test_motors_stay_in_their_range_and_keep_their_torque(numbers):
 
 def test_the_outer_loops_run_at_a_fifth_of_the_rate():
     made = guided([[0.1, 0.0, 0.0]])
-    before = made.tilt.copy()
+    before = made.angles.copy()
     for _ in range(OUTER - 1):
         made.advance_outer_loops(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
-        np.testing.assert_array_equal(made.tilt, before)
+        np.testing.assert_array_equal(made.angles, before)
     made.advance_outer_loops(np.array([[0.0, 0.1, 0.0]]), NONE, NONE, np.array([False]), np.zeros(1))
-    assert np.degrees(made.tilt[0, 0]) < -4.9
+    assert np.degrees(made.angles[0, 0]) < -4.9
 
 
 def test_rows_do_not_know_of_each_other():

@@ -24,7 +24,7 @@ from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
 
-from twins.engines.mujoco_engine import TRACKED_SHARE, Drones, RigidBody
+from twins.engines.mujoco_engine import LIFT, TRACKED_SHARE, Drones, RigidBody
 
 DT = 0.01
 
@@ -98,7 +98,7 @@ def linear_cascade(step, seconds, h=0.0005):
 def test_motors_carry_the_weight_and_the_drone_is_level(kind):
     engine = hovering(kind)
     weight = AIRFRAMES[kind.name].mass * GRAVITY
-    np.testing.assert_allclose(engine.quadrotor.thrust.sum(axis=1), weight, rtol=2e-3)
+    np.testing.assert_allclose(engine.quadrotor._state[:, LIFT].sum(axis=1), weight, rtol=2e-3)
     np.testing.assert_allclose(engine.attitude, [[1.0, 0.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(engine.position, [[0.0, 0.0, 1.0]], atol=2e-3)
 
