@@ -107,6 +107,7 @@ def robot() -> Iterator[Target]:
 
 def world() -> Iterator[Target]:
     """The twin service: commands, states of those elsewhere, statuses, and orders to put things in and out."""
+    from experiments.real_time.processes.joining import Network  # noqa: PLC0415
     from experiments.real_time.processes.world import WorldProcess  # noqa: PLC0415
     from experiments.real_time.processes.world_population import Population  # noqa: PLC0415
 
@@ -115,7 +116,8 @@ def world() -> Iterator[Target]:
 
     def make():
         net.forget()
-        process = WorldProcess(experiment, Population(experiment), net.session, Event(), ownership=OwnershipCheck([]))  # type: ignore[arg-type]
+        joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
+        process = WorldProcess(experiment, Population(experiment), joint, Event())
         process.exchange.utc = time.time()
         t = 0.0
 

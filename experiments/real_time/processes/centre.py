@@ -12,12 +12,10 @@ import gc
 import os
 import threading
 import time
-from collections.abc import Sequence
 from math import floor, isfinite
 from typing import Final
 
 import numpy as np
-import zenoh
 from msgspec.structs import replace
 
 from agents.arrays import Index
@@ -27,7 +25,6 @@ from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.name_ownership import OwnershipCheck
 from agents.network.shutdown import end
 from agents.network.validation import reach_of
 from agents.runtime import command_line
@@ -37,7 +34,7 @@ from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
-from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
+from experiments.real_time.processes.joining import EXPLAINED, Launch, Network, joined
 
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # queued poses of a robot
@@ -48,20 +45,14 @@ PHASES: Final = {phase.word: int(phase) for phase in Phase}
 class CentreProcess:
     """Clock and network of a central controller."""
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        session: zenoh.Session,
-        keys: Keys,
-        ownership: OwnershipCheck,
-        endpoints: Sequence[str] = (),
-    ) -> None:
-        """Declares all but the token, which tells that orders are received. `endpoints` are those of the session."""
+    def __init__(self, experiment: Experiment, joint: Network) -> None:
+        """Declares all but the token, which tells that orders are received."""
+        session, keys = joint.session, joint.keys
         assignment = Plan(experiment).assignment(centrally=True)
         self.centre = centre = Centre(assignment)
         self._names, self._session, self._keys = assignment.names, session, keys
-        self._ownership = ownership
-        self._router = network.RouterWatch(session, keys.centre_alive, endpoints)
+        self._ownership = joint.ownership
+        self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
         self._period = assignment.decide_every / assignment.body_hz
@@ -210,7 +201,7 @@ def serve(launch: Launch) -> int:
         token=Keys(experiment.network.realm).centre_alive,
         taken="a centre guides the robots",
     ) as joint:
-        process = CentreProcess(experiment, joint.session, joint.keys, joint.ownership, endpoints)
+        process = CentreProcess(experiment, joint)
         joint.declared.append(process)
         others = [name for name in experiment.robots if name not in guided]
         print(

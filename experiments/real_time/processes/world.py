@@ -18,14 +18,13 @@ import zenoh
 
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from agents.network.name_ownership import OwnershipCheck
 from agents.network.shutdown import Farewell, end
 from agents.plugins import registry
 from agents.runtime import command_line
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.file.problems import refusal
-from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
+from experiments.real_time.processes.joining import EXPLAINED, Launch, Network, joined
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
 
@@ -56,23 +55,14 @@ class Pace:
 class WorldProcess:
     """Runs a population in real time, and obeys orders."""
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        population: Population,
-        session: zenoh.Session,
-        lost: threading.Event,
-        *,
-        ownership: OwnershipCheck,
-        endpoints: Sequence[str] = (),
-    ) -> None:
-        """`lost` is set to end as soon as the robots have landed; `endpoints` are those of the session."""
-        self._ownership, self._over = ownership, threading.Event()
+    def __init__(self, experiment: Experiment, population: Population, joint: Network, lost: threading.Event) -> None:
+        """`lost` is set to end as soon as the robots have landed."""
+        session, self._keys = joint.session, joint.keys
+        self._ownership, self._over = joint.ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
-        self._keys = Keys(experiment.network.realm)
         self._engine = registry.split(experiment.world.engine)[0]
         self._dt = 1.0 / experiment.rates.body_hz
-        self.exchange = Exchange(experiment, population, session, ownership, endpoints)
+        self.exchange = Exchange(experiment, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -210,8 +200,7 @@ def serve(launch: WorldLaunch) -> int:
     ) as joint:
         # before anything watches those tokens: a session that has begun to watch answers from what it has heard
         there = _alive(joint.session, joint.keys)
-        own = joint.ownership
-        world = WorldProcess(experiment, population, joint.session, lost, ownership=own, endpoints=endpoints)
+        world = WorldProcess(experiment, population, joint, lost)
         joint.declared.append(world)
         back = world.exchange.restore_positions(there)
         print(_ready(experiment, world.carried, endpoints, back), flush=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from functools import partial
 from math import inf
 from typing import Final
@@ -21,11 +21,11 @@ from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.name_ownership import OwnershipCheck
 from agents.runtime import range_inbox
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world_population import HOLD_S, Population
 
 DEPTH: Final = 16_384  # queued commands: those of two hundred robots in 0.8 s
@@ -50,17 +50,9 @@ class Exchange:
     malformed: int  # refused payloads
     trouble: str  # last refusal; empty if there was none
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        population: Population,
-        session: zenoh.Session,
-        ownership: OwnershipCheck,
-        endpoints: Sequence[str] = (),
-    ) -> None:
-        """`endpoints` are those of the session."""
-        self._population, self._session = population, session
-        keys = self._keys = Keys(experiment.network.realm)
+    def __init__(self, experiment: Experiment, population: Population, joint: Network) -> None:
+        session, keys = joint.session, joint.keys
+        self._population, self._session, self._keys = population, session, keys
         self._encoding = experiment.network.encoding
         self._mime = messages.MIME[self._encoding]
         x, y, z = experiment.arena.size
@@ -72,8 +64,8 @@ class Exchange:
         self.utc = self._clock.utc()
         self.contacts = self.refused = self.malformed = 0
         self.trouble = ""
-        self._ownership = ownership
-        self._router = network.RouterWatch(session, keys.world_alive, endpoints)
+        self._ownership = joint.ownership
+        self._router = network.RouterWatch(session, keys.world_alive, joint.endpoints)
         self._cut_off = False
         self._setpoints = pubsub.Inbox(
             pubsub.subscriber(session, keys.setpoint("*"), DEPTH),

@@ -17,6 +17,7 @@ from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck
 from experiments.definition.experiment import Formation, Robot
 from experiments.real_time.processes.centre import CentreProcess
+from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
 from experiments.real_time.processes.world_population import Population
 from tests.agents.few import pair
@@ -53,14 +54,15 @@ def test_who_wakes_and_finds_its_name_taken_sends_nothing(what, way, monkeypatch
     monkeypatch.setattr(Attentive, "silent_since", lambda *_: silent[0])
     ownership = OwnershipCheck([token])
     with Net().worn() as net:
+        joint = Network(net.session, KEYS, [], [], ownership)
         monkeypatch.setattr(pubsub, "publisher", lambda *_, **__: Counted())
         if what == "world":
             drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
             experiment = pair(robots={"F": drone}, formation=Formation())
             lost = threading.Event()
-            process = WorldProcess(experiment, Population(experiment), net.session, lost, ownership=ownership)
+            process = WorldProcess(experiment, Population(experiment), joint, lost)
         else:
-            process = CentreProcess(pair(architecture="centralised"), net.session, KEYS, ownership)
+            process = CentreProcess(pair(architecture="centralised"), joint)
             goals = CentreGoals(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
             monkeypatch.setattr(process.centre, "decide", lambda *_: goals)
             process._goals[0] = Counted()

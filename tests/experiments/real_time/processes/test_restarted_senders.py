@@ -11,6 +11,7 @@ from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.goal_inbox import GoalInbox
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
+from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population
 from tests.agents.few import pair
@@ -29,7 +30,7 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(experiment, Population(experiment), net.session, OwnershipCheck([]))
+        world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
@@ -53,7 +54,7 @@ def test_a_world_of_many_robots_knows_who_owns_each_name():
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(experiment, Population(experiment), net.session, OwnershipCheck([]))
+        world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
         for name in names:
             alive = KEYS.alive(name)
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):
