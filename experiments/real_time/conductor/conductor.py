@@ -40,7 +40,6 @@ TARDY_S: Final = 0.05  # robots that begin later than this after the common star
 GO_ON_S: Final = 5.0  # robots start later than the conductor, and count the deadline from then
 
 ADOPT_S: Final = 0.5
-MISSED_S: Final = 1.0  # who changes from one router to another is back sooner
 LATE_S: Final = 1.0  # who says that it waits so long after the common start has not heard of it
 LEAVE_S: Final = 8.0  # so long may robots of the case before take to end
 
