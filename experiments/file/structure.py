@@ -36,13 +36,14 @@ _WORDS: Final = {
     "float": "a number", "int": "a whole number", "str": "text", "bool": "true or false", "array": "a list",
     "object": "a table",
 }  # fmt: skip
-_GROUPS: Final[dict[Path, str]] = {  # entry-point group of each choice of a plug-in; `*` is any name or number
+# entry-point group of each choice of a plug-in; `int` is any number in a list, `str` any name
+_GROUPS: Final[dict[tuple[str | int | type, ...], str]] = {
     ("trigger",): registry.TRIGGERS,
     ("formation", "update"): registry.TRIGGERS,
     ("prediction",): registry.PREDICTORS,
     ("formation", "law"): registry.LAWS,
-    ("timeline", "*", "plan"): registry.PLANNERS,
-    ("arena", "obstacles", "*", "plan"): registry.PLANNERS,
+    ("timeline", int, "plan"): registry.PLANNERS,
+    ("arena", "obstacles", str, "plan"): registry.PLANNERS,
     ("avoidance",): registry.AVOIDANCES,
     ("world", "engine"): registry.ENGINES,
 }
@@ -76,7 +77,7 @@ def faults(document: Mapping[str, Any], struct: type[msgspec.Struct] = Experimen
 
 def group_of(path: Path) -> str | None:
     """Entry-point group of the plug-in choice at a path; None if no choice stands there."""
-    return _GROUPS.get(path if len(path) < 3 else (*path[:-2], "*", path[-1]))
+    return _GROUPS.get(path if len(path) < 3 else (*path[:-2], type(path[-2]), path[-1]))
 
 
 def plugin_files(experiment: Experiment) -> set[pathlib.Path]:

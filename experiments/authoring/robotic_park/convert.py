@@ -188,7 +188,7 @@ def _note_robots(park: Park, notes: list[str]) -> None:
 
 def _rate(key: str, what: str, periods: Sequence[float], notes: list[str]) -> float:
     """The rate [Hz] nearest to the commonest period [s] that divides the rate of bodies."""
-    hz = 1.0 / _commonest(key, periods, notes)
+    hz = 1.0 / _commonest(f"{key} [s]", periods, notes)
     nearest = divisor(RATE_HZ, hz)
     if abs(nearest - hz) > 1e-6 * hz:
         notes.append(f"{what} at {hz:g} Hz become {nearest:g} Hz, which divides the {RATE_HZ:g} Hz of bodies")
@@ -232,7 +232,7 @@ def _formation_table(
         table["stiffness"] = _rounded(usual["pose"])
         if any(task.kind == "pose" and task.law != "pid" for _, task in jobs):
             notes.append("pose tasks by gradient: theirs knows no sides and acts on x and y apart; here it is linear")
-    table["clamp"] = _commonest("task.controller.upperLimit", [task.clamp for _, task in jobs], notes)
+    table["clamp"] = _commonest("task.controller.upperLimit [m]", [task.clamp for _, task in jobs], notes)
     own = {robot.name: _rounded(gains[robot.name]) for robot, task in jobs if gains[robot.name] != usual[task.kind]}
     return table, _links(park, found, own, notes), _anchors(park, found, gains, notes)
 

@@ -362,6 +362,14 @@ def test_a_wrong_set_names_the_flag(flag, message, hint):
     assert str(problem).startswith("--set ")
 
 
+def test_a_leg_has_a_number_and_no_name():
+    (problem,) = refused("triangle", "timeline.first.plan.speed=1").problems
+    assert (problem.message, problem.hint) == (
+        "'timeline' must be a list, not a table",
+        "write [[timeline]], with two brackets",
+    )
+
+
 def test_set_does_not_hide_what_is_wrong_in_the_file(write):
     file = write(MINIMAL + "[formation]\ngian = 2.0\n")
     problems = refused(file, "formation.gain=x").problems
