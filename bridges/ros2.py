@@ -215,12 +215,7 @@ class Ros2Launch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def serve(launch: Ros2Launch) -> int:
-    """Run the bridge until a signal or the loss of its lifeline; prints when ready and whenever a robot comes or goes.
-
-    Raises:
-        BodyError: If the extra `ros` is not installed.
-        EndpointError, Unreachable: If a router is not reachable.
-    """
+    """Run the bridge until a signal or the loss of its lifeline; prints when ready and when a robot comes or goes."""
     stop = threading.Event()
     if launch.lifeline:
         Lifeline(stop).start()

@@ -73,11 +73,7 @@ class Address:
         return cls(kteam, host, port or protocol.PARK_PORT, "", server)
 
     def server_of(self, robot: str, chosen: protocol.Khepera4Settings) -> str | None:
-        """The server on the robot by its address and its `device` table; None if neither names one.
-
-        Raises:
-            BodyError: If they contradict one another.
-        """
+        """The server by address and `device` table, None if neither names one; raises BodyError if they differ."""
         named = chosen.server or self.server
         if named is not None and ((named == "kteam") != self.kteam or (self.server or named) != named):
             raise BodyError(

@@ -196,12 +196,7 @@ class ViconLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
 
 
 def serve(launch: ViconLaunch) -> int:
-    """Run the bridge until SIGINT, SIGTERM or the loss of its lifeline (and of the robots); returns the exit code.
-
-    Raises:
-        network.Unreachable: If no router answers.
-        ValueError: If an endpoint, the server or a robot's subject is malformed.
-    """
+    """Run the bridge until a signal, or until its lifeline is lost and the robots are gone; returns the exit code."""
     host, port = parse_server(launch.server)
     subjects = parse_maps(launch.map)
     stop, lost = threading.Event(), threading.Event()
@@ -237,11 +232,7 @@ def parse_server(server: str) -> tuple[str, int]:
 
 
 def parse_maps(maps: Sequence[str]) -> dict[str, str]:
-    """Subject by robot, from texts "ROBOT=SUBJECT" or "ROBOT" (subject of the same name).
-
-    Raises:
-        ValueError: If there is none, a text has neither form, or a robot or subject occurs twice.
-    """
+    """Subject by robot, from texts "ROBOT=SUBJECT" or "ROBOT"; raises ValueError for others, none or repetitions."""
     if not maps:
         raise ValueError("name the robots with --map ROBOT or --map ROBOT=SUBJECT")
     found: dict[str, str] = {}

@@ -261,12 +261,7 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 def run(launch: TwinLaunch) -> int:
-    """Runs the twin until a signal, or until its lifeline is lost and the robots are gone; returns the exit code.
-
-    Raises:
-        ValueError: If its address or its faults are malformed.
-        Unreachable: If no router answers.
-    """
+    """Run the twin until a signal, or until its lifeline is lost and the robots are gone; returns the exit code."""
     host, port = parse_address(launch.listen)
     faults = msgspec.json.decode(launch.faults, type=Faults)
     stop, lost = threading.Event(), threading.Event()

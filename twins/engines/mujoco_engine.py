@@ -88,11 +88,7 @@ class Drones(OnboardFlight):
     def __init__(
         self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float, *, scene: Scene, motor_lag: float
     ) -> None:
-        """Steps of `dt` [s] are divided so that the firmware runs at its own rate or faster.
-
-        Raises:
-            BodyError: If MuJoCo is not installed, or has no airframe of a kind.
-        """
+        """Steps of `dt` [s] are divided for the firmware's rate; raises BodyError without MuJoCo or an airframe."""
         try:
             import mujoco  # noqa: PLC0415 - an extra
             from mujoco import rollout  # noqa: PLC0415
