@@ -69,10 +69,8 @@ class ControlView(View):
 class ControlUpdates:
     """Choice of rows (N) whose law is computed anew, and the inputs of their last computation."""
 
-    last_event: LastEvent  # last computation of each row
-
     def __init__(self, trigger: Trigger, rows: int, links: Links) -> None:
-        self.last_event = LastEvent(rows)
+        self.last_event = LastEvent(rows)  # last computation of each row
         self._trigger, self._state = trigger, trigger.state(rows)
         self._apart, self._rate = np.zeros((2, len(links), 3))
         self._active: Index = np.zeros(0, dtype=np.intp)

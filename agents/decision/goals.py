@@ -191,12 +191,10 @@ class GoalComputer:
 class StationKeeping:
     """Rows (N) that stay at the place where their hold began."""
 
-    held: Mask  # (N,) rows that stay
-
     def __init__(self, ground: Array) -> None:
         """Hold at the heights `ground` (N,) [m]."""
         self._ground, self._at = ground, np.full((len(ground), 3), np.nan)
-        self.held: Mask = np.zeros(len(ground), dtype=bool)
+        self.held: Mask = np.zeros(len(ground), dtype=bool)  # (N,) rows that stay
 
     def hold_position(self, held: Mask, position: Array, goal: Array, yaw: Array) -> tuple[Array, Array]:
         """Goals (N, 3) [m] and yaws (N,) [rad]: the held place for rows `held` (N,), else the given ones."""

@@ -49,15 +49,13 @@ class BodyCommands:
 class Lifecycle:
     """Phases of N rows."""
 
-    moved: bool  # whether a phase changed on the last tick, or by an order since the one before
-
     def __init__(self, flies: Mask, hover: Array, duration: float) -> None:
         """Rows that fly (N,), their hover heights (N,) [m], and the duration of the experiment [s]."""
         rows = len(flies)
         self.phase = np.full(rows, IDLE)
         self.start_at = np.full(rows, np.inf)
         self.reason, self._waits = [""] * rows, [""] * rows
-        self.moved = False
+        self.moved = False  # whether a phase changed on the last tick, or by an order since the one before
         self._before = self.phase.tobytes()
         self._flies, self._hover, self._duration = flies, hover, duration
         self._climbing = np.zeros(rows, dtype=bool)

@@ -145,24 +145,21 @@ class Conditions:
 class Channel:
     """Carries samples over links (E)."""
 
-    dropped: Index  # (E,) samples that were lost
-    limited: bool  # some link has a bandwidth: sizes must be given
-    instant: bool  # nothing takes time on any link: a sample is received at once, or lost
-    ideal: bool  # nothing is lost or takes time on any link: there is no need to send
-
     def __init__(self, conditions: Conditions) -> None:
         self._conditions = conditions
-        self.dropped = np.zeros(len(conditions), dtype=np.intp)
+        self.dropped: Index = np.zeros(len(conditions), dtype=np.intp)  # (E,) samples that were lost
         delay = conditions.delay
         self._delay: Array | float = delay
         if len(delay) and (delay == delay[0]).all():
             self._delay = float(delay[0])  # one number for all costs nothing to look up
         self._jitters = bool(conditions.jitter.any())
         self._loses = bool(conditions.loss.any())
+        # some link has a bandwidth: sizes must be given
         self.limited = bool(np.isfinite(conditions.bandwidth).any())
         self._plain = not (self._jitters or self._loses or self.limited or conditions.outages)
+        # nothing takes time on any link: a sample is received at once, or lost
         self.instant = not (conditions.delay.any() or self._jitters or self.limited)
-        self.ideal = self._plain and self.instant
+        self.ideal = self._plain and self.instant  # nothing is lost or takes time: there is no need to send
         self._in_order = isinstance(self._delay, float) and not (self._jitters or self.limited)
         self._enter, self._leave = _thresholds(conditions)
         self._free = np.full(len(conditions), -np.inf)  # when each link has sent all that it has taken

@@ -142,12 +142,10 @@ def keep(session: zenoh.Session, alive: Sequence[str], pause: threading.Event) -
 class OwnershipCheck:
     """Check whether a process still owns its names, in a thread of its own: a loop polls the result."""
 
-    awake_at: float  # last run of the process, on `uptime` [s]
-
     def __init__(self, alive: Sequence[str], lease_s: float = LEASE_S) -> None:
         """Begin when the names are owned: liveliness keys `alive`, in a session whose lease is `lease_s` [s]."""
         self._alive, self._stood_s = alive, 0.5 * lease_s
-        self.awake_at = uptime()
+        self.awake_at = uptime()  # last run of the process [s]
         self._taken = ""
         self._asking: threading.Thread | None = None
         self._anew = False

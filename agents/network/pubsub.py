@@ -107,9 +107,6 @@ class Subscription(Protocol):
 class Inbox(Generic[M]):
     """Queued messages of one kind: `for pose in inbox.read(check)` decodes, checks, and counts what is refused."""
 
-    malformed: int  # refused payloads
-    trouble: str  # reason of the last refusal
-
     def __init__(
         self,
         subscription: Subscription,
@@ -124,7 +121,7 @@ class Inbox(Generic[M]):
         self._next = subscription.handler.try_recv  # the handler is made anew by Zenoh whenever it is asked for
         self._robots = robots
         self._key, self._owner = "", None if keys is None else keys.whose("")  # of the last sample: mostly the next's
-        self.malformed, self.trouble = 0, ""
+        self.malformed, self.trouble = 0, ""  # refused payloads, and the reason of the last refusal
 
     def read(self, check: Callable[[M], object] | None = None) -> Iterator[M]:
         """Queued messages, oldest first, without waiting; those for which `check` raises `Malformed` are left out."""
@@ -181,11 +178,9 @@ class CallbackQueue(Generic[T]):
     lock.
     """
 
-    waiting: deque[T]  # queued items
-
     def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
         """Keeps the newest `depth` items that are `wanted`. `callback` is the one to declare."""
-        self.waiting = deque(maxlen=depth)
+        self.waiting: deque[T] = deque(maxlen=depth)  # queued items
         self._wanted = wanted
         self.callback = Callback(self._append, indirect=False)
 
@@ -205,14 +200,12 @@ class ImmediateSubscriber:
     The callback runs in the receiving thread: it must be quick, and must not query this session.
     """
 
-    waiting: deque[messages.Stop]  # to be polled
-
     def __init__(
         self, session: zenoh.Session, key: str, obey: Callable[[messages.Stop], object], depth: int = 256
     ) -> None:
         """Subscribes: each stop is given to `obey`; the newest `depth` wait to be polled from then on."""
         self._obey = obey
-        self.waiting = deque(maxlen=depth)
+        self.waiting: deque[messages.Stop] = deque(maxlen=depth)  # to be polled
         self._subscriber = session.declare_subscriber(key, Callback(self._receive, indirect=False))
 
     def try_recv(self) -> messages.Stop | None:
@@ -240,13 +233,10 @@ class Orders(Generic[M]):
     Declare it before the liveliness token: a client that sees the token may then give orders.
     """
 
-    malformed: int  # refused payloads
-    waiting: deque[zenoh.Query]  # queued
-
     def __init__(self, session: zenoh.Session, key: str, kind: type[M]) -> None:
-        self._kind, self.malformed = kind, 0
+        self._kind, self.malformed = kind, 0  # refused payloads
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
-        self.waiting = self._queries.waiting
+        self.waiting = self._queries.waiting  # queued
         self._queryable = session.declare_queryable(key, self._queries.callback, complete=True)
 
     def read(self) -> Iterator[tuple[zenoh.Query, M]]:
@@ -279,14 +269,12 @@ class LastValue:
     """Answers a plain `get` (z_get, REST) on a key with its last value, which the cache of an advanced publisher does
     not; polled by `answer` from the control loop, so it costs no thread."""
 
-    waiting: deque[zenoh.Query]  # queued
-
     def __init__(self, session: zenoh.Session, key: str, mime: str) -> None:
         self.key = key
         self.mime = mime
         self._payload: bytes | None = None
         self._queries = CallbackQueue[zenoh.Query](ORDERS)
-        self.waiting = self._queries.waiting
+        self.waiting = self._queries.waiting  # queued
         self._queryable = session.declare_queryable(key, self._queries.callback)  # as long as it is referenced
 
     def hold(self, payload: bytes) -> None:
@@ -318,11 +306,9 @@ class AliveWatch:
     a robot counts as lost. A token on many keys at once (`park/**`) belongs to no robot and is left out.
     """
 
-    waiting: deque[zenoh.Sample]  # queued changes
-
     def __init__(self, session: zenoh.Session, keyexpr: str) -> None:
         self.handler = CallbackQueue[zenoh.Sample](TOKEN_CHANGES, lambda sample: "*" not in str(sample.key_expr))
-        self.waiting = self.handler.waiting
+        self.waiting = self.handler.waiting  # queued changes
         self._subscriber = session.liveliness().declare_subscriber(keyexpr, self.handler.callback, history=True)
 
     def changes(self) -> Iterator[tuple[str, bool]]:

@@ -113,14 +113,12 @@ class Publisher:
 class Subscriber:
     """Subscriber of a topic."""
 
-    malformed: int  # samples that were no message of the topic's type
-
     def __init__(self, node: Node, kind: str, key: str, token: str, depth: int) -> None:
         participant = node.participant
         self._node = node  # as above
         self.kind: Final = kind
         self.key: Final = key
-        self.malformed = 0
+        self.malformed = 0  # samples that were no message of the topic's type
         self._types = participant.types
         self._subscriber: zenoh.Subscriber[Handler[zenoh.Sample]] = pubsub.subscriber(participant.session, key, depth)
         self._token = _announce(participant, token)

@@ -23,8 +23,6 @@ from agents.runtime.pose_inbox import NEWS
 class GoalInbox:
     """Goals for the guided rows of one process, through the modelled channel; polled."""
 
-    news: list[deque[messages.GoalReceipt]]  # by row, for telemetry, which empties them
-
     def __init__(
         self,
         session: zenoh.Session,
@@ -51,6 +49,7 @@ class GoalInbox:
         self._seq = dict.fromkeys(rows, 0)
         self._rows = np.array(rows, dtype=np.intp)
         self._channel = Channel(conditions or Conditions.ideal(len(rows)))
+        # by row, for telemetry, which empties them
         self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in self._names]
 
     @property

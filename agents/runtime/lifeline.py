@@ -23,8 +23,6 @@ GONE: Final = "the starter is gone"  # or has come to its end
 class Lifeline:
     """Watches a file descriptor in a daemon thread; the owner reacts to a loss: a robot lands first."""
 
-    reason: str | None  # of the loss; set before `lost`
-
     def __init__(
         self,
         lost: threading.Event,  # set once when the launcher is gone
@@ -32,7 +30,7 @@ class Lifeline:
         fd: int = 0,  # standard input
         on_line: Callable[[bytes], None] | None = None,  # called in that thread with each line that is no heartbeat
     ) -> None:
-        self.reason = None
+        self.reason: str | None = None  # of the loss; set before `lost`
         self._lost, self._timeout_s, self._fd, self._on_line = lost, timeout_s, fd, on_line
         self._rest = b""
         self._thread = threading.Thread(target=self._watch, name="lifeline", daemon=True)

@@ -264,9 +264,6 @@ def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> Pos
 class PoseInbox(ModelledInbox):
     """Poses of all neighbours of the rows of a process."""
 
-    news: list[deque[messages.PoseReceipt]]  # (n) newest received poses of each row, for telemetry, which empties them
-    received: list[int]  # (n) received poses of each row
-
     def __init__(
         self,
         session: zenoh.Session,
@@ -289,8 +286,9 @@ class PoseInbox(ModelledInbox):
             conditions or Conditions.ideal(len(links)), agent.neighbours,
             reach=reach, rate=agent.assignment.body_hz / agent.assignment.pose_every,
         )  # fmt: skip
+        # (n) newest received poses of each row, for telemetry, which empties them
         self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
-        self.received = [0] * len(agent.assignment.names)
+        self.received = [0] * len(agent.assignment.names)  # (n) received poses of each row
         self._behind = [0.0] * len(self.senders)
 
     def deliver(self, t: float, utc: float) -> None:

@@ -51,9 +51,6 @@ class Counts:
 class Telemetry:
     """States, statuses and range readings of the rows of a process."""
 
-    utc: float  # [s] UTC at which the clock of the process was 0
-    due: float  # [s] on that clock, of the next statuses of all rows
-
     def __init__(
         self,
         session: zenoh.Session,
@@ -78,6 +75,7 @@ class Telemetry:
             pubsub.publisher(session, keys.ranges(name), mime) if own else None
             for name, own in zip(names, ranged, strict=True)
         ]
+        # [s] UTC at which the clock of the process was 0, and on that clock, of the next statuses of all rows
         self.utc = self.due = 0.0
         self._receipts = [deque[messages.GoalReceipt]() for _ in names] if receipts is None else receipts
         self._seq = 0

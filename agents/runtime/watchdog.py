@@ -31,8 +31,6 @@ class Watchdog:
     the motors and ends the process. Each call has a thread of its own: it may hang as the loop does.
     """
 
-    tripped: str  # why the robots were ordered to land; empty before, and after `forgive`
-
     def __init__(
         self,
         body: Body,
@@ -43,7 +41,7 @@ class Watchdog:
         down_s: float = DOWN_S,  # from then until the motors are cut [s]
         end: Callable[[int], object] = os._exit,  # ends the process with an exit code
     ) -> None:
-        self.tripped = ""
+        self.tripped = ""  # why the robots were ordered to land; empty before, and after `forgive`
         self._body, self._rows, self._alarm, self._end = body, rows, alarm, end
         self._silence_s, self._down_s = silence_s, down_s
         self._beats = 0

@@ -155,9 +155,6 @@ class Incident(NamedTuple):
 class Hazards:
     """State machine of N rows."""
 
-    held: Mask  # (N,) rows that must keep their place
-    incidents: list[Incident]  # since the reader emptied the list
-
     def __init__(self, flies: Mask, limits: Limits) -> None:
         """Of rows that fly or not (N,)."""
         table, shape = rules(limits), (len(Cause), len(flies))
@@ -181,9 +178,9 @@ class Hazards:
         self._present: Mask = np.zeros(shape, dtype=bool)  # on the last tick
         self._texts: list[dict[int, str]] = [{} for _ in flies]
         self._quiet = True
-        self.held = np.zeros(len(flies), dtype=bool)
+        self.held: Mask = np.zeros(len(flies), dtype=bool)  # (N,) rows that must keep their place
         self._no_row = self.held
-        self.incidents = []
+        self.incidents: list[Incident] = []  # since the reader emptied the list
 
     def update(self, t: float, found: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
         """Update at `t` [s]; returns incidents of the rows that must land or be cut now, for the first time.
