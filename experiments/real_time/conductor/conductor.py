@@ -103,7 +103,6 @@ class Conductor(CaseRun):
             self._processes.prepare()
             with ExitStack() as stack:
                 self._join(stack)
-                self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
                 self._adopt()
                 self._processes.start()
                 if self._await_phase("ready", self._patience(), recorder=True):
@@ -130,6 +129,10 @@ class Conductor(CaseRun):
             self._processes.end()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
         return CaseResult(self._context.recording, start, ready, lost)
+
+    def _join(self, stack: ExitStack) -> None:
+        super()._join(stack)
+        self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
 
     def _adopt(self) -> None:
         """Adopt robots that were started by hand or at boot."""
