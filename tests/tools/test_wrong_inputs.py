@@ -186,9 +186,9 @@ def test_two_robots_with_the_address_of_one_device_are_a_finding(second: str, sa
     for name, body in (("RV01", "rover://192.0.2.7:5005"), ("RV03", second)):
         robots[name] = msgspec.structs.replace(robots[name], body=body)
 
-    def found(**more: object) -> list[tuple[str, str, tuple[object, ...]]]:
+    def found(**more: object) -> list[tuple[str, str, object]]:
         experiment = SimpleNamespace(robots=robots, **{"hosts": {}, **more})
-        return [(each.code, each.message, each.path) for each in devices(SimpleNamespace(experiment=experiment))]
+        return [(each.code, each.message, each.where) for each in devices(SimpleNamespace(experiment=experiment))]
 
     message = f"RV01 and RV03 have the same body, {second}: one device gets the setpoints of both"
     assert found() == ([("same-device", message, ("robots", "RV03", "body"))] if same else [])
