@@ -27,14 +27,12 @@ class Transmission(msgspec.Struct, frozen=True):
 class Transmitter:
     """Transmissions of N rows."""
 
-    trigger: Trigger  # may be replaced by one of the same kind
-    last_event: LastEvent  # last transmission of each row
-
     def __init__(
         self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
     ) -> None:
         """Without `kinds` rows are smoothed as robots on wheels are."""
-        self.trigger, self.last_event = trigger, LastEvent(rows)
+        self.trigger = trigger  # may be replaced by one of the same kind
+        self.last_event = LastEvent(rows)  # last transmission of each row
         self._kinds = kinds
         self._predictor, self._state = predictor, trigger.state(rows)
         self._smoothed: LowPass | None = None

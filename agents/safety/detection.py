@@ -25,12 +25,11 @@ from agents.safety.situation import ProcessHealth, Situation
 class Separation:
     """Distances on all links (E) of rows to the senders, whether used by the law or only by avoidance."""
 
-    touching: Array  # (E,) distance of the axes at which two upright robots side by side touch [m]
-
     def __init__(self, assignment: Assignment) -> None:
         self._assignment, links = assignment, assignment.links
         own = np.array([kind.radius for kind in assignment.kinds])
         theirs = np.array([kind.radius for kind in assignment.robot_kinds])
+        # (E,) distance of the axes at which two upright robots side by side touch [m]
         self.touching = own[links.receiver] + (theirs[links.sender] if len(theirs) else 0.0)
 
     def distances(self, t: float, position: Array, neighbours: NeighbourStates) -> Array:

@@ -72,11 +72,6 @@ class Continuity:
 class Obedience:
     """Told and measured motion of N rows."""
 
-    still: Mask  # (N,) rows that are told to move and do not
-    strays: Mask  # (N,) rows that move and are not told to
-    told: Array  # (N,) way that a row was told and has not moved [m]
-    strayed: Array  # (N,) way that it moved and was not told [m]
-
     def __init__(self, kinds: Sequence[Kind]) -> None:
         takes = np.array([kind.takes for kind in kinds])
         self._twist, self._position = takes == "twist", takes == "position"
@@ -89,7 +84,9 @@ class Obedience:
         self._free = RUSH_S * self._speed + np.array([kind.radius for kind in kinds])
         self._due = -np.inf
         rows = len(kinds)
+        # (N,) rows that are told to move and do not, and rows that move and are not told to
         self.still, self.strays = np.zeros((2, rows), dtype=bool)
+        # (N,) way that a row was told and has not moved [m], and that it moved and was not told
         self.told, self.strayed = np.zeros((2, rows))
         self._samples = 0
         # told in this piece and in the one before, for a body is late: it moves when it is told no more
