@@ -87,18 +87,13 @@ def digest(root: Path = ROOT, packages: Sequence[str] = PACKAGES) -> str:
     return total.hexdigest()
 
 
-def number() -> str:
-    """The installed version."""
-    return _version("zenpark") or "unknown"
-
-
 def provenance(text: str | None = None) -> Provenance:
     """Code, versions and machine of this process, now; of plug-ins only those that the text of an experiment names."""
-    packages = {name: found for name in LIBRARIES if (found := _version(name)) is not None}
+    packages = {name: found for name in LIBRARIES if (found := installed(name)) is not None}
     with suppress(OSError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return Provenance(
-        zenpark=number(),
+        zenpark=installed("zenpark") or "unknown",
         code=digest(),
         python=platform.python_version(),
         packages=packages,
@@ -135,7 +130,8 @@ def clock_quality() -> str:
     return "not synchronised" if state == UNSYNCHRONISED else f"synchronised within {timex[3] / 1e3:.1f} ms"
 
 
-def _version(package: str) -> str | None:
+def installed(package: str) -> str | None:
+    """The installed version of a package."""
     try:
         return version(package)
     except PackageNotFoundError:

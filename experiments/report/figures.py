@@ -34,6 +34,7 @@ from experiments.report.style import (
     HATCHES,
     INK,
     MAGENTA,
+    MANY,
     PAPER,
     SHORTEST_S,
     WIDTH,
@@ -43,7 +44,6 @@ from experiments.report.style import (
     legend_above,
     mark_phases,
     merged,
-    name_ticks,
     panel_height,
     plain,
     robot_lines,
@@ -52,7 +52,7 @@ from experiments.report.style import (
     thinned,
     time_axis,
 )
-from experiments.report.trajectories import formation, has_heights, has_positions, plan_view
+from experiments.report.trajectories import LOW, formation, has_positions, plan_view
 
 BAND: Final = "#009E73"  # the tolerance
 LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
@@ -83,7 +83,7 @@ def every(
     figures: dict[str, Figure] = {}
     if any(has_positions(trace) for trace in first):
         figures["plan_view"] = plan_view(first, width)
-        if any(map(has_heights, first)):
+        if any((trace.true_position[..., 2] > LOW).any() for trace in first):
             figures["formation"] = formation(first, width)
     if first:
         figures["errors"] = errors(known, cases, width, bands)
@@ -170,7 +170,9 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
         else:
             axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
         axes.grid(axis="y")
-    name_ticks(panels[-1], [f"({name})" if name in out else name for name in names])
+    words = [f"({name})" if name in out else name for name in names]
+    upright, size = 90 if len(names) > MANY else 0, 6.5 if len(names) <= 2 * MANY else 5.0
+    panels[-1].set_xticks(range(len(names)), words, rotation=upright, fontsize=size)
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
     figure.align_ylabels(list(panels))
     legend_above(figure, panels[0].get_legend_handles_labels(), columns=3)

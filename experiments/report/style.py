@@ -186,18 +186,6 @@ def fitting(width: float, labels: Sequence[str], columns: int) -> int:
     return 1
 
 
-def name_ticks(axes: Axes, names: Sequence[str]) -> None:
-    """Robots along the x axis, upright if there are many."""
-    crowded = len(names) > MANY
-    axes.set_xticks(
-        range(len(names)),
-        names,
-        rotation=90 if crowded else 0,
-        fontsize=6.5 if len(names) <= 2 * MANY else 5.0,
-    )
-    axes.tick_params(axis="x", length=0)
-
-
 def time_axis(axes: Axes, traces: Sequence[Trace]) -> None:
     """The x axis as time, as long as the longest trace."""
     begin, end = min(float(trace.time[0]) for trace in traces), max(float(trace.time[-1]) for trace in traces)

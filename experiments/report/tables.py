@@ -15,7 +15,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from agents.network.messages import Event
-from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics, ShadowMetrics
+from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.page import NONE, Cell, Row, Table, interval, number
@@ -420,10 +420,6 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     shadows = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
     tables = (_table_by_row(name, runs[:1], columns, items=shadows) for name, runs in by_case(cases).items())
     return tuple(table for table in tables if table.rows)
-
-
-def shadowed(cases: Sequence[CaseMetrics]) -> list[tuple[CaseMetrics, RobotMetrics, ShadowMetrics]]:
-    return [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
 
 
 # ---------------------------------------------------------------------- lists of what happened

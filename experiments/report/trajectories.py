@@ -195,11 +195,6 @@ def has_positions(trace: Trace) -> bool:
     return bool(np.isfinite(trace.true_position).all(axis=2).any())
 
 
-def has_heights(trace: Trace) -> bool:
-    """Whether any robot is ever above the floor, by more than `LOW`."""
-    return bool((trace.true_position[..., 2] > LOW).any())
-
-
 @styled
 def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """The trajectories of the whole run in space, all cases in one panel: start hollow, end full, links of the end.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
 from experiments.report.page import Finding, Mark, interval, number
-from experiments.report.tables import dropped_share, mean_delay, ratio_words, shadowed
+from experiments.report.tables import dropped_share, mean_delay, ratio_words
 
 KEPT_UP = 0.99  # a world that is slower than this share of real time falls behind
 UNFINISHED_M = 0.3  # a robot that is nearer to where its plan wants it merely lags
@@ -292,7 +292,8 @@ def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    found = sorted(shadowed(cases), key=lambda each: -each[2].rmse)
+    found = [(case, robot, robot.shadow) for case in cases for robot in case.robots if robot.shadow is not None]
+    found.sort(key=lambda each: -each[2].rmse)
     if not found:
         return []
     shown = []

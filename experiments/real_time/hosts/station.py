@@ -89,7 +89,7 @@ def answer(question: Question, clock: float) -> Answer:
             return Answer(
                 code,
                 clock,
-                version=version.number(),
+                version=version.installed("zenpark") or "unknown",
                 python=platform.python_version(),
                 machine=f"{socket.gethostname()} ({platform.system()} {platform.machine()})",
                 seen_from=os.environ.get("SSH_CONNECTION", "").partition(" ")[0],
