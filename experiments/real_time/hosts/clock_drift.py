@@ -63,6 +63,8 @@ class Drift:
     def _run(self) -> None:
         while self._hosts and not self._over.wait(PERIOD_S):
             for host in list(self._hosts):
+                if self._over.is_set():  # the end does not wait for hosts, each of which may be silent
+                    return
                 try:
                     self._measure(host)
                 except HostError as error:

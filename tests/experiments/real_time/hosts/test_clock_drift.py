@@ -96,6 +96,21 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
     assert "says nothing; its clock is not corrected any more" in trouble[1]
 
 
+def test_the_end_waits_for_the_host_that_is_asked_and_for_no_other(monkeypatch):
+    monkeypatch.setattr(clock_drift, "PERIOD_S", 0.01)
+    asked = []
+
+    class Silent(Host):
+        def measure(self, samples):
+            asked.append(self)
+            following._over.set()
+            return super().measure(samples)
+
+    with clock_drift.Drift([Silent([]), Silent([]), Silent([])]) as following:
+        until(lambda: asked, "the first is asked")
+    assert len(asked) == 1
+
+
 def test_nobody_abroad_nothing_to_follow():
     with clock_drift.Drift([]) as following:
         assert following.news() == ([], [])
