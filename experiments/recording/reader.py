@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -25,7 +26,8 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from experiments.recording.topics import CHUNK_BYTES, TOPICS
 
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
-_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE: Final = struct.Struct("<BQHIQQ")  # the same, and channel, sequence, log time, publish time of a message
+HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", "<u4, <u8"), ("published", "<u8")])
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
 
@@ -56,7 +58,17 @@ class Records:
     complete: bool = False  # the file was finished by its recorder and nothing in it is damaged; known at the end
 
     def messages(self) -> Iterator[Message]:
-        """All messages whose channel is known, in the order they were written.
+        """All messages whose channel is known, in the order they were written; raises as `pieces` does."""
+        for data, places in self.pieces():
+            for at in places:
+                _, length, channel, sequence, logged, published = _MESSAGE.unpack_from(data, at)
+                if channel in self.channels:
+                    yield Message(
+                        channel, sequence, logged, published, data[at + _MESSAGE.size : at + _RECORD.size + length]
+                    )
+
+    def pieces(self) -> Iterator[tuple[bytes, list[int]]]:
+        """Pieces of the file that are not damaged, each with the places in it where the records of messages begin.
 
         Raises:
             RecordingError: If the file cannot be read, or is no MCAP file.
@@ -71,7 +83,7 @@ class Records:
                 f"{self.path}: cannot be read: {error.strerror}; give the .mcap file of a run"
             ) from error
 
-    def _walk(self, file: BinaryIO, size: int) -> Iterator[Message]:
+    def _walk(self, file: BinaryIO, size: int) -> Iterator[tuple[bytes, list[int]]]:
         damaged = False
         while len(head := file.read(_RECORD.size)) == _RECORD.size:
             opcode, length = _RECORD.unpack(head)
@@ -84,28 +96,30 @@ class Records:
             try:
                 if opcode == Opcode.CHUNK:
                     stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
-                    messages = list(self._chunk(stream.read(length)))
+                    data = stream.read(length)
                 else:
-                    messages = list(self._chunk(head + body))
+                    data = head + body
+                places = self._places(data)
             except _DAMAGE:
                 damaged = True
                 continue
-            yield from messages
+            if places:
+                yield data, places
 
-    def _chunk(self, data: bytes) -> Iterator[Message]:
-        """The messages among records that follow each other."""
-        at = 0
-        while at < len(data):
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
-            if opcode == Opcode.MESSAGE:
-                channel, sequence, logged, published = _MESSAGE.unpack_from(data, at)
-                message = Message(channel, sequence, logged, published, data[at + _MESSAGE.size : at + length])
-                if channel in self.channels:
-                    yield message
+    def _places(self, data: bytes) -> list[int]:
+        """Places where the records of messages begin, among records that follow each other; other records are kept."""
+        places = []
+        at, end, unpack = 0, len(data), _RECORD.unpack_from
+        while at < end:
+            opcode, length = unpack(data, at)
+            if opcode != Opcode.MESSAGE:
+                self._keep(opcode, data[at + _RECORD.size : at + _RECORD.size + length])
+            elif length < _MESSAGE.size - _RECORD.size or at + _RECORD.size + length > end:
+                raise ValueError("a message beyond its chunk")
             else:
-                self._keep(opcode, data[at : at + length])
-            at += length
+                places.append(at)
+            at += _RECORD.size + length
+        return places
 
     def _keep(self, opcode: int, body: bytes) -> None:
         stream = ReadDataStream(BytesIO(body))
