@@ -51,9 +51,8 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
     def words(self) -> tuple[str, ...]:
         """Code, versions and machine in a sentence each, for people."""
         code = f"zenpark {self.zenpark}, code {self.code[:SHOWN]}"
-        code += f", commit {self.commit[:SHOWN]}{' with changes' if self.commit.endswith('+changes') else ''}" * bool(
-            self.commit
-        )
+        if self.commit:
+            code += f", commit {self.commit[:SHOWN]}{' with changes' if self.commit.endswith('+changes') else ''}"
         used = [f"Python {self.python}", *(f"{name} {number}" for name, number in self.packages.items())]
         added = [f"plug-ins of {name} {number}" for name, number in self.plugins.items()]
         machine = [self.system, self.cpu, f"{self.cores} cores", f"{self.memory_gb:.0f} GB"]

@@ -397,7 +397,8 @@ def import_(
 
     path, notes = convert(file, target, duration, poses)
     lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
-    lines += ["Not carried over, or not as it was:"] * bool(notes)
+    if notes:
+        lines.append("Not carried over, or not as it was:")
     lines += [textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    ") for note in notes]
     print_result({"file": path, "notes": notes}, *lines, as_json=as_json)
 

@@ -134,7 +134,9 @@ def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator)
         replies = orders.send_order(opened, keys, receivers, messages.Order(what, at=at))
         done = {name: reply.reason or DONE[what] for name, reply in replies.items() if reply.ok}
         refused = {name: reply.reason or reply.phase for name, reply in replies.items() if not reply.ok}
-        text = f"{what}: {', '.join(done) or 'no robot'}" + f"; refused by {', '.join(refused)}" * bool(refused)
+        text = f"{what}: {', '.join(done) or 'no robot'}"
+        if refused:
+            text += f"; refused by {', '.join(refused)}"
         event = messages.Event(time.time(), "order", by.identity, text)
         opened.put(keys.event, messages.encode(event), encoding=messages.JSON)
     return by.print_results(done, refused)

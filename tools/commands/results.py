@@ -544,5 +544,6 @@ def clean(
         shown.append({"folder": run.folder, "parts": parts, "removed": yes})
         if not as_json:
             print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
-    print_result(shown, f"runs: {len(chosen)}" + "; --yes does it" * bool(chosen and not yes), as_json=as_json)
+    remedy = "; --yes does it" if chosen and not yes else ""
+    print_result(shown, f"runs: {len(chosen)}{remedy}", as_json=as_json)
     return 0

@@ -79,7 +79,8 @@ class Planner:
 
         A take-off is refused unless idle, a landing while landing.
         """
-        if self.plan[row] == Plan.LANDING if landing else self.plan[row] != Plan.IDLE:
+        possible = self.plan[row] != Plan.LANDING if landing else self.plan[row] == Plan.IDLE
+        if not possible:
             return Status.REFUSED
         span, zero = max(span, SHORTEST), np.zeros(4)
         goal = self._shorter_turn(pose, np.array([pose[0], pose[1], height, yaw]))
