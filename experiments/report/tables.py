@@ -293,9 +293,8 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
         ("RMSE [m]", _cell(_mean, "rmse")),
         ("Acquired [s]", _cell(_mean, "acquired_s")),
     ]
-    for k in range(1, max(len(run.starts_s) for run in runs)):
-        later = lambda robots, k=k: _known(_mean, (p.acquired_s for r in robots for p in r.phases[k - 1 : k]))  # noqa: E731
-        columns.append((f"{_phase(runs, k).strip()} [s]", lambda robots, later=later: number(later(robots))))  # type: ignore[misc]
+    later = range(1, max(len(run.starts_s) for run in runs))
+    columns += [(f"{_phase(runs, k).strip()} [s]", partial(_acquired_again, k=k)) for k in later]
     worst = "Worst link at the end" + (", mean" if len(runs) > 1 else "")
     columns.append((f"{worst} [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
     if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
@@ -308,9 +307,17 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
         (f"mean of {len(group)}", kind): [robot for robot in kept if robot.robot in group]
         for kind, group in groups.items()
     }
-    name = lambda robot: (f"({robot.robot})" if robot.robot in left_out else robot.robot, robot.kind)  # noqa: E731
+
+    def name(robot: RobotMetrics) -> tuple[str, str]:
+        return f"({robot.robot})" if robot.robot in left_out else robot.robot, robot.kind
+
     table = _table_by_row(case, runs, columns, name=name, sums=sums)
     return replace(table, note="In brackets: left out of the means.") if left_out else table
+
+
+def _acquired_again(robots: Sequence[RobotMetrics], k: int) -> str:
+    """Mean time [s] until robots had acquired the formation in phase `k`."""
+    return number(_known(_mean, (phase.acquired_s for robot in robots for phase in robot.phases[k - 1 : k])))
 
 
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
@@ -417,7 +424,10 @@ def shadow_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         ("Correlation x, y, z", signed("correlation", scale=1.0, form=".4f")),
         ("of speeds", signed("correlation_speed", scale=1.0, form=".4f")),
     ]
-    shadows = lambda run: [robot for robot in run.robots if robot.shadow is not None]  # noqa: E731
+
+    def shadows(run: CaseMetrics) -> list[RobotMetrics]:
+        return [robot for robot in run.robots if robot.shadow is not None]
+
     tables = (_table_by_row(name, runs[:1], columns, items=shadows) for name, runs in by_case(cases).items())
     return tuple(table for table in tables if table.rows)
 
