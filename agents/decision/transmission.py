@@ -11,8 +11,9 @@ import numpy as np
 from agents.arrays import Array, Index, clamp, every
 from agents.body.kinds import Kind
 from agents.network.validation import MAX_SPEED
+from agents.plugins.calls import failure
 from agents.plugins.predictors import HOLD, Predictor
-from agents.plugins.registry import FAILURES, PluginError
+from agents.plugins.registry import FAILURES
 from agents.plugins.triggers import LastEvent, Trigger, View
 
 
@@ -83,7 +84,7 @@ def due_rows(trigger: Trigger, view: View, state: Array) -> Index:
     try:
         return trigger.due(view, state)
     except FAILURES as error:
-        raise PluginError(f"the trigger {type(trigger).__name__} failed: {type(error).__name__}: {error}") from error
+        raise failure("trigger", trigger, error) from error
 
 
 class LowPass:

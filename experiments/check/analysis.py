@@ -40,6 +40,7 @@ from experiments.metrics.signals import after_last
 from twins.scene import Scene
 
 MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
+FITTING: Final = 1e-4  # [m] between a target and that of the best shape
 STANDS: Final = 0.001  # [m] moved by less in `WINDOW_S`
 GUESSES: Final = 400  # random places of robots from which a shape is sought: each costs time with their number
 
@@ -181,12 +182,16 @@ class Analysis:
 
 
 def _fitting(given: Link, second: str, first: str, place: Mapping[str, Array]) -> Link:
-    """A link with the target that two places have."""
+    """A link with the target that two places have; as it is if they fit it already."""
     offset = place[second] - place[first]
     if given.distance is not None:
+        if abs(norm(offset) - given.distance) < FITTING:
+            return given
         return msgspec.structs.replace(given, distance=round(float(norm(offset)), 4))
     count = len(given.offset or given.bearing or ())
     if given.offset is not None:
+        if np.all(np.abs(offset[:count] - given.offset) < FITTING):
+            return given
         return msgspec.structs.replace(given, offset=np.round(offset[:count], 4).tolist())
     return msgspec.structs.replace(given, bearing=np.round(offset[:count] / norm(offset[:count]), 4).tolist())
 

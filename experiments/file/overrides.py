@@ -189,6 +189,8 @@ def _target_in(shape: Mapping[str, Any], robots: object, text: str, word: str) -
     if not pairs_or_none(text):
         return 1.0 if word == "distance" else [1.0, 0.0]
     second, first = link_pairs(text)[0]
+    if first == second:
+        raise _NoPlace(f"'{first}' cannot receive from itself", "name two robots")
     places = []
     for name in (first, second):
         place = shape.get(name)

@@ -169,8 +169,8 @@ def _unknown(key: str, hint: str, path: Path, plugin: tuple[str, str] | None) ->
     """Fault of an unknown key; the hint names another table or plug-in that has it."""
     if plugin is not None:
         group, kind = plugin
-        other = _kind_with(group, [key])
-        hint = f"'{other}' has it" if other else hint
+        if others := [repr(other) for other in _kinds_with(group, [key])]:
+            hint = f"it is a parameter of {', '.join(others)}"
         return Fault((*path, key), f"unknown parameter '{key}' of {kind!r}", hint, on_key=True)
     if path and key in _FIELDS:
         hint = f"'{key}' belongs at the top of the file, above the first [table]"
@@ -185,8 +185,8 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
             if key != "kind" and (hint := did_you_mean(key, ["kind"])).startswith("did you mean"):
                 message = f"unknown key '{key}' in '{_name(path)}', which lacks its kind"
                 return [Fault((*path, key), message, hint, on_key=True)]
-        likely = _kind_with(group, [key for key in value if key != "kind"])
-        hint = f'add kind = "{likely}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
+        likely = _kinds_with(group, [key for key in value if key != "kind"])
+        hint = f'add kind = "{likely[0]}"' if likely else f'add kind = "..."; known: {", ".join(known)}'
         return [Fault((*path, "kind"), f"'{_name(path)}' needs its kind, as text", hint)]
     kind, given = registry.split(value)
     where = path if isinstance(value, str) else (*path, "kind")
@@ -199,9 +199,9 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     return _table(given, struct, path, (group, kind))
 
 
-def _kind_with(group: str, keys: Sequence[str]) -> str | None:
-    """The first plug-in that has all these parameters."""
-    return next((kind for kind in registry.names(group) if set(keys) <= set(parameters(group, kind))), None)
+def _kinds_with(group: str, keys: Sequence[str]) -> list[str]:
+    """Plug-ins that have all these parameters."""
+    return [kind for kind in registry.names(group) if set(keys) <= set(parameters(group, kind))]
 
 
 def _own_checks(value: Mapping[str, Any], struct: type[msgspec.Struct], path: Path) -> list[Fault]:

@@ -55,7 +55,7 @@ def check(
     ] = None,
     as_json: AsJson = False,
 ) -> int:
-    """Check an experiment file and say what theory says of it; exit code 1 if it has errors."""
+    """Check an experiment file and say what theory says of it; exit code 2 for errors of the file, 1 of theory."""
     from experiments.check.check import analyses, examine, unreadable
     from experiments.file import document
     from experiments.file.problems import DocumentError
@@ -331,7 +331,9 @@ def explain(
 def _print_entries(entries: Sequence[Entry]) -> None:
     """Lines of a table, one for each entry: cut at a terminal, in full for a file or a pipe."""
     for entry in entries:
-        text = f"{entry.key}  {entry.text}" + (f" [default: {entry.default}]" if entry.default else "")
+        default = f"default: {entry.default}" if entry.default else ""
+        known = ", ".join(filter(None, (entry.limits, default)))
+        text = f"{entry.key}  {entry.text}" + (f" [{known}]" if known else "")
         print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))
 
 

@@ -109,7 +109,7 @@ def test_a_trigger_that_fails_is_named():
         def fires(self, view, memory):
             return view.nothing
 
-    with pytest.raises(PluginError, match="the trigger Broken failed: AttributeError"):
+    with pytest.raises(PluginError, match=r"the trigger Broken failed: AttributeError.* \(.*\.py:\d+\)$"):
         say(Transmitter(Broken(), 1), 0.0, np.zeros((1, 3)))
 
 

@@ -182,6 +182,8 @@ class Broken(Avoidance, frozen=True):
     def restrain(self, setpoint, own, near):
         if self.way == "restrain fails":
             return setpoint / [1, 2, 3]
+        if self.way == "restrain nothing":
+            return None
         if self.way == "restrain lists":
             return [row[:2] for row in setpoint.tolist()[:1]] + setpoint.tolist()[1:]
         if self.way == "restrain words":
@@ -194,7 +196,11 @@ class Broken(Avoidance, frozen=True):
     [
         ("deviate fails", "the avoidance Broken failed: KeyError: 'goal'"),
         ("deviate shape", r"`deviate` of the avoidance Broken must give a goal per row, \(2, 3\), not \(1, 3\)"),
-        ("restrain fails", "the avoidance Broken failed: ValueError"),
+        ("restrain fails", r"the avoidance Broken failed: ValueError.* \(.*test_avoidance\.py:\d+\)$"),
+        (
+            "restrain nothing",
+            r"not nothing: is a `return` missing\? \(.*test_avoidance\.py\)",
+        ),
         ("restrain lists", "the avoidance Broken failed: ValueError"),
         ("restrain words", "the avoidance Broken failed: ValueError"),
         ("restrain shape", r"`restrain` of the avoidance Broken must give a setpoint per row, \(2, 4\), not \(2, 2\)"),

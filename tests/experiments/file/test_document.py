@@ -69,7 +69,7 @@ EXPECTED = [
     ("obstacle-plan-unknown", 11, 17, "no 'lime' among the planners", "did you mean 'line'?"),
     ("obstacle-two-shapes", 10, 7, "an obstacle has exactly one of box, radius and wall", "for example box ="),
     ("obstacle-wall-with-plan", 9, 8, "a wall cannot have a plan, because it does not move", "use a box"),
-    ("parameter-of-another", 3, 32, "unknown parameter 'threshold' of 'periodic'", "has it"),
+    ("parameter-of-another", 3, 32, "unknown parameter 'threshold' of 'periodic'", "it is a parameter of 'pred"),
     ("plan-missing", 11, 8, "'radius' is missing in 'plan'", "add radius ="),
     ("plan-own-check", 11, 52, "`radius` must be a number other than 0", ""),
     ("rate-not-dividing", 10, 11, "pose_hz = 40 does not divide body_hz = 100", "pose_hz = 50"),

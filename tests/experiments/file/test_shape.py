@@ -79,6 +79,7 @@ def test_a_change_may_have_a_shape():
         ("KH01 = [0.7, 1.4]", "KH01 = [1.0, 1.0]", "TB01 and KH01 are at one place"),
         ("KH01 = [0.7, 1.4]", "KH01 = [0.7, 1.4]\nKH1 = [0, 0]", "no robot is called 'KH1'"),
         ("KH01 = [0.7, 1.4]", "KH01 = 3", "KH01"),
+        ('"TB01 > KH01" = "shape"', '"TB01 > TB01" = "shape"', "'TB01' cannot receive from itself"),
         ('"TB01 > KH01" = "shape"', '"TB01 -> KH01" = "shape"', "is no link"),
         ('"TB01 > KH01" = "shape"', '"TB01 > KH1" = "shape"', "no robot is called 'KH1'"),
         ('"TB01 > KH01" = "shape"', '"TB01 > KH01" = "shap"', "shap"),
