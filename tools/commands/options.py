@@ -135,6 +135,14 @@ def warn(lines: Sequence[str]) -> None:
         print(f"zenpark: {line}", file=sys.stderr)
 
 
+def open_in_browser(address: str) -> None:
+    """Open a page, or tell that there is no browser."""
+    import webbrowser
+
+    if not webbrowser.open(address):
+        warn([f"no browser was found here: open {address} by hand"])
+
+
 def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included
     """Print a result as JSON: what every command does with `--json`; NaN is null, a path its text."""
     import msgspec

@@ -27,6 +27,7 @@ from tools.commands.options import (
     Settings,
     check_bodies,
     example,
+    open_in_browser,
     print_json,
     print_result,
     warn,
@@ -274,14 +275,12 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
 
 def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:
     """Write and print the results."""
-    import webbrowser
-
     write_figures_of_merit(runs, folder)
     page = write_report(runs, folder) if show.report else None
     found = summary(runs)
     print_result(found, *_lines(runs, found, page), as_json=show.as_json)
     if show.open_report and page is not None:
-        webbrowser.open(page.resolve().as_uri())
+        open_in_browser(page.resolve().as_uri())
 
 
 def _refuse(options: RunOptions, show: _Shown, *, virtual: bool, seeds: int) -> None:

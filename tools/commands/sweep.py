@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import Anyway, AsJson, Cases, File, OpenReport, Out, Report, Settings, example, print_result
+from tools.commands.options import (
+    Anyway,
+    AsJson,
+    Cases,
+    File,
+    OpenReport,
+    Out,
+    Report,
+    Settings,
+    example,
+    open_in_browser,
+    print_result,
+)
 
 if TYPE_CHECKING:
     from experiments.sweep.optimise import TuningResult
@@ -59,8 +71,6 @@ def sweep(
     open_report: OpenReport = False,
 ) -> int:
     """Run cases x values x seeds in virtual time on all cores; finished runs are never repeated."""
-    import webbrowser
-
     from experiments.file.document import load
     from experiments.sweep import table as tables
     from tools.commands.run import sound
@@ -93,7 +103,7 @@ def sweep(
         lines += [f"figures: {found.folder / 'figures'}", f"page: {page}"]
     print_result(table, *lines, as_json=as_json)
     if open_report and page is not None and code != INTERRUPTED:
-        webbrowser.open(page.resolve().as_uri())
+        open_in_browser(page.resolve().as_uri())
     return code
 
 

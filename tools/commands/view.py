@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from tools import completion
-from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, example, print_json, routers
+from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, example, open_in_browser, print_json, routers
 
 if TYPE_CHECKING:
     import zenoh
@@ -348,9 +348,7 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
 
 
 def _tell(port: int, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
-    import webbrowser
-
     address = f"http://127.0.0.1:{port}"
     print(f"{address}  {what}", flush=True, file=to)
     if open_page:
-        webbrowser.open(address)
+        open_in_browser(address)
