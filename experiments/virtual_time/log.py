@@ -251,7 +251,7 @@ class Logbook:
         return self._by_sample(got.arrival, got.link, news)
 
     def _by_sample(self, arrival: Array, row: Index, news: Iterable[T]) -> dict[tuple[int, int], list[T]]:
-        """What arrived, by the number of the next sample and the row."""
+        """Arrivals by the number of the next sample and the row."""
         sample = np.searchsorted(self._log.time, arrival - ROUNDING_S)
         found: dict[tuple[int, int], list[T]] = {}
         for k, robot, each in zip(sample.tolist(), row.tolist(), news, strict=True):

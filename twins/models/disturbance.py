@@ -28,7 +28,7 @@ class HoverJitter:
         self._displacement = np.zeros((len(disturbance), 2))
 
     def advance(self, height: Array) -> Array:
-        """One step of dt, exact for any dt; returns the displacement (n, 2) of rows at `height` (n,) [m]."""
+        """Step by dt, exact for any dt; returns the displacement (n, 2) of rows at `height` (n,) [m]."""
         self._displacement = self._keep * self._displacement + self._push.draw()
         if every(height >= FULL_WOBBLE):
             return self._displacement

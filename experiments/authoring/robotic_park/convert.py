@@ -158,7 +158,7 @@ def _body(robot: Robot) -> dict[str, str]:
 
 
 def _note_robots(park: Park, notes: list[str]) -> None:
-    """What robots of theirs have and zenpark's do not."""
+    """Notes on settings of the authors' robots that zenpark does not have."""
 
     def those(what: Callable[[Robot], object], note: str) -> None:
         if names := [robot.name for robot in park.robots if what(robot)]:

@@ -141,7 +141,7 @@ class _Switch(Struct, frozen=True):
 
 
 class _TaskHead(Struct, frozen=True):
-    """What counts of a task that is switched off, whatever else is in it."""
+    """Head of a task: all that is read of a task that is switched off."""
 
     enable: bool = True
     relationship: str = ""

@@ -1,4 +1,4 @@
-"""What `check` finds in the ideal run: acquisition, soft formations, encounters, walls and plans."""
+"""Findings of `check` in the ideal run: acquisition, soft formations, encounters, walls and plans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What several commands do alike."""
+"""Helpers of several commands: pages are opened in the browser."""
 
 import webbrowser
 
