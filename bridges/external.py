@@ -18,9 +18,9 @@ from agents.arrays import Array, Index, Mask, norm, some
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState
 from agents.body.measured_positions import MeasuredPositions
+from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
 from agents.safety.detection import SLOWEST
@@ -94,7 +94,7 @@ class ExternalBody:
         try:
             name = f"body of {'+'.join(self._names)}"
             self._session = network.open_session(self._endpoints, name=name, wait_s=OPEN_S, identity=self._names[0])
-        except (network.Unreachable, EndpointError) as error:
+        except ExplainedError as error:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, messages.MIME["json"]
         rows = range(len(self._names))

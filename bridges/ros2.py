@@ -19,10 +19,8 @@ import msgspec
 import zenoh
 from msgspec import Meta
 
-from agents.body.interface import BodyError
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.keys import Keys
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
@@ -239,8 +237,7 @@ def serve(launch: Ros2Launch) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    explained = (BodyError, EndpointError, network.Unreachable)
-    return command_line.run("zenpark bridge ros2", Ros2Launch, serve, explained, arguments)
+    return command_line.run("zenpark bridge ros2", Ros2Launch, serve, arguments)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ TOPS = ("agents", "twins", "bridges", "experiments", "tools")
 MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one other imports
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
+agents.errors
 agents.arrays agents.clock agents.user_folder
 agents.formation agents.network
 agents.plugins

@@ -12,6 +12,7 @@ from typing import Annotated, Final
 
 import typer
 
+from agents.errors import ExplainedError
 from tools.bench import bench
 from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
 from tools.commands.options import Group, example, print_json
@@ -62,28 +63,7 @@ for _name, _help in LAUNCHER.items():
     app.command(name=_name, help=_help, epilog=example(f"{_name} --help"), context_settings=_given)(_launched(_name))
 
 
-# The errors that explain themselves, by the module that defines them: one that was raised has its module loaded,
-# so that nothing needs to be imported to recognise it.
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # a disk takes no more
-EXPLAINED: Final = (
-    ("agents.network.endpoints", "EndpointError"),
-    ("agents.network.lab", "LabError"),
-    ("agents.network.session", "Unreachable"),
-    ("agents.body.interface", "BodyError"),
-    ("agents.network.name_ownership", "NameTaken"),
-    ("agents.plugins.registry", "PluginError"),
-    ("experiments.file.problems", "DocumentError"),
-    ("experiments.recording.reader", "RecordingError"),
-    ("experiments.report.export", "ExportError"),
-    ("experiments.real_time.conductor.run_view", "RunFailed"),
-    ("experiments.real_time.hosts.hosts", "HostError"),
-    ("experiments.virtual_time.conductor", "Stuck"),
-    ("experiments.sweep.workers", "SweepError"),
-    ("experiments.real_time.conductor.support", "StandInError"),
-    ("tools.commands.network", "KeyExpressionError"),
-    ("experiments.view.broadcast", "Occupied"),
-    ("tools.commands.view", "ViewError"),
-)
 
 
 def _version(asked: bool) -> None:
@@ -106,10 +86,6 @@ def _zenpark(
         ),
     ] = False,
 ) -> None: ...
-
-
-def _explained() -> tuple[type[BaseException], ...]:
-    return tuple(getattr(sys.modules[module], name) for module, name in EXPLAINED if module in sys.modules)
 
 
 UsageError: Final[type[typer.BadParameter]] = typer.BadParameter.__mro__[
@@ -163,7 +139,7 @@ def main() -> None:
         sys.exit(2)
     except typer.Abort:
         sys.exit(130)
-    except _explained() as error:
+    except ExplainedError as error:
         _report(str(error), problems=getattr(error, "problems", None))
         sys.exit(2)
     except OSError as error:

@@ -17,6 +17,7 @@ from msgspec import Meta
 from agents.arrays import Array, Columns, Index, Mask
 from agents.body.kinds import Kind
 from agents.clock import Clock
+from agents.errors import ExplainedError
 from agents.network.keys import Keys
 from agents.network.messages import Inspection
 
@@ -203,7 +204,7 @@ def inspect(body: Body, row: int) -> Inspection:
     return body.inspect(row) if isinstance(body, Inspectable) else Inspection()
 
 
-class BodyError(RuntimeError):
+class BodyError(ExplainedError, RuntimeError):
     """A body that cannot be opened or driven, with the remedy."""
 
 

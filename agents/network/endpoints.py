@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, Self
 
+from agents.errors import ExplainedError
 from agents.network import lab
 
 DEFAULT_PORT: Final = 7447
@@ -22,7 +23,7 @@ _WHY_NOT: Final = {
 }
 
 
-class EndpointError(ValueError):
+class EndpointError(ExplainedError, ValueError):
     """An endpoint that cannot or must not be used, with the remedy."""
 
 

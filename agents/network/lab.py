@@ -17,6 +17,8 @@ from typing import Final, Literal, NamedTuple, get_args
 
 import msgspec
 
+from agents.errors import ExplainedError
+
 Role = Literal[
     "robot", "operator", "observer", "router", "recorder", "world", "positioning", "twin", "centre", "ros2"
 ]  # fmt: skip
@@ -29,7 +31,7 @@ SECURE: Final = ("tls", "quic")
 DEFAULT_SECURE: Final = "tls/127.0.0.1:7447"
 
 
-class LabError(ValueError):
+class LabError(ExplainedError, ValueError):
     """A lab, a certificate or an endpoint of a lab that cannot be used, with the remedy."""
 
 

@@ -18,6 +18,7 @@ from typing import Final
 import zenoh
 
 from agents.clock import uptime
+from agents.errors import ExplainedError
 from agents.network import pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -29,7 +30,7 @@ TURN_S: Final = 0.01  # between two polls of a check
 SETTLE_S: Final = 0.2  # limit for a token to travel from one router to the next, and for a lost link to be noticed
 
 
-class NameTaken(RuntimeError):
+class NameTaken(ExplainedError):
     """A process of the same name is on the network already."""
 
 

@@ -27,6 +27,7 @@ from typing import Final, Protocol, TypeVar
 import zenoh
 from zenoh.handlers import RingChannel
 
+from agents.errors import ExplainedError
 from agents.network import access_control, lab
 from agents.network import endpoints as topology
 from agents.network.endpoints import EndpointError
@@ -121,7 +122,7 @@ ASKED: Final = 8  # pending queries
 LOOK_S: Final = 0.1  # most time between two polls that counts as silence of the router
 
 
-class Unreachable(ConnectionError):
+class Unreachable(ExplainedError, ConnectionError):
     """No router answers at the endpoints."""
 
 

@@ -62,10 +62,7 @@ def settings(
             raise EndpointError(f"'{endpoint}' is not an endpoint: write it like {DEFAULT_ENDPOINT}")
         if why := refusal(lab.bare([endpoint])[0]):
             raise EndpointError(why)
-    try:
-        of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
-    except lab.LabError as error:
-        raise EndpointError(str(error)) from None
+    of_lab, folder = _of_lab([*connect, *listen], identity or name or "", bool(listen), rights)
     connect, listen = topology.bare(connect), topology.bare(listen)
     if folder is None:
         for endpoint in listen:

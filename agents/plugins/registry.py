@@ -17,6 +17,8 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
+from agents.errors import ExplainedError
+
 BODIES: Final = "zenpark.bodies"
 TRIGGERS: Final = "zenpark.triggers"
 LAWS: Final = "zenpark.laws"
@@ -34,7 +36,7 @@ class _Groups(Protocol):
     def select(self, *, group: str) -> EntryPoints: ...
 
 
-class PluginError(ValueError):
+class PluginError(ExplainedError, ValueError):
     """A registered plug-in cannot be used."""
 
 

@@ -15,9 +15,10 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import msgspec
 from msgspec import Meta
 
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.errors import ExplainedError
+from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.lab import LabError, secured
+from agents.network.lab import secured
 
 
 @contextmanager
@@ -35,14 +36,6 @@ def on_termination(end: Callable[[], object], *more: signal.Signals) -> Iterator
             signal.signal(number, handler)
 
 
-def secured_endpoints(connect: Sequence[str], folder: str | None) -> list[str]:
-    """Endpoints, the usual one if there are none, each with its lab if there is one; raises EndpointError."""
-    try:
-        return secured(connect, folder) or [DEFAULT_ENDPOINT]
-    except LabError as error:
-        raise EndpointError(str(error)) from None
-
-
 class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     """Options of a process that joins a network without an experiment."""
 
@@ -55,7 +48,8 @@ class NetworkLaunch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     lifeline: Annotated[bool, Meta(description="end when standard input ends or is silent")] = False
 
     def endpoints(self) -> list[str]:
-        return secured_endpoints(self.connect, self.lab)
+        """Routers, the usual one if none is named, each with its lab if there is one; raises LabError."""
+        return secured(self.connect, self.lab) or [DEFAULT_ENDPOINT]
 
 
 L = TypeVar("L", bound=msgspec.Struct)
@@ -65,11 +59,12 @@ def run(
     prog: str,
     kind: type[L],
     serve: Callable[[L], int],
-    explained: tuple[type[BaseException], ...],
     arguments: Sequence[str] | None = None,
+    more: tuple[type[BaseException], ...] = (),
 ) -> int:
-    """Runs a process from its command line; errors that are `explained` are printed. Returns the exit code."""
+    """Runs a process from its command line; prints errors that are explained, and `more`. Returns the exit code."""
     launch = parse(prog, kind, arguments)
+    explained: tuple[type[BaseException], ...] = (ExplainedError, *more)
     try:
         return serve(launch)
     except explained as error:

@@ -16,6 +16,7 @@ import msgspec
 import zenoh
 from msgspec import Meta
 
+from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
@@ -109,7 +110,7 @@ def serve_router(
                 read = now
                 try:
                     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
-                except EndpointError as error:  # the former rules still hold
+                except ExplainedError as error:  # the former rules still hold
                     print(f"router: {error}", file=sys.stderr, flush=True)
                     continue
                 print("router: the lab has changed; its rules are enforced from now on", flush=True)
@@ -163,8 +164,7 @@ def _launched(launch: RouterLaunch) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    explained = (EndpointError, OSError, msgspec.MsgspecError)
-    return command_line.run("zenpark router", RouterLaunch, _launched, explained, arguments)
+    return command_line.run("zenpark router", RouterLaunch, _launched, arguments, (OSError, msgspec.MsgspecError))
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyError, BodyRequest, BodyState, Rays, call_all
 from agents.clock import uptime
+from agents.errors import ExplainedError
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
@@ -83,7 +83,7 @@ class TurtleBot3:
                 session = network.open_session(
                     robot.endpoints, name=f"{robot.name} ROS 2", wait_s=wait, identity=robot.name
                 )
-            except (network.Unreachable, EndpointError) as error:
+            except ExplainedError as error:
                 raise BodyError(f"{robot.name}: {error}; or set device.endpoint to the router of the robot") from None
             self._sessions[robot.endpoints] = session
         return self._sessions[robot.endpoints]

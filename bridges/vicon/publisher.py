@@ -249,7 +249,7 @@ def parse_maps(maps: Sequence[str]) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    return command_line.run("zenpark bridge vicon", ViconLaunch, serve, (ValueError, network.Unreachable), arguments)
+    return command_line.run("zenpark bridge vicon", ViconLaunch, serve, arguments, (ValueError,))
 
 
 if __name__ == "__main__":

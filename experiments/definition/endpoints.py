@@ -30,13 +30,10 @@ def router_endpoints(
         experiment: Its `network.connect` holds if the command line names none.
 
     Raises:
-        EndpointError: If a router of a lab asks for no certificates.
+        LabError: If a router of a lab asks for no certificates.
     """
     endpoints = read_endpoints(connect) or experiment.network.connect or []
-    try:
-        return lab.secured(endpoints, lab_folder(experiment, file, chosen))
-    except lab.LabError as error:
-        raise EndpointError(str(error)) from None
+    return lab.secured(endpoints, lab_folder(experiment, file, chosen))
 
 
 def read_endpoints(given: Iterable[str]) -> list[str]:

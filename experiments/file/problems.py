@@ -15,6 +15,7 @@ from typing import Final
 
 import msgspec
 
+from agents.errors import ExplainedError
 from agents.plugins.registry import did_you_mean
 
 Path = tuple[str | int, ...]
@@ -208,7 +209,7 @@ class Problem:
         return "\n".join(parts)
 
 
-class DocumentError(ValueError):
+class DocumentError(ExplainedError, ValueError):
     """Experiment that cannot be read, with all of its problems."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:

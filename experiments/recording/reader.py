@@ -23,6 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from agents.errors import ExplainedError
 from experiments.recording.topics import CHUNK_BYTES, TOPICS
 
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
@@ -31,7 +32,7 @@ HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", 
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
 
-class RecordingError(RuntimeError):
+class RecordingError(ExplainedError):
     """A recording that cannot be written, read or recovered, with its path and the remedy."""
 
 

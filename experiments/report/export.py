@@ -16,6 +16,7 @@ from typing import Any, Final, get_args, get_type_hints
 
 import numpy as np
 
+from agents.errors import ExplainedError
 from agents.formation.graph import adjacency
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, phase_starts
@@ -80,24 +81,20 @@ UNITS: Final[dict[str, Any]] = {
 COLUMNS: Final = ("x", "y", "z", "yaw", "true_x", "true_y", "true_z", "goal_x", "goal_y", "goal_z", "error")
 
 
-class ExportError(RuntimeError):
-    """A failed export, with the remedy."""
-
-
 def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], file: Path) -> None:
     """Writes a struct for each case, named after it, into a file of MATLAB's version 5.
 
     Numbers are doubles, robots are counted from 1, what is unknown is NaN. What is in the structs: docs/matlab.md.
 
     Raises:
-        ExportError: If scipy is missing, the file cannot be written, or a case is too large for it.
+        ExplainedError: If scipy is missing, the file cannot be written, or a case is too large for it.
     """
     savemat = require_savemat()
     names = matlab_names(traces)
     cases = {names[case]: structure(trace, metrics[case]) for case, trace in traces.items()}
     for name, case in cases.items():
         if (size := _bytes(case)) >= LARGEST:
-            raise ExportError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
+            raise ExplainedError(f"{file}: {name} has {size / 1e9:.1f} GB, MATLAB reads 2.1; export a table: --csv")
     try:
         with file.open("wb") as stream:
             savemat(stream, cases, long_field_names=True, do_compression=True, oned_as="column")
@@ -129,7 +126,7 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
     """All cases side by side as a film, `speed` times as fast as the run: .mp4 (H.264, by ffmpeg) or .gif.
 
     Raises:
-        ExportError: If there is no ffmpeg for an .mp4, or the file cannot be written.
+        ExplainedError: If there is no ffmpeg for an .mp4, or the file cannot be written.
     """
     from matplotlib.animation import FFMpegWriter, PillowWriter  # noqa: PLC0415
 
@@ -137,12 +134,12 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
 
     mp4 = file.suffix.lower() == ".mp4"
     if mp4 and not FFMpegWriter.isAvailable():
-        raise ExportError(
+        raise ExplainedError(
             f"{file}: an .mp4 needs the program ffmpeg (Debian: apt install ffmpeg); a .gif needs nothing"
         )
     shown = list(traces.values())
     if not any(trajectories.has_positions(trace) for trace in shown):
-        raise ExportError(f"{file}: no position is known in this run; there is nothing to show")
+        raise ExplainedError(f"{file}: no position is known in this run; there is nothing to show")
     figure, show = trajectories.film(shown)
     writer = FFMpegWriter(FRAMES_HZ, bitrate=2000) if mp4 else PillowWriter(FRAMES_HZ)  # type: ignore[arg-type]
     try:
@@ -226,8 +223,8 @@ def _is_number(kind: Any) -> bool:  # noqa: ANN401 - an annotation
     return set(get_args(kind) or (kind,)) <= {int, float, NoneType}
 
 
-def _unwritable(file: Path, error: OSError) -> ExportError:
-    return ExportError(f"{file}: cannot be written: {error.strerror}; name another place")
+def _unwritable(file: Path, error: OSError) -> ExplainedError:
+    return ExplainedError(f"{file}: cannot be written: {error.strerror}; name another place")
 
 
 def _bytes(value: Any) -> int:  # noqa: ANN401 - any field of a struct
@@ -242,7 +239,7 @@ def require_savemat() -> Any:  # noqa: ANN401 - scipy has no types
     try:
         return import_module("scipy.io").savemat  # an extra
     except ImportError:
-        raise ExportError(
+        raise ExplainedError(
             "MATLAB files need a library that is an extra: ./zenpark install scipy, or pip install -e "
             "'.[matlab]'; a table needs none: --csv"
         ) from None

@@ -20,6 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
+from agents.errors import ExplainedError
 from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
@@ -27,7 +28,7 @@ from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combinat
 from experiments.sweep.store import Store
 from experiments.sweep.sweep import SweepRunner, folder_of, origin
 from experiments.sweep.table import MEANS, RATIOS, CellRow, words_of
-from experiments.sweep.workers import SweepError, workers
+from experiments.sweep.workers import workers
 
 Progress = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
 
@@ -152,7 +153,7 @@ def tune(
 
     Raises:
         DocumentError: If the file or an argument is wrong.
-        SweepError: If the library is not installed, or the workers are lost.
+        ExplainedError: If the library is not installed, or the workers are lost.
         KeyboardInterrupt: After Ctrl-C; the same call goes on from there.
     """
     wish = wish_of(wished)
@@ -266,7 +267,7 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
     try:
         return import_module("cma")
     except ImportError:
-        raise SweepError(
+        raise ExplainedError(
             "--optimize needs a library that is an extra: ./zenpark install cma, or pip install -e '.[optimize]'"
         ) from None
 

@@ -94,7 +94,7 @@ def sweep(
 
     Raises:
         DocumentError: If the file or an argument is wrong.
-        SweepError: If the workers are lost.
+        ExplainedError: If the workers are lost.
     """
     read = load(file, *settings)
     axes, words = arguments(given)

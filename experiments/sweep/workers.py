@@ -17,16 +17,13 @@ from typing import Any, Final
 
 import msgspec
 
+from agents.errors import ExplainedError
 from experiments.sweep.runs import WorkResult, fly
 
 ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 ADDRESS: Final = re.compile(r"(tcp|tls)://[^\s/]+:[0-9]{1,5}")
 KILLED: Final = "a process of the sweep was killed, perhaps for want of memory (then: fewer --processes)"
 ANSWER_S: Final = 10.0  # a scheduler that does not answer for so long is not there
-
-
-class SweepError(RuntimeError):
-    """A sweep that cannot go on, with the remedy; what is done is kept."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class Workers:
         """Runs all works, and yields each when it is done, in any order.
 
         Raises:
-            SweepError: If the workers are lost, or have other code.
+            ExplainedError: If the workers are lost, or have other code.
         """
         if self.executor is None:
             for work in works:
@@ -65,7 +62,7 @@ class Workers:
             for future in as_completed(waiting):
                 yield waiting[future], self._checked(future.result())
         except self.failures as error:
-            raise SweepError(f"{self.reason(error)}; what is done is kept: give the same command again") from None
+            raise ExplainedError(f"{self.reason(error)}; what is done is kept: give the same command again") from None
         finally:
             for future in waiting:
                 future.cancel()
@@ -73,7 +70,7 @@ class Workers:
     def _checked(self, answer: bytes) -> WorkResult:
         outcome = msgspec.json.decode(answer, type=WorkResult)
         if outcome.stranger:
-            raise SweepError(
+            raise ExplainedError(
                 f"{self.place} has another version of zenpark, of a plug-in or of numpy than this process "
                 f"({outcome.stranger}), so its runs would not be the same; install the same everywhere (or, if the "
                 "code has just been changed, give the command again)"
@@ -85,7 +82,7 @@ def workers(scheduler: str | None, processes: int | None) -> AbstractContextMana
     """The workers of a scheduler, if one is named, else of this machine; the end of the block ends their work.
 
     Raises:
-        SweepError: At the beginning of the block, if a scheduler is not there, or has no worker.
+        ExplainedError: At the beginning of the block, if a scheduler is not there, or has no worker.
     """
     return _local(processes) if scheduler is None else _cluster(scheduler)
 
@@ -122,12 +119,12 @@ def _cluster(address: str) -> Iterator[Workers]:
     try:
         distributed: Any = import_module("distributed")  # an extra
     except ImportError:
-        raise SweepError(
+        raise ExplainedError(
             "--scheduler needs a library that is an extra: ./zenpark install distributed, or "
             "pip install -e '.[cluster]'"
         ) from None
     if not ADDRESS.fullmatch(address):
-        raise SweepError(f"--scheduler {address}: this is no address; write one as tcp://192.0.2.7:8786")
+        raise ExplainedError(f"--scheduler {address}: this is no address; write one as tcp://192.0.2.7:8786")
     with ExitStack() as stack:
         client: Any = None
         try:
@@ -137,7 +134,7 @@ def _cluster(address: str) -> Iterator[Workers]:
         except OSError as error:  # time-outs are
             why = "has no workers" if client is not None else f"does not answer ({_first_line(error)})"
             how = f"`dask scheduler` starts one, and `dask worker {address}` on each machine its workers"
-            raise SweepError(f"the scheduler at {address} {why}: {how}") from None
+            raise ExplainedError(f"the scheduler at {address} {why}: {how}") from None
 
         def threads() -> int:
             return max(1, sum(map(int, client.nthreads().values())))

@@ -16,6 +16,7 @@ import msgspec
 import zenoh
 
 from agents.clock import Clock as Utc
+from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
@@ -34,10 +35,6 @@ ENCODED: Final = (
     messages.Pose,
     messages.Goal,
 )  # the rest is JSON
-
-
-class Occupied(RuntimeError):
-    """A realm in which a run is up, into which nothing is played."""
 
 
 class Broadcast:
@@ -77,7 +74,7 @@ class Broadcast:
         """Plays until `ended`, by a clock from 0 to the recording's length [s]; returns the number of messages sent.
 
         Raises:
-            Occupied: If a run or a robot is up in the realm, before or while it plays.
+            ExplainedError: If a run or a robot is up in the realm, before or while it plays.
         """
         keys, names = self.keys, [self.keys.alive(name) for name in self.experiment.robots]
         began, mine = Utc().utc(), str(self._session.zid())
@@ -89,7 +86,7 @@ class Broadcast:
         def refuse_strangers(own: Sequence[str] = ()) -> None:
             found = {token for watch in watches for token, there in watch.changes() if there}
             if strangers := {token for token in found if token not in own and Keys.life_of(token) != mine}:
-                raise Occupied(_occupied(keys, strangers))
+                raise ExplainedError(_occupied(keys, strangers))
 
         until = time.monotonic() + SEEN_S
         while time.monotonic() < until and not ended.wait(STEP_S):
@@ -118,7 +115,7 @@ class Broadcast:
                 if at >= len(self._sent) and not clock.loop:
                     break
         except NameTaken as taken:
-            raise Occupied(_occupied(keys, set(str(taken).split(", ")))) from None
+            raise ExplainedError(_occupied(keys, set(str(taken).split(", ")))) from None
         finally:
             ownership.end()
         return count

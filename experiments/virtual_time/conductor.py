@@ -9,6 +9,7 @@ import numpy as np
 from agents.agent import Agent
 from agents.arrays import Mask
 from agents.decision.lifecycle import Phase
+from agents.errors import ExplainedError
 
 LEAD_S: Final = 0.5  # from the order to the common start
 # orders before the start fall on multiples of this, so that repetitions a few ticks apart get the same
@@ -16,7 +17,7 @@ ORDERS_S: Final = 0.5
 PATIENCE_S: Final = 60.0  # an experiment whose robots are not ready, up or down after this long never will be
 
 
-class Stuck(RuntimeError):
+class Stuck(ExplainedError):
     """Robots that do not become ready, airborne or done."""
 
 

@@ -21,8 +21,8 @@ from typing import Any
 import msgspec
 
 from agents.body.interface import BodyError
+from agents.errors import ExplainedError
 from agents.network import messages as wire
-from agents.network.endpoints import EndpointError
 from agents.plugins import registry
 from experiments.catalogue import index
 from experiments.file import document
@@ -401,7 +401,7 @@ def words() -> Iterator[Target]:
     from bridges.khepera4.link import Address  # noqa: PLC0415
     from bridges.vicon.publisher import parse_server  # noqa: PLC0415
     from experiments.definition.links import link_pairs  # noqa: PLC0415
-    from tools.commands.network import KeyExpressionError, key_expression  # noqa: PLC0415
+    from tools.commands.network import key_expression  # noqa: PLC0415
     from twins.devices.device import Faults  # noqa: PLC0415
 
     kinds = (crazyflie.CrazyflieSettings, khepera4.Khepera4Settings, tello.TelloSettings, turtlebot3.TurtleBot3Settings)
@@ -459,10 +459,7 @@ def words() -> Iterator[Target]:
             text = rest.decode("utf-8", "surrogateescape")
             read[name if name in read else names[len(data) % len(names)]](text)
 
-        refusals = (
-            BodyError, EndpointError, KeyExpressionError, registry.PluginError, argparse.ArgumentTypeError,
-            msgspec.MsgspecError, ValueError,
-        )  # fmt: skip
+        refusals = (ExplainedError, argparse.ArgumentTypeError, msgspec.MsgspecError, ValueError)
         yield Target(examples, take, refusals)
 
 

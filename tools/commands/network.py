@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from agents.errors import ExplainedError
 from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
 
 if TYPE_CHECKING:
@@ -21,10 +22,6 @@ app: Final = typer.Typer()
 POLL_S: Final = 0.02
 WINDOW_S: Final = 1.0
 DEPTH: Final = 8192  # samples between two polls
-
-
-class KeyExpressionError(ValueError):
-    """Not a key expression of Zenoh."""
 
 
 @dataclass
@@ -50,7 +47,7 @@ def key_expression(text: str) -> str:
         return str(zenoh.KeyExpr(text))
     except zenoh.ZError as error:
         why = str(error).partition(" at /")[0].partition("`: ")[2]
-        raise KeyExpressionError(f"'{text}' is not a key expression: {why}. Write it like park/*/pose") from None
+        raise ExplainedError(f"'{text}' is not a key expression: {why}. Write it like park/*/pose") from None
 
 
 def members(session: zenoh.Session, timeout_s: float = 2.0) -> list[Member]:

@@ -292,12 +292,11 @@ def _of_environment(lab: str | None) -> list[str]:
     """Routers that the environment names; none if they are wrong, which must not keep the others from being stopped."""
     import os
 
-    from agents.network.endpoints import EndpointError
-    from agents.network.lab import LabError
+    from agents.errors import ExplainedError
 
     try:
         return routers(os.environ.get(CONNECT, "").split(), lab)
-    except (EndpointError, LabError) as error:
+    except ExplainedError as error:
         print(f"zenpark: {CONNECT}: {error}", file=sys.stderr)
         return []
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from agents.errors import ExplainedError
 from tools import completion
 from tools.commands.options import AsJson, example, print_json, print_result
 
@@ -310,23 +311,23 @@ def export(  # noqa: PLR0917 - a command line
 ) -> None:
     """Write a run for MATLAB, as one table, as a film, or as a bundle that `./zenpark run` repeats."""
     from experiments.recording import bundle
-    from experiments.report.export import ExportError, require_savemat, write_csv, write_mat, write_video
+    from experiments.report.export import require_savemat, write_csv, write_mat, write_video
     from experiments.run import reopen
 
     if video is not None and (target or as_csv or as_bundle or video.suffix.lower() not in (".mp4", ".gif")):
-        raise ExportError(f"{video}: name the film behind --video alone, with .mp4 or .gif at its end")
+        raise ExplainedError(f"{video}: name the film behind --video alone, with .mp4 or .gif at its end")
     own = video.suffix if video else ".csv" if as_csv else ".zip" if as_bundle else ".mat"
     place = Path(folder).resolve()
     usual = place.with_name(f"{place.name}.zip") if as_bundle else place / f"run{own}"
     file = video or (Path(target) if target else usual)
     suffix = file.suffix.lower()
     if (video is None and suffix not in (".mat", ".csv", ".zip")) or (suffix != own and (as_csv or as_bundle)):
-        raise ExportError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
+        raise ExplainedError(f"{file}: is no name for what is exported; let it end with .mat, .csv or .zip (a bundle)")
     if suffix == ".mat":
         require_savemat()  # before a long recording is read
     found = reopen(Path(folder))
     if not found.traces:
-        raise ExportError(f"{folder}: no case had begun; there is nothing to export")
+        raise ExplainedError(f"{folder}: no case had begun; there is nothing to export")
     if suffix == ".mat":
         write_mat(found.traces, found.metrics, file)
     elif suffix == ".zip":

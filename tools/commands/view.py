@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
+from agents.errors import ExplainedError
 from tools import completion
 from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, example, open_in_browser, print_json, routers
 
@@ -31,10 +32,6 @@ START_S: Final = 30.0  # until a run that was started just now is registered
 POLL_S: Final = 0.1
 REFRESH_S: Final = 0.25  # of the table
 FIRST_S: Final = 5.0  # limit for the reports of a table that is printed once
-
-
-class ViewError(RuntimeError):
-    """A view that cannot be opened, with the remedy."""
 
 
 @app.command(epilog=example("view", "view runs/first --open"))
@@ -245,7 +242,9 @@ def require_viser() -> None:
     from importlib.util import find_spec
 
     if find_spec("viser") is None:
-        raise ViewError("the view needs viser: `./zenpark view` installs it; elsewhere `pip install zenpark[view]`")
+        raise ExplainedError(
+            "the view needs viser: `./zenpark view` installs it; elsewhere `pip install zenpark[view]`"
+        )
 
 
 @contextmanager
@@ -316,7 +315,7 @@ def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: s
         return Watched(given, realm, identity or _default_identity(given))
     up = [run for run in run_registry.runs() if run.what == "run" and run.alive]
     if not up:
-        raise ViewError(
+        raise ExplainedError(
             "no run is up on this machine: start one (`./zenpark run robotic-park`), name its router (--connect), or "
             "the folder of a recording"
         )

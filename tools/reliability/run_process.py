@@ -19,16 +19,14 @@ from typing import Final
 
 import msgspec
 
+from agents.errors import ExplainedError
 from agents.network import messages
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from experiments.file.document import load
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
-from experiments.real_time.conductor.run_view import Progress, RunFailed
-from experiments.real_time.conductor.support import StandInError
-from experiments.real_time.hosts.hosts import HostError
+from experiments.real_time.conductor.run_view import Progress
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged
-from experiments.real_time.processes import joining
 from tools.progress import Lines
 from tools.reliability import spoilt_process
 from tools.reliability.spoilt_process import ROBOT, role_of
@@ -37,7 +35,6 @@ PAGE: Final = resource.getpagesize()
 PROC: Final = Path("/proc")
 NAME: Final = "conductor"
 END_S: Final = 45.0  # landing, recording and router of an interrupted run
-EXPLAINED: Final = (*joining.EXPLAINED, HostError, RunFailed, StandInError)
 
 
 class Request(msgspec.Struct):
@@ -92,7 +89,7 @@ def main() -> int:
                     EventLines(), over.is_set, launching=partial(CabledLauncher, request.cables, request.switches)
                 ),
             )
-    except EXPLAINED as error:
+    except ExplainedError as error:
         print(f"zenpark: {error}", file=sys.stderr)
         return 2
     return 0

@@ -298,8 +298,7 @@ def run(launch: TwinLaunch) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    explained = (ValueError, network.Unreachable, RecursionError)
-    return command_line.run("vicon twin", TwinLaunch, run, explained, arguments)
+    return command_line.run("vicon twin", TwinLaunch, run, arguments, (ValueError, RecursionError))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from agents.clock import Clock
 from agents.decision.lifecycle import FINISHED, TOLD_TO_END, Phase
+from agents.errors import ExplainedError
 from agents.network import endpoints as topology
 from agents.network import lab, messages, pubsub
 from agents.network import session as network
@@ -105,7 +106,7 @@ Show = Callable[[Progress], None]
 Shown = AbstractContextManager[Show]  # a live table takes the terminal over
 
 
-class RunFailed(RuntimeError):
+class RunFailed(ExplainedError):
     """A run that could not begin or go on, with reason and remedy."""
 
 

@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from agents.errors import ExplainedError
 from agents.network import endpoints as topology
 from agents.plugins import registry
 from experiments.definition import bodies
@@ -25,7 +26,7 @@ POLL_S: Final = 0.02
 VICON: Final = "vicon://"
 
 
-class StandInError(RuntimeError):
+class StandInError(ExplainedError):
     """A protocol twin or a positioning system that did not start, with its output."""
 
 

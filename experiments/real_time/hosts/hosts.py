@@ -21,6 +21,7 @@ import msgspec
 
 from agents import clock
 from agents.clock import Clock
+from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.endpoints import Endpoint
 from agents.network.messages import HostClock
@@ -38,7 +39,7 @@ POLL_S: Final = 0.02
 STATION: Final = "host-"  # prefix of the process of the connection to a host
 
 
-class HostError(RuntimeError):
+class HostError(ExplainedError):
     """Hosts that cannot take part, with reason and remedy."""
 
 

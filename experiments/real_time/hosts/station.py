@@ -23,9 +23,9 @@ from typing import Final, Literal
 import msgspec
 
 from agents.clock import Clock
+from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network import session as network
-from agents.network.endpoints import EndpointError
 from agents.plugins import registry
 from agents.runtime.lifeline import SILENCE_S
 from experiments.definition.bodies import missing_library
@@ -103,7 +103,7 @@ def _reach(endpoint: str, question: Question) -> Found:
         routers = lab.secured([endpoint], question.lab)
         with network.open_session(routers, name="zenpark hosts", wait_s=REACH_S, identity=identity):
             return Found(endpoint, True, f"{(time.monotonic() - began) * 1e3:.0f} ms")
-    except (network.Unreachable, EndpointError, lab.LabError) as error:
+    except ExplainedError as error:
         return Found(endpoint, False, str(error))
 
 

@@ -34,7 +34,7 @@ from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
-from experiments.real_time.processes.joining import EXPLAINED, Launch, Network, joined
+from experiments.real_time.processes.joining import Launch, Network, joined
 
 REPORT_S: Final = 1.0
 DEPTH: Final = 64  # queued poses of a robot
@@ -215,4 +215,4 @@ def serve(launch: Launch) -> int:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark centre", Launch, serve, EXPLAINED))
+    end(command_line.run("zenpark centre", Launch, serve))

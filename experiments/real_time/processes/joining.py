@@ -16,16 +16,13 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 import zenoh
 
-from agents.body.interface import BodyError
 from agents.clock import Clock
 from agents.network import pubsub
 from agents.network import session as network
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
-from agents.network.lab import LabError
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import held
-from agents.plugins.registry import PluginError
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
@@ -36,8 +33,6 @@ from experiments.file.document import Document, chosen_case
 from experiments.file.problems import DocumentError
 
 LOOK_S: Final = 0.1
-# errors of processes that are printed without a traceback
-EXPLAINED: Final = (DocumentError, BodyError, NameTaken, PluginError, EndpointError, LabError, network.Unreachable)
 
 
 class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):

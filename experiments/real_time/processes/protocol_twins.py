@@ -31,7 +31,7 @@ from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import structure
 from experiments.file.problems import refusal
-from experiments.real_time.processes.joining import EXPLAINED, Launch
+from experiments.real_time.processes.joining import Launch
 from twins.devices.device import Device, DeviceRequest, Faults
 
 
@@ -177,4 +177,4 @@ def _serve(
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark twin", TwinLaunch, stand_in, (*EXPLAINED, OSError)))
+    end(command_line.run("zenpark twin", TwinLaunch, stand_in, more=(OSError,)))

@@ -23,8 +23,7 @@ from agents.network.keys import Keys
 from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
-from experiments.real_time.processes.joining import EXPLAINED, Launch, joined
-from experiments.recording.reader import RecordingError
+from experiments.real_time.processes.joining import Launch, joined
 from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
@@ -198,4 +197,4 @@ def record(launch: RecorderLaunch) -> int:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark recorder", RecorderLaunch, record, (*EXPLAINED, RecordingError, OSError)))
+    end(command_line.run("zenpark recorder", RecorderLaunch, record, more=(OSError,)))

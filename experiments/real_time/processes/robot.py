@@ -28,6 +28,7 @@ from agents.clock import Clock
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
+from agents.network.lab import secured
 from agents.network.shutdown import end
 from agents.plugins import registry
 from agents.runtime import command_line
@@ -40,7 +41,7 @@ from experiments.file import document
 from experiments.file.document import chosen_case
 from experiments.file.problems import refusal
 from experiments.real_time.processes import joining
-from experiments.real_time.processes.joining import EXPLAINED, Launch
+from experiments.real_time.processes.joining import Launch
 
 STDIN: Final = "-"
 JOIN: Final = "join"
@@ -68,7 +69,7 @@ def fly(launch: RobotLaunch) -> int:
     with ExitStack() as stack:
         endpoints: Sequence[str] = launch.connect
         if file == JOIN:
-            endpoints = command_line.secured_endpoints(launch.connect, launch.lab)
+            endpoints = secured(launch.connect, launch.lab) or [DEFAULT_ENDPOINT]
             session = stack.enter_context(network.open_session(endpoints, name=f"{names[0]} joins", identity=names[0]))
             keys = Keys(launch.realm)
             read = joining.wait_for_experiment(session, keys, names)
@@ -139,7 +140,7 @@ def _ranging(robot: Robot) -> Ranging:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line of the process."""
-    return command_line.run("zenpark agent", RobotLaunch, fly, EXPLAINED, arguments)
+    return command_line.run("zenpark agent", RobotLaunch, fly, arguments)
 
 
 if __name__ == "__main__":

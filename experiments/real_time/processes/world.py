@@ -24,7 +24,7 @@ from agents.runtime import command_line
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.file.problems import refusal
-from experiments.real_time.processes.joining import EXPLAINED, Launch, Network, joined
+from experiments.real_time.processes.joining import Launch, Network, joined
 from experiments.real_time.processes.world_network import Exchange
 from experiments.real_time.processes.world_population import Population, Refused
 
@@ -226,4 +226,4 @@ def _alive(session: zenoh.Session, keys: Keys) -> set[str]:
 
 
 if __name__ == "__main__":
-    end(command_line.run("zenpark world serve", WorldLaunch, serve, EXPLAINED))
+    end(command_line.run("zenpark world serve", WorldLaunch, serve))

@@ -5,7 +5,8 @@ import signal
 
 import pytest
 
-from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.endpoints import DEFAULT_ENDPOINT
+from agents.network.lab import LabError
 from agents.runtime.command_line import NetworkLaunch, on_termination, parse
 
 
@@ -39,5 +40,5 @@ def test_the_arguments_of_the_network():
 def test_a_lab_wants_endpoints_that_ask_for_certificates(tmp_path):
     given = parse("twin", NetworkLaunch, ["--connect", "tcp/a:1", "--lab", str(tmp_path), "--as", "CF01"])
     assert given.identity == "CF01"
-    with pytest.raises(EndpointError, match="asks for no certificate"):
+    with pytest.raises(LabError, match="asks for no certificate"):
         given.endpoints()

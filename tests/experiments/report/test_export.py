@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from agents.errors import ExplainedError
 from agents.formation.graph import laplacian
 from experiments.file.document import load, loads
 from experiments.metrics.signals import formation_errors
 from experiments.recording.run_folder import SOURCE
 from experiments.report import export
-from experiments.report.export import KEYWORDS, UNITS, ExportError, matlab_names, structure
+from experiments.report.export import KEYWORDS, UNITS, matlab_names, structure
 from experiments.run import simulate
 from tools.commands import results as commands
 
@@ -47,9 +48,9 @@ def test_a_film_shows_the_run_from_its_start_to_its_end(flown):
 
 def test_a_film_needs_its_encoder_and_a_name(flown, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ExportError, match="needs the program ffmpeg"):
+    with pytest.raises(ExplainedError, match="needs the program ffmpeg"):
         commands.export(str(flown[0]), video=tmp_path / "film.mp4")
-    with pytest.raises(ExportError, match=r"\.mp4 or \.gif"):
+    with pytest.raises(ExplainedError, match=r"\.mp4 or \.gif"):
         commands.export(str(flown[0]), video=tmp_path / "film.avi")
 
 
@@ -169,15 +170,15 @@ def test_names_that_are_valid_stay():
 
 def test_what_cannot_be_exported_is_explained(flown, tmp_path, monkeypatch):
     folder, run = flown
-    with pytest.raises(ExportError, match=r"run\.txt: is no name"):
+    with pytest.raises(ExplainedError, match=r"run\.txt: is no name"):
         commands.export(str(folder), str(tmp_path / "run.txt"), as_csv=False)
-    with pytest.raises(ExportError, match=r"end with \.mat, \.csv"):
+    with pytest.raises(ExplainedError, match=r"end with \.mat, \.csv"):
         commands.export(str(folder), str(tmp_path / "run.mat"), as_csv=True)
     for name in ("run.mat", "run.csv"):
-        with pytest.raises(ExportError, match="cannot be written: No such file or directory"):
+        with pytest.raises(ExplainedError, match="cannot be written: No such file or directory"):
             commands.export(str(folder), str(tmp_path / "nowhere" / name), as_csv=False)
     monkeypatch.setattr(export, "LARGEST", 1000)
-    with pytest.raises(ExportError, match=r"periodic has 0\.0 GB"):
+    with pytest.raises(ExplainedError, match=r"periodic has 0\.0 GB"):
         export.write_mat(run.traces, run.metrics, tmp_path / "run.mat")
 
 
@@ -186,14 +187,14 @@ def test_without_scipy_it_says_what_to_install(flown, monkeypatch):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(export, "import_module", missing)
-    with pytest.raises(ExportError, match=r"\./zenpark install scipy"):
+    with pytest.raises(ExplainedError, match=r"\./zenpark install scipy"):
         commands.export(str(flown[0]), None, as_csv=False)
     commands.export(str(flown[0]), None, as_csv=True)
 
 
 def test_a_run_without_a_case_has_nothing(monkeypatch, tmp_path):
     monkeypatch.setattr("experiments.run.reopen", lambda _folder: SimpleNamespace(traces={}))
-    with pytest.raises(ExportError, match="nothing to export"):
+    with pytest.raises(ExplainedError, match="nothing to export"):
         commands.export(str(tmp_path), None, as_csv=True)
 
 

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from agents.errors import ExplainedError
 from experiments.definition.experiment import Experiment
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
@@ -21,7 +22,7 @@ from experiments.sweep.plan import Axis
 from experiments.sweep.runs import Stuck
 from experiments.sweep.sweep import folder_of, side_by_side, sweep
 from experiments.sweep.table import parameter_columns
-from experiments.sweep.workers import SweepError, Work, workers
+from experiments.sweep.workers import Work, workers
 from tools.commands import sweep as commands
 from tools.commands.results import report
 
@@ -173,12 +174,12 @@ def test_how_many_fly_side_by_side_depends_on_their_number():
 
 
 def test_workers_with_other_code_are_refused():
-    with workers(None, 1) as crew, pytest.raises(SweepError, match="another version of zenpark"):
+    with workers(None, 1) as crew, pytest.raises(ExplainedError, match="another version of zenpark"):
         list(crew.done([Work("x", b'{"title":"","robots":{},"duration_s":1}', (1,), "other")]))
 
 
 def test_a_scheduler_that_is_none():
-    with pytest.raises(SweepError, match=r"--scheduler nonsense: this is no address; write one as tcp://"):
+    with pytest.raises(ExplainedError, match=r"--scheduler nonsense: this is no address; write one as tcp://"):
         workers("nonsense", None).__enter__()
 
 

@@ -6,12 +6,13 @@ import threading
 
 import pytest
 
+from agents.errors import ExplainedError
 from agents.network import pubsub
 from agents.network.keys import Keys
 from experiments.file.document import load
 from experiments.run import simulate
 from experiments.view import broadcast
-from experiments.view.broadcast import Broadcast, Occupied
+from experiments.view.broadcast import Broadcast
 from experiments.view.replay import Clock
 from tests.fuzz.loopnet import Mute, Net
 
@@ -50,7 +51,7 @@ def test_the_replay_ends_when_another_process_owns_a_name(token, shown, recordin
         clock = Clock(0.0, played.end - played.begin)
         clock.playing, clock.speed = True, 10.0
         if shown:
-            with pytest.raises(Occupied, match=shown):
+            with pytest.raises(ExplainedError, match=shown):
                 played.run(threading.Event(), clock)
             assert clock.t < clock.end
         else:

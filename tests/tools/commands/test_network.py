@@ -8,10 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from agents.errors import ExplainedError
 from agents.network.messages import Order
 from agents.network.pubsub import Orders, alive_token, pose_publisher, publisher, subscriber
 from agents.network.session import open_session
-from tools.commands.network import HEADING, Cadence, KeyExpressionError, echo, key_expression, members, readable
+from tools.commands.network import HEADING, Cadence, echo, key_expression, members, readable
 
 ROOT = Path(__file__).resolve().parents[3]
 JSON, MSGPACK = "application/json", "application/msgpack"
@@ -44,7 +45,7 @@ def test_key_expressions(text):
     ],
 )
 def test_what_is_no_key_expression(text, why):
-    with pytest.raises(KeyExpressionError, match=rf"is not a key expression: .*{why}.*park/\*/pose"):
+    with pytest.raises(ExplainedError, match=rf"is not a key expression: .*{why}.*park/\*/pose"):
         key_expression(text)
 
 

@@ -1,0 +1,5 @@
+"""Base of the errors that a user can mend: a command prints them without a traceback and ends with exit code 2."""
+
+
+class ExplainedError(Exception):
+    """An error whose text names the place and the remedy."""
