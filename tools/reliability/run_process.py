@@ -12,10 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -128,8 +127,7 @@ class WatchedRun:
         self._launcher.end([NAME], grace_s=END_S)
 
 
-@dataclass(frozen=True)
-class Usage:
+class Usage(NamedTuple):
     """Resources of a process."""
 
     rss_mb: float  # resident memory [MB]
@@ -148,7 +146,7 @@ def usage_of(pid: int) -> Usage | None:
     except OSError:
         return None
     # counted from the state, which is field 3 of proc_pid_stat(5): num_threads 20, rss 24
-    return Usage(int(fields[21]) * PAGE / 1e6, int(fields[17]), files, cpu_s)
+    return Usage(round(int(fields[21]) * PAGE / 1e6, 3), int(fields[17]), files, cpu_s)
 
 
 if __name__ == "__main__":

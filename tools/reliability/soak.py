@@ -1,7 +1,6 @@
 """`./zenpark soak`: an experiment in real time for hours, and whether anything grows, is lost, slows down or dies.
 
-Sampled from outside, by a process that takes no part in the run: memory, threads, descriptors and CPU of each process,
-what the robots count, and how long their poses take. Everything is written down as it comes.
+Everything is written down as it comes: the processes that are measured keep no samples.
 """
 
 from __future__ import annotations
@@ -29,21 +28,20 @@ def soak(
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
-    from experiments.recording.run_folder import SOURCE, new_folder
+    from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
+    from experiments.recording.run_folder import new_folder
     from tools.progress import finding_lines
     from tools.reliability import soak_verdict
-    from tools.reliability.run_process import Request
-    from tools.reliability.soak_sampler import sample
+    from tools.reliability.soak_sampler import Sampler
 
-    changes = [*(settings or []), f"duration_s={60.0 * minutes!r}"]
-    read = load(file, *changes)
+    read = load(file, *(settings or []), f"duration_s={60.0 * minutes!r}")
     name = case or next(iter(read.cases()))
-    experiment = chosen(read, [name])[name]
     folder = new_folder(read, out)
-    read.keep(folder / SOURCE)
-    request = Request(str(folder / SOURCE), str(folder), name, changes, bodies)
+    sampler = Sampler(chosen(read, [name])[name], folder, name)
     with interrupts() as interrupted:
-        soaked = sample(experiment, request, interrupted)
+        user = Supervision(sampler, interrupted)
+        conduct(read, folder, RunOptions([name], bodies, here=True), user)
+        soaked = sampler.result(interrupted=interrupted() or bool(user.emergency))
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)
     page = soak_verdict.write(folder, soaked, findings, f"./zenpark soak {file} --minutes {minutes:g}")

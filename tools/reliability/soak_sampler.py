@@ -1,149 +1,141 @@
-"""Samples of a soak: a process beside the run counts what its processes take and what its robots receive."""
+"""Samples of a soak: what the processes of a run take, and what its robots receive, as a table that grows on disk."""
 
 from __future__ import annotations
 
 import csv
+import os
+import secrets
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import msgspec
-import zenoh
 
-from agents.clock import Clock
-from agents.network import messages, pubsub
-from agents.network import session as network
-from agents.network.endpoints import free_endpoint
-from agents.network.keys import Keys
 from experiments.definition.experiment import Experiment
-from experiments.real_time.conductor.run_view import RunFailed
-from experiments.real_time.hosts.launcher import Launcher
-from tools.reliability.run_process import Request, WatchedRun, usage_of
-from tools.reliability.soak_verdict import COLUMNS, Row, Soaked
-from tools.reliability.spoilt_process import OTHER
+from experiments.real_time.conductor.run_view import News, Progress, RobotView
+from experiments.real_time.hosts.launcher import RUN, tagged
+from tools.reliability.run_process import NAME, usage_of
+from tools.reliability.spoilt_process import OTHER, role_of
 
 SAMPLE_S: Final = 5.0
 SAMPLES: Final = 60  # at least so many, however short it is
-POLL_S: Final = 0.1
-START_S: Final = 120.0  # 20 robots on a small machine take their time
-ROUTER_S: Final = 30.0
-OVER_S: Final = 90.0  # landing, and the end of the recording
 TABLE: Final = "soak.csv"
 PRINT_S: Final = 60.0
 
 
-class Receiver:
-    """The last status of each robot, and the delays [s] of the poses that it received since the last sample."""
+class Row(msgspec.Struct, frozen=True):
+    """A process at one time; fields of robots are None for others."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys, robots: Sequence[str]) -> None:
-        self.status: dict[str, messages.Status] = {}
-        self.delays: dict[str, list[float]] = {name: [] for name in robots}
-        statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
-        self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.delays)
-        states = pubsub.subscriber(session, keys.state("*"), 16384)
-        self._states = pubsub.Inbox(states, messages.State, keys=keys, robots=self.delays)
+    time_s: float  # from the common start [s]
+    process: str  # a robot's name, "router", "recorder", "conductor"
+    rss_mb: float  # resident memory [MB]
+    threads: int
+    files: int  # open file descriptors
+    cpu_s: float  # CPU time since its begin [s]
+    recording_mb: float | None = None  # size of the recording, of the recorder
+    lost: int | None = None  # poses of its neighbours that never arrived; None but for robots
+    missed: int | None = None  # ticks that it missed, of `ticks`
+    ticks: int | None = None
+    malformed: int | None = None  # payloads that it refused
+    # poses received since the sample before
+    heard: int | None = None
+    delay_s: float | None = None  # median from sender to receiver [s]
+    longest_s: float | None = None  # the largest delay [s]
 
-    def read(self) -> None:
-        """Take in what has been received since the last call."""
-        self.status |= {status.robot: status for status in self._statuses.read()}
-        for state in self._states.read():
+
+COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """Samples of a soak."""
+
+    title: str  # of the experiment
+    robots: tuple[str, ...]  # by process
+    duration_s: float  # planned, from the common start [s]
+    rows: Sequence[Row]  # in order of time
+    died: Mapping[str, float] = field(default_factory=dict)  # processes that ended too early, and when [s]
+    interrupted: bool = False  # by the user
+
+
+class Sampler(ExitStack):
+    """Follows a run: writes a row for each of its processes every few seconds, and prints a line a minute."""
+
+    def __init__(self, experiment: Experiment, folder: Path, case: str) -> None:
+        super().__init__()
+        self._experiment, self._recording, self._table = experiment, folder / f"{case}.mcap", folder / TABLE
+        self._groups: dict[str, list[str]] = {}
+        for name, robot in experiment.robots.items():
+            self._groups.setdefault(robot.process or name, []).append(name)
+        self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
+        self._died: dict[str, float] = {}
+        self._news = News()
+        self._every = min(SAMPLE_S, experiment.duration_s / SAMPLES)
+        self._due, self._print_due = self._every, PRINT_S
+        os.environ[RUN] = self._tag = secrets.token_hex(8)  # processes of the run inherit it
+        self._file = self.enter_context(self._table.open("w", newline="", encoding="utf-8"))
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(COLUMNS)
+
+    def __call__(self, progress: Progress) -> None:
+        """Take in the last update of the run, and sample its processes if it is time."""
+        t = progress.elapsed
+        for event in self._news.new_events(progress):
+            if event.kind == "lost":
+                self._died.setdefault(event.source, round(t or 0.0, 1))
+        for state in progress.states:
             if state.phase == "running":
-                self.delays[state.robot] += [pose.arrived - pose.stamp for pose in state.received]
+                self._delays[state.robot] += [pose.arrived - pose.stamp for pose in state.received]
+        if t is None or not self._due <= t <= self._experiment.duration_s or progress.phase in ("landing", "stopped"):
+            return
+        self._due += self._every
+        rows = list(self._rows(round(t, 2), progress.robots))
+        self._writer.writerows(map(msgspec.structs.astuple, rows))
+        self._file.flush()
+        if t > self._print_due:
+            self._print_due += PRINT_S
+            lost, memory = sum(row.lost or 0 for row in rows), sum(row.rss_mb for row in rows)
+            minutes = f"{t / 60.0:6.1f} of {self._experiment.duration_s / 60.0:g} min"
+            print(f"{minutes}: {len(rows)} processes, {memory:.0f} MB, {lost} poses lost", file=sys.stderr)
 
-    def sampled(self, row: Row) -> Row:
-        """The row of a process with the counters of its robots, whose delays begin anew; others stay as they are."""
-        members = [name for name in row.process.split("+") if name in self.status]
-        if not members:
-            return row
-        delays = sorted(delay for name in members for delay in self.delays[name])
-        for name in members:
-            self.delays[name].clear()
-        first = self.status[members[0]]
-        return msgspec.structs.replace(
-            row,
-            lost=sum(sum(self.status[name].lost.values()) for name in members),
-            missed=first.missed,  # the process counts these, not the robot
-            ticks=first.ticks,
-            malformed=first.malformed,
-            heard=len(delays),
-            delay_s=round(delays[len(delays) // 2], 6) if delays else None,
-            longest_s=round(delays[-1], 6) if delays else None,
+    def result(self, *, interrupted: bool) -> Soaked:
+        """The samples, after the run."""
+        with self._table.open(newline="", encoding="utf-8") as file:
+            known = [{name: text for name, text in row.items() if text} for row in csv.DictReader(file)]
+        return Soaked(
+            self._experiment.title,
+            tuple(map("+".join, self._groups.values())),
+            self._experiment.duration_s,
+            msgspec.convert(known, list[Row], strict=False),
+            self._died,
+            interrupted,
         )
 
-
-def rows(found: Mapping[int, str], receiver: Receiver, t: float, recording: Path) -> Iterator[Row]:
-    """A row for each process, by its id and role, `t` [s] after the common start."""
-    for pid, name in found.items():
-        usage = usage_of(pid)
-        if usage is None or name == OTHER:
-            continue
-        row = Row(round(t, 2), name, round(usage.rss_mb, 3), usage.threads, usage.files, usage.cpu_s)
-        if name == "recorder" and recording.exists():
-            row = msgspec.structs.replace(row, recording_mb=round(recording.stat().st_size / 1e6, 3))
-        yield receiver.sampled(row)
-
-
-def sample(experiment: Experiment, request: Request, interrupted: Callable[[], bool]) -> Soaked:  # noqa: PLR0915
-    """Run a case and sample it until it is over; print a line a minute on standard error.
-
-    Raises:
-        RunFailed: If it does not begin.
-    """
-    folder, duration = Path(request.folder), experiment.duration_s
-    groups: dict[str, list[str]] = {}
-    for name, robot in experiment.robots.items():
-        groups.setdefault(robot.process or name, []).append(name)
-    recording, every = folder / f"{request.case}.mcap", min(SAMPLE_S, duration / SAMPLES)
-    endpoint = free_endpoint(preferred_port=0)
-    request.changes.append(f"network.listen=['{endpoint}']")
-    sampled: list[Row] = []
-    died: dict[str, float] = {}
-    start: float | None = None
-    began = printed = time.monotonic()
-    with ExitStack() as stack:
-        launcher = stack.enter_context(Launcher(folder / "logs"))
-        watched = WatchedRun(launcher, request)
-        session = stack.enter_context(network.open_session([endpoint], name="soak", wait_s=ROUTER_S))
-        receiver = Receiver(session, Keys(experiment.network.realm), list(experiment.robots))
-        table = stack.enter_context((folder / TABLE).open("w", newline="", encoding="utf-8"))
-        written = csv.writer(table)
-        written.writerow(COLUMNS)
-        due, over, clock = 0.0, False, Clock()
-        while watched.process.alive and not interrupted():
-            time.sleep(POLL_S)
-            receiver.read()
-            now = clock.utc()
-            for event in watched.news():
-                if event.kind == "start":
-                    start = event.stamp
-                    due = start + every
-                elif event.kind == "lost" and start is not None and now < start + duration:
-                    died[event.source] = round(now - start, 1)
-                over |= event.kind == "phase" and event.text.startswith("landing")
-            if start is None:
-                if time.monotonic() > began + START_S:
-                    raise RunFailed(f"no common start within {START_S:g} s: see {folder / 'logs'}")
+    def _rows(self, t: float, robots: Mapping[str, RobotView]) -> Iterator[Row]:
+        """A row for each process of the run."""
+        roles = {pid: role_of(words) for pid, words in tagged(f"{RUN}={self._tag}")}
+        for pid, process in {**roles, os.getpid(): NAME}.items():
+            if process == OTHER or (usage := usage_of(pid)) is None:
                 continue
-            if over or now < due or now > start + duration:
-                if now > start + duration + OVER_S:
-                    raise RunFailed(f"it does not end {OVER_S:g} s after its time: see {folder / 'logs'}")
-                continue
-            due += every
-            fresh = list(rows(watched.processes(), receiver, now - start, recording))
-            sampled += fresh
-            written.writerows(msgspec.structs.astuple(row) for row in fresh)
-            table.flush()
-            if time.monotonic() > printed + PRINT_S:
-                printed = time.monotonic()
-                lost, memory = sum(row.lost or 0 for row in fresh), sum(row.rss_mb for row in fresh)
-                minutes = f"{(now - start) / 60.0:6.1f} of {duration / 60.0:g} min"
-                print(f"{minutes}: {len(fresh)} processes, {memory:.0f} MB, {lost} poses lost", file=sys.stderr)
-        asked = interrupted()
-        watched.end()
-        code = watched.process.handle.poll()
-    if start is None and not asked:
-        raise RunFailed(f"it never began: {watched.process.tail()}")
-    return Soaked(experiment.title, tuple(map("+".join, groups.values())), duration, sampled, code, died, asked)
+            row = Row(t, process, *usage)
+            if process == "recorder" and self._recording.exists():
+                row = msgspec.structs.replace(row, recording_mb=round(self._recording.stat().st_size / 1e6, 3))
+            names = [name for name in process.split("+") if name in robots]
+            statuses = [status for name in names if (status := robots[name].status) is not None]
+            if statuses:
+                delays = sorted(delay for name in names for delay in self._delays[name])
+                self._delays |= {name: [] for name in names}
+                row = msgspec.structs.replace(
+                    row,
+                    lost=sum(sum(status.lost.values()) for status in statuses),
+                    missed=statuses[0].missed,  # the process counts these, not the robot
+                    ticks=statuses[0].ticks,
+                    malformed=statuses[0].malformed,
+                    heard=len(delays),
+                    delay_s=round(delays[len(delays) // 2], 6) if delays else None,
+                    longest_s=round(delays[-1], 6) if delays else None,
+                )
+            yield row

@@ -5,14 +5,12 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-import msgspec
-
-from experiments.report.page import Finding, Mark, Section, Table, date_of, render
+from experiments.report.page import NONE, Finding, Section, Table, date_of, render
 from experiments.report.page import Row as Line
+from tools.reliability.soak_sampler import Row, Soaked
 
 PAGE: Final = "soak.html"
 WARM_SHARE: Final = 0.1  # of the run that does not count, but not more than
@@ -22,57 +20,10 @@ GROWTH: Final = 0.02  # of the memory
 JUDGED_S: Final = 300.0  # memory of a shorter run says nothing: allocators are still filling their pools
 SLOWER: Final = 2.0  # times the delay at the beginning
 DELAY_S: Final = 0.005  # delays below are the noise of the machine
+MISSED: Final = 0.01  # share of the ticks
 
 
-class Row(msgspec.Struct, frozen=True):
-    """A process at one time; fields of robots are None for others."""
-
-    time_s: float  # from the common start [s]
-    process: str  # a robot's name, "router", "recorder", "conductor"
-    rss_mb: float  # resident memory [MB]
-    threads: int
-    files: int  # open file descriptors
-    cpu_s: float  # CPU time since its begin [s]
-    recording_mb: float | None = None  # size of the recording, of the recorder
-    lost: int | None = None  # poses of its neighbours that never arrived; None but for robots
-    missed: int | None = None  # ticks that it missed, of `ticks`
-    ticks: int | None = None
-    malformed: int | None = None  # payloads that it refused
-    # poses received since the sample before
-    heard: int | None = None
-    delay_s: float | None = None  # median from sender to receiver [s]
-    longest_s: float | None = None  # the largest delay [s]
-
-
-COLUMNS: Final = tuple(each.name for each in msgspec.structs.fields(Row))
-
-
-@dataclass(frozen=True)
-class Soaked:
-    """Samples of a soak."""
-
-    title: str  # of the experiment
-    robots: tuple[str, ...]  # by process
-    duration_s: float  # planned, from the common start [s]
-    rows: Sequence[Row]  # in order of time
-    exit: int | None  # of the conductor's process
-    died: dict[str, float]  # processes that ended too early, and when [s]
-    interrupted: bool = False  # by the user
-
-    def by_process(self) -> dict[str, list[Row]]:
-        found: dict[str, list[Row]] = {}
-        for row in self.rows:
-            found.setdefault(row.process, []).append(row)
-        return found
-
-    @property
-    def warm_s(self) -> float:
-        """From then on it counts [s]."""
-        return min(WARM_SHARE * self.duration_s, WARM_S)
-
-
-@dataclass(frozen=True)
-class Ends:
+class Ends(NamedTuple):
     """Rows of a process after the warm-up: first and last window."""
 
     first: Sequence[Row]
@@ -80,7 +31,7 @@ class Ends:
 
     def over(self, what: Callable[[Iterable[float]], float], field: str) -> tuple[float, float]:
         """A statistic of a field in both windows."""
-        first, last = (what(getattr(row, field) for row in rows) for rows in (self.first, self.last))
+        first, last = (what(getattr(row, field) for row in rows) for rows in self)
         return first, last
 
     @property
@@ -90,11 +41,16 @@ class Ends:
         return last / first - 1.0 if first else 0.0
 
 
+def warm_s(soaked: Soaked) -> float:
+    """From then on it counts [s]."""
+    return min(WARM_SHARE * soaked.duration_s, WARM_S)
+
+
 def ends(soaked: Soaked) -> dict[str, Ends]:
-    """Both ends of each process that has enough rows to have them."""
+    """Both ends of each process that has enough rows to have them, by name."""
     found = {}
-    for process, rows in soaked.by_process().items():
-        counted = [row for row in rows if row.time_s >= soaked.warm_s]
+    for process in sorted({row.process for row in soaked.rows}):
+        counted = [row for row in soaked.rows if row.process == process and row.time_s >= warm_s(soaked)]
         size = max(2, round(WINDOW * len(counted)))
         if len(counted) >= 2 * size:
             found[process] = Ends(counted[:size], counted[-size:])
@@ -103,37 +59,38 @@ def ends(soaked: Soaked) -> dict[str, Ends]:
 
 def judge(soaked: Soaked) -> list[Finding]:
     """The verdict; bad findings fail it."""
-    both, sampled = ends(soaked), soaked.by_process()
-    last = {process: rows[-1] for process, rows in sampled.items()}
-    found = [*_alive(soaked, sampled), _memory(soaked, both)]
+    both, last = ends(soaked), {row.process: row for row in soaked.rows}
+    found = [*_alive(soaked), _memory(soaked, both)]
 
     def add(wrong: str, right: str) -> None:
         found.append(Finding("bad", wrong) if wrong else Finding("good", right))
 
+    def total(field: str) -> int:
+        return sum(getattr(row, field) or 0 for row in last.values())
+
     for what, field in (("threads", "threads"), ("file descriptors", "files")):
         counts = {process: each.over(max, field) for process, each in both.items()}
-        grown = ", ".join(
-            f"{process} +{after - before}" for process, (before, after) in counts.items() if after > before
-        )
+        grown = ", ".join(f"{process} +{after - first}" for process, (first, after) in counts.items() if after > first)
         add(grown and f"{what} grow: {grown}", f"{what} do not grow")
     lost = ", ".join(f"{process} {row.lost}" for process, row in last.items() if row.lost)
     received = sum(row.heard or 0 for row in soaked.rows)
     untested = "" if received else "no pose was received: nothing was tested"
     add(f"lost poses: {lost}" if lost else untested, f"0 of {received} poses were lost")
-    if malformed := sum(row.malformed or 0 for row in last.values()):
+    if malformed := total("malformed"):
         found.append(Finding("bad", f"{malformed} payloads were refused as malformed"))
-    early = [row.delay_s for each in both.values() for row in each.first if row.delay_s is not None]
-    late = [row.delay_s for each in both.values() for row in each.last if row.delay_s is not None]
-    if early and late:
-        before, after = statistics.median(early), statistics.median(late)
+    windows = [
+        [row.delay_s for each in both.values() for row in each[end] if row.delay_s is not None] for end in (0, 1)
+    ]
+    if all(windows):
+        before, after = map(statistics.median, windows)
         longest = max(row.longest_s or 0.0 for row in soaked.rows)
         text = f"{1e3 * before:.2f} ms at first, {1e3 * after:.2f} ms at last, {1e3 * longest:.0f} ms at most"
         slow = after > max(SLOWER * before, DELAY_S)
         found.append(Finding("bad" if slow else "good", f"delay of poses: {text}"))
-    missed, ticks = (sum(getattr(row, field) or 0 for row in last.values()) for field in ("missed", "ticks"))
-    if ticks:
-        mark: Mark = "good" if missed < 0.01 * ticks else "fair"
-        found.append(Finding(mark, f"{missed} of {ticks} ticks were missed ({100.0 * missed / ticks:.3f} %)"))
+    if ticks := total("ticks"):
+        share = total("missed") / ticks
+        text = f"{total('missed')} of {ticks} ticks were missed ({100.0 * share:.3f} %)"
+        found.append(Finding("good" if share < MISSED else "fair", text))
     return found
 
 
@@ -142,17 +99,14 @@ def passed(findings: Sequence[Finding]) -> bool:
     return all(finding.mark != "bad" for finding in findings)
 
 
-def _alive(soaked: Soaked, sampled: Mapping[str, Sequence[Row]]) -> list[Finding]:
-    lasted = max((row.time_s for row in soaked.rows), default=0.0)
+def _alive(soaked: Soaked) -> list[Finding]:
+    lasted, sampled = max((row.time_s for row in soaked.rows), default=0.0), {row.process for row in soaked.rows}
     bad = [f"{name} ended after {at:.0f} s" for name, at in soaked.died.items()]
-    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled and name not in soaked.died]
-    if soaked.exit != 0:
-        bad.append(f"the run ended with exit code {soaked.exit}: see logs/")
+    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled | soaked.died.keys()]
     if soaked.interrupted:
         bad.append(f"it was interrupted after {lasted:.0f} s of {soaked.duration_s:g} s")
-    if bad:
-        return [Finding("bad", text) for text in bad]
-    return [Finding("good", f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes")]
+    good = f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes"
+    return [Finding("bad", text) for text in bad] or [Finding("good", good)]
 
 
 def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> Finding:
@@ -160,13 +114,13 @@ def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> Finding:
         return Finding("bad", "too few samples to compare beginning and end: let it run longer")
     grown = {process: each.growth for process, each in both.items()}
     most = max(grown, key=lambda process: grown[process])
-    text = f"memory: largest growth after {soaked.warm_s:.0f} s is {100 * grown[most]:+.2f} % ({most})"
+    text = f"memory: largest growth after {warm_s(soaked):.0f} s is {100 * grown[most]:+.2f} % ({most})"
     if soaked.duration_s < JUDGED_S:
         return Finding("plain", f"{text}; not judged below {JUDGED_S / 60:.0f} minutes")
-    if grown[most] <= GROWTH:
-        return Finding("good", f"{text}, within {100 * GROWTH:g} %")
-    beyond = ", ".join(f"{p} {100 * g:+.2f} %" for p, g in sorted(grown.items()) if g > GROWTH)
-    return Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
+    beyond = ", ".join(f"{process} {100 * growth:+.2f} %" for process, growth in grown.items() if growth > GROWTH)
+    if beyond:
+        return Finding("bad", f"memory grows beyond {100 * GROWTH:g} %: {beyond}")
+    return Finding("good", f"{text}, within {100 * GROWTH:g} %")
 
 
 # ---------------------------------------------------------------------- the page
@@ -182,7 +136,7 @@ def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: st
             ("Date", date_of(time.time())),
             ("Duration", f"{soaked.duration_s / 60.0:g} min"),
             ("Robots", str(len(soaked.robots))),
-            ("Warm-up", f"{soaked.warm_s:g} s"),
+            ("Warm-up", f"{warm_s(soaked):g} s"),
         ],
         command=command,
         verdict=findings,
@@ -193,12 +147,10 @@ def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: st
 def table(soaked: Soaked) -> Table:
     """Each process after the warm-up and at the end."""
     lines = []
-    rows = soaked.by_process()
-    for process, each in sorted(ends(soaked).items()):
+    for process, each in ends(soaked).items():
         last, first = each.last[-1], each.first[0]
         share = 100.0 * (last.cpu_s - first.cpu_s) / max(last.time_s - first.time_s, 1e-9)
-        delays = [row.delay_s for row in rows[process] if row.delay_s is not None]
-        counts = ("–" if count is None else str(count) for count in (last.lost, last.missed))
+        delays = [row.delay_s for row in soaked.rows if row.process == process and row.delay_s is not None]
         cells = (
             process,
             *(f"{memory:.1f}" for memory in each.over(statistics.median, "rss_mb")),
@@ -206,8 +158,8 @@ def table(soaked: Soaked) -> Table:
             str(last.threads),
             str(last.files),
             f"{share:.1f} %",
-            *counts,
-            f"{1e3 * statistics.median(delays):.2f}" if delays else "–",
+            *(NONE if count is None else str(count) for count in (last.lost, last.missed)),
+            f"{1e3 * statistics.median(delays):.2f}" if delays else NONE,
         )
         lines.append(Line(cells))
     head = ("Process", "MB first", "MB last", "Growth", "Threads", "Files", "CPU", "Lost", "Missed", "Delay [ms]")

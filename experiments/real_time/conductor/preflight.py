@@ -312,7 +312,7 @@ class Inspector(CaseRun):
     def _update(self) -> None:
         """Take in what has happened since the last update."""
         self._view.update()
-        for state in self._view.states:
+        for state in self._progress.states:
             if state.robot in self._states:
                 self._states[state.robot].append(state)
         for death in self._processes.deaths():

@@ -83,6 +83,7 @@ class Progress:
     duration: float
     robots: dict[str, RobotView]
     events: list[messages.Event] = field(default_factory=list)
+    states: list[messages.State] = field(default_factory=list)  # of the last update
     silent_since: float = inf  # [s, monotonic] begin of the silence of the routers
     clock: Clock = field(default_factory=Clock)
 
@@ -144,7 +145,6 @@ class NetworkView:
         self._statuses = pubsub.Inbox(statuses, messages.Status, keys=keys, robots=self.robots)
         states = pubsub.subscriber(session, keys.state("*"), 4096)
         self._states = pubsub.Inbox(states, messages.State, keys=keys, robots=self.robots)
-        self.states: list[messages.State] = []  # of the last update
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._recorder_watch = pubsub.AliveWatch(session, keys.recorder)
         self.recording_begun = False  # the recorder is there
@@ -171,8 +171,8 @@ class NetworkView:
         self.recording_begun |= any(there for _, there in self._recorder_watch.changes())
         for status in self._statuses.read():
             self._receive_status(status)
-        self.states = list(self._states.read())
-        for state in self.states:
+        self._progress.states = list(self._states.read())
+        for state in self._progress.states:
             view = self.robots[state.robot]
             view.error = state.error if view.linked else None
             view.place = state.true_position or state.position or view.place
