@@ -44,6 +44,10 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
         float | None, Meta(description="random walk of the measured position with the way [m per square root of m]")
     ] = None
 
+    def without_noise(self) -> Disturbance:
+        """What is left without random parts: the latency."""
+        return Disturbance(latency_s=self.latency_s)
+
 
 @dataclass(frozen=True)
 class BodyRequest:

@@ -18,7 +18,7 @@ from experiments.check import motion, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
 from experiments.check.findings import FORGIVEN, MARK, Finding, first_of_each_code
-from experiments.check.ideal_run import message_rate, predict, undisturbed
+from experiments.check.ideal_run import predict
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
@@ -119,7 +119,7 @@ def figures(experiment: Experiment) -> Figures:
 @QUIET
 def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
     cases = {name: standby.without_standby(case) for name, case in cases.items()}
-    return {name: analyse(case, predict(undisturbed(case))) for name, case in cases.items()}
+    return {name: analyse(case, predict(case)) for name, case in cases.items()}
 
 
 @QUIET
@@ -193,6 +193,6 @@ def _figures(analysis: Analysis) -> Figures:
         end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),
-        messages_hz=message_rate(experiment),
+        messages_hz=prediction.messages_hz,
         predicted_s=last,
     )

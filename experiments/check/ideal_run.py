@@ -1,4 +1,4 @@
-"""Ideal run: one flight on the virtual clock, without noise, in an empty, endless room.
+"""Ideal run: one flight on the virtual clock, without noise, in an empty, endless room; beside it one with noise.
 
 Everything else is that of a run: bodies with their limits and their inertia, triggers, updates, the modelled network,
 the plans, and the 5 mm at which robots on wheels stop. Walls, obstacles and avoidance are left out: robots that would
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import msgspec
@@ -27,7 +27,6 @@ FAR: Final = 1e6  # [m] walls that no robot meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
 REPETITIONS: Final = 5  # flights with noise, each with another seed
-QUESTIONS: Final = 6000  # to the trigger, from which the rate of transmissions is estimated
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,9 @@ class Prediction:
     position: Array  # (T, N, 3) [m]
     incidents: tuple[Incident, ...] = ()  # hazards of robots on the way
     transmissions: int = 1  # of all robots in the run
+    messages_hz: float = (
+        0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
+    )
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
 
 
@@ -46,13 +48,10 @@ def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
     return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
 
 
-def undisturbed(experiment: Experiment) -> Experiment:
-    """The same as `isolated`, without noise."""
-    quiet = {
-        name: msgspec.structs.replace(each, hover_jitter=None, position_sigma=None, yaw_sigma=None, odometry_drift=None)
-        for name, each in experiment.disturbance.items()
-    }
-    return msgspec.structs.replace(isolated(experiment), disturbance=quiet)
+def has_noise(experiment: Experiment) -> bool:
+    """Whether a robot is disturbed by noise."""
+    own = [bodies.disturbance(experiment, name) for name in experiment.robots]
+    return any(each != each.without_noise() for each in own)
 
 
 def isolated(experiment: Experiment) -> Experiment:
@@ -77,9 +76,14 @@ def isolated(experiment: Experiment) -> Experiment:
     )
 
 
-def predict(bare: Experiment) -> Prediction:
-    """Flight of what `undisturbed` or `isolated` made of an experiment, from the common start to the end."""
-    return fly_repeatedly(bare, 1)[0]
+def predict(experiment: Experiment) -> Prediction:
+    """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
+    bare = isolated(experiment)
+    without, *noisy = _fly(bare, [bare.seed] * (1 + has_noise(bare)), quiet=1)
+    if without.stuck and noisy:  # only the noise may hold the robots back
+        return _fly(bare, [bare.seed], quiet=1)[0]
+    counted = (*noisy, without)[0]
+    return replace(without, messages_hz=counted.transmissions / bare.duration_s)
 
 
 def repetitions(bare: Experiment) -> int:
@@ -88,22 +92,27 @@ def repetitions(bare: Experiment) -> int:
 
 
 def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
-    """`count` flights, the first with the seed of the experiment, each other one with the next seed; see `predict`."""
+    """`count` flights of what `isolated` made, the first with the seed of the experiment, each other with the next."""
+    return _fly(bare, [bare.seed + k for k in range(count)])
+
+
+def _fly(bare: Experiment, seeds: Sequence[int], *, quiet: int = 0) -> list[Prediction]:
+    """Flights with these seeds side by side, the first `quiet` of them without noise."""
     names = tuple(bare.robots)
     try:
-        log = simulation.simulate(bare, [bare.seed + k for k in range(count)], lean=True, landing=False)
+        log = simulation.simulate(bare, seeds, quiet=quiet, lean=True, landing=False)
     except conductor.Stuck as stuck:
         position, _ = bodies.start_poses(bare, names)
         position[:, 2] = np.nan_to_num(bodies.hover_heights(bare, names))
-        return [Prediction(np.zeros(1), position[None], stuck=str(stuck))] * count
+        return [Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))] * len(seeds)
     run = log.time >= -ROUNDING_S
     begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s]
+    sent = np.bincount(sent_in_run(log.sent, bare.duration_s).link // len(names), minlength=len(seeds))
     flights = []
-    for k in range(count):
+    for k, transmissions in enumerate(sent.tolist()):
         first, end = k * len(names), (k + 1) * len(names)
         mine = tuple(each._replace(row=each.row - first) for each in begun if first <= each.row < end)
-        sent = len(sent_in_run(log.sent, bare.duration_s))  # of all flights: none is none in each
-        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine, sent))
+        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine, transmissions))
     return flights
 
 
@@ -136,14 +145,3 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         near = np.flatnonzero(gap.min(axis=0) < radius[i] + radius[j])
         found += [Approach(i, int(j[k]), float(gap[at[k], k]), float(prediction.time[at[k]])) for k in near]
     return found
-
-
-def message_rate(experiment: Experiment) -> float:
-    """Transmissions of all robots together in a flight with the noise of the experiment [1/s].
-
-    Noise makes robots transmit; the flight takes `QUESTIONS` questions to the trigger at most.
-    """
-    duration = min(experiment.duration_s, QUESTIONS / experiment.rates.pose_hz)
-    bare = isolated(msgspec.structs.replace(experiment, duration_s=duration))
-    flight = predict(bare)
-    return 0.0 if flight.stuck else flight.transmissions / bare.duration_s

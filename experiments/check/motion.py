@@ -16,7 +16,7 @@ from agents.plugins import registry
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Finding
-from experiments.check.ideal_run import approaches, fly_repeatedly, isolated, repetitions, undisturbed
+from experiments.check.ideal_run import approaches, fly_repeatedly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, GAIN, OFF, strength
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
@@ -146,7 +146,7 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
         or shape is None
         or shape.worst > FAR_OFF
         or analysis.prediction.stuck
-        or bare == undisturbed(experiment)
+        or not has_noise(experiment)
     ):
         return
     spans = []

@@ -153,13 +153,15 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
 
 
 def body_request(
-    experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = ()
+    experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = (), *, quiet: int = 0
 ) -> BodyRequest:
     """Request for the bodies of `names`, one repetition for each seed; `endpoints` are the routers.
 
+    The first `quiet` repetitions are without noise.
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
     copies = len(seeds)
+    noisy = tuple(disturbance(experiment, name) for name in names)
     placed = [scattered_poses(experiment, names, seed) for seed in seeds]
     return BodyRequest(
         names=tuple(names) * copies,
@@ -169,7 +171,7 @@ def body_request(
         yaw=np.concatenate([yaw for _, yaw in placed]),
         rate_hz=experiment.rates.body_hz,
         seeds=tuple(seed for seed in seeds for _ in names),
-        disturbance=tuple(disturbance(experiment, name) for name in names) * copies,
+        disturbance=tuple(each.without_noise() for each in noisy) * quiet + noisy * (copies - quiet),
         external=tuple(experiment.robots[name].position == "external" for name in names) * copies,
         device=tuple(experiment.robots[name].device for name in names) * copies,
         endpoints=tuple(endpoints),

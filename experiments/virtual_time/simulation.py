@@ -84,6 +84,7 @@ def simulate(
     experiment: Experiment,
     seeds: Sequence[int],
     *,
+    quiet: int = 0,
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
@@ -93,6 +94,7 @@ def simulate(
 
     Args:
         seeds: One for each repetition.
+        quiet: Number of repetitions, the first ones, that are flown without noise.
         lean: Keep `true_position`, and of the poses sent numbers and times: a seventh of the memory, for sweeps. The
             other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
@@ -105,7 +107,7 @@ def simulate(
     names = tuple(experiment.robots)
     assignment = Plan(experiment).assignment(names, copies=len(seeds))
     agent = Agent(assignment)
-    request = bodies.body_request(experiment, names, seeds)
+    request = bodies.body_request(experiment, names, seeds, quiet=quiet)
     request = replace(request, external=(False,) * len(request.names))  # no motion capture in virtual time
     twin = TwinBody(request, bodies.shared_world(experiment, names, len(seeds)))
     body = shadowed(twin, request, bodies.shadow_periods(experiment, names, len(seeds)))

@@ -23,4 +23,3 @@ def recorded(tmp_path_factory):
 def unflown(monkeypatch):
     """`check` flies one second only: enough for findings that take no flight."""
     monkeypatch.setattr(ideal_run, "WORK", 0.0)
-    monkeypatch.setattr(ideal_run, "QUESTIONS", 50)

@@ -8,7 +8,7 @@ import pytest
 
 from agents.body.interface import Disturbance, Jitter
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions, undisturbed
+from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import document
 from experiments.sweep.runs import figures_of
@@ -57,16 +57,15 @@ def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in
 
 def test_what_is_expected_is_a_flight_on_the_virtual_clock_without_noise():
     park = document.read(PARK).cases()["event"]
-    quiet = undisturbed(park)
-    assert quiet.duration_s == 45.0
-    flown = predict(quiet)
-    again = predict(undisturbed(msgspec.structs.replace(park, seed=8)))
+    assert isolated(park).duration_s == 45.0
+    flown = predict(park)
+    again = predict(msgspec.structs.replace(park, seed=8))
     np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
     np.testing.assert_allclose(flown.time, np.arange(451) / 10.0, atol=1e-9)
     assert not flown.incidents
     assert not flown.stuck
     many = msgspec.structs.replace(park, robots={f"R{k}": park.robots["KH01"] for k in range(1000)}, duration_s=600.0)
-    assert 40.0 < undisturbed(many).duration_s < 100.0  # of many robots the beginning
+    assert 40.0 < isolated(many).duration_s < 100.0  # of many robots the beginning
 
 
 def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
@@ -132,6 +131,27 @@ def test_flights_with_noise_are_those_of_their_seeds():
     np.testing.assert_array_equal(second.position, alone.position)
     assert np.abs(first.position - second.position).max() > 1e-3
     assert repetitions(msgspec.structs.replace(bare, robots={f"R{k}": bare.robots["CF0"] for k in range(1000)})) == 1
+
+
+def test_the_flight_with_noise_beside_the_ideal_one_counts_messages_and_changes_nothing_else(monkeypatch):
+    noisy = msgspec.structs.replace(document.read(PARK).cases()["event"], duration_s=5.0)
+    still = msgspec.structs.replace(noisy, disturbance={})
+    ideal, alone = predict(noisy), predict(still)
+    np.testing.assert_array_equal(ideal.position, alone.position)
+    assert ideal.transmissions == alone.transmissions
+    assert alone.messages_hz == alone.transmissions / 5.0
+    assert ideal.messages_hz > alone.messages_hz
+
+    flown = simulation.simulate
+
+    def stuck_by_noise(experiment, seeds, *, quiet, **how):
+        if quiet < len(seeds):
+            raise conductor.Stuck("not ready after 60 s: R0")
+        return flown(experiment, seeds, quiet=quiet, **how)
+
+    monkeypatch.setattr(simulation, "simulate", stuck_by_noise)
+    np.testing.assert_array_equal(predict(noisy).position, ideal.position)
+    assert predict(noisy).messages_hz == 0.0
 
 
 def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
