@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import sysconfig
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +17,7 @@ import typer
 from experiments.catalogue import index
 
 ROOT: Final = Path(__file__).resolve().parents[1]
+PACKAGES: Final = Path(typer.__file__).parents[1]
 FIND_KEYS: Final = """
 import re
 from experiments.file.reference import entries
@@ -99,7 +98,7 @@ def _keys() -> list[str]:
     """
     from agents.user_folder import runtime_folder  # noqa: PLC0415 - other completion is quicker without
 
-    places = [*(ROOT / "experiments" / "definition").glob("*.py"), Path(sysconfig.get_path("purelib"))]
+    places = [*(ROOT / "experiments" / "definition").glob("*.py"), PACKAGES]
     try:
         kept = runtime_folder() / f"keys-{max(place.stat().st_mtime_ns for place in places):x}.txt"
         if not kept.exists():
@@ -121,6 +120,8 @@ def _table(document: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _document(context: typer.Context) -> dict[str, Any]:
     """The experiment that is named before on the command line; empty if it cannot be read."""
+    import tomllib  # noqa: PLC0415 - help is quicker without
+
     # behind an option that has no value yet, arguments are not told apart
     file = str(context.params.get("file") or next(iter(context.args), ""))
     place = index.FOLDER / f"{file}.toml" if file in index.names() else Path(file)

@@ -1,4 +1,7 @@
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -60,6 +63,12 @@ def test_a_broken_stamp_makes_it_stale(bootstrap, stamp):
     assert not bootstrap.ready("core")
 
 
+def test_a_start_imports_nothing_that_only_an_installation_needs():
+    program = "import runpy, sys; runpy.run_path('zenpark'); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-S", "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not {"ast", "shutil", "ssl", "subprocess"} & set(done.stdout.split())
+
+
 def test_settings_for_other_projects_are_left_out(bootstrap, monkeypatch):
     for name in ("PIP_TARGET", "PIP_CONSTRAINT", "UV_PYTHON", "UV_CONSTRAINT", "VIRTUAL_ENV", "PYTHONPATH"):
         monkeypatch.setenv(name, "/elsewhere")
@@ -99,10 +108,8 @@ def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
 def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatch, uid, installs):
     run = []
     monkeypatch.setattr(bootstrap.os, "geteuid", lambda: uid)
-    monkeypatch.setattr(
-        bootstrap.shutil, "which", lambda name, path=None: None if name in {"sshd", "ip"} else f"/{name}"
-    )
-    done = bootstrap.subprocess.CompletedProcess([], 0, "")
+    monkeypatch.setattr(shutil, "which", lambda name, path=None: None if name in {"sshd", "ip"} else f"/{name}")
+    done = subprocess.CompletedProcess([], 0, "")
     monkeypatch.setattr(bootstrap, "silently", lambda command, environment: run.append(command) or done)
     bootstrap.add_needed()
     assert [command[2] for command in run] == (["update", "install"] if installs else [])

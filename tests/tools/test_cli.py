@@ -13,7 +13,7 @@ from agents.network.endpoints import EndpointError, free_endpoint
 from agents.plugins import registry
 from experiments.recording.version import SHOWN, digest, provenance
 from tools.commands.options import PANELS
-from tools.main import LAUNCHER, app, main, part_for
+from tools.main import app, main, part_for
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)
@@ -130,13 +130,24 @@ def test_help_shows_every_command_in_a_panel_with_its_whole_description():
         assert " ".join(f"{name} {shown[name].help.partition(chr(10))[0]}".split()) in words
 
 
-def test_a_call_builds_the_commands_beside_its_own_at_most():
-    for name in COMMANDS:
-        built = typer.main.get_command(part_for([name])).commands
-        assert name in built
-        assert len(built) < 10 or name in LAUNCHER
-    for words in ([], ["--help"], ["rnu"]):
-        assert part_for(words) is app
+def with_parameters(built, above=()):
+    """Commands that have parameters, by their words."""
+    for name, command in built.commands.items():
+        if hasattr(command, "commands"):
+            yield from with_parameters(command, (*above, name))
+        elif command.params:
+            yield " ".join((*above, name))
+
+
+def test_a_call_builds_the_parameters_of_its_own_command_only():
+    whole = typer.main.get_command(app)
+    assert {"run", "robot stop", "cert init"} < set(with_parameters(whole))
+    for words in (*([name] for name in COMMANDS), ["robot", "stop", "KH01"], [], ["--help"], ["rnu"], ["robot", "run"]):
+        built = typer.main.get_command(part_for(words))
+        assert set(with_parameters(built)) == {" ".join(words[:2]), *words[:1]} & set(with_parameters(whole))
+        assert built.commands.keys() == whole.commands.keys()
+    assert CliRunner().invoke(part_for(["--help"]), ["--help"]).stdout == CliRunner().invoke(app, ["--help"]).stdout
+    assert CliRunner().invoke(part_for(["robot"]), ["robot"]).stdout == CliRunner().invoke(app, ["robot"]).stdout
 
 
 def test_what_the_launcher_does_is_named():

@@ -52,7 +52,7 @@ def test_ctrl_c_while_the_script_imports_ends_it_without_a_traceback():
         "import runpy, sys\n"
         "class Interrupted:\n"
         "    def find_spec(name, *_):\n"
-        "        if name == 'ssl': raise KeyboardInterrupt\n"
+        "        if name == 'hashlib': raise KeyboardInterrupt\n"
         "sys.meta_path.insert(0, Interrupted)\n"
         "runpy.run_path('zenpark', run_name='__main__')"
     )
