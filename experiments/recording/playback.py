@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -21,8 +22,8 @@ from experiments.recording.clocks import Correction
 from experiments.recording.losses import STATUS_S, count_dropped, count_lost, counter_growth
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
-from experiments.recording.ros2.cdr import Codec, Undecodable, codec
-from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose
+from experiments.recording.ros2.cdr import Undecodable, codec
+from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose, Topic
 from experiments.recording.trace import (
     ROUNDING_S,
     Goals,
@@ -46,6 +47,26 @@ M = TypeVar("M", State, SentPose, Status)
 
 class NotStarted(RecordingError):
     """The recording of a run that ended before its common start, so that there is nothing to show."""
+
+
+def topic_of(records: Records, channel: int) -> Topic | None:
+    """The topic of a channel in a file, None if another program wrote it; raises RecordingError for other fields."""
+    about = records.channels[channel]
+    schema = records.schemas.get(about.schema_id)
+    if schema is None or (topic := _topics().get(schema.name)) is None:
+        return None
+    if schema.data.decode(errors="replace") != codec(topic.recorded).schema:
+        raise RecordingError(
+            f"{records.path}: {about.topic} was recorded by a version of zenpark with other fields of {schema.name}; "
+            "read it with that version"
+        )
+    return topic
+
+
+@cache
+def _topics() -> dict[str, Topic]:
+    """Topics by their types in the file."""
+    return {codec(topic.recorded).name: topic for topic in TOPICS}
 
 
 @dataclass(frozen=True)
@@ -143,13 +164,12 @@ class _Content:
 
     def fill(self) -> int:
         """Reads all messages and counts them; those of other types are passed over."""
-        known = {made.name: (made, self._lists[kind].append) for kind in self._lists for made in [codec(kind)]}
         readers: dict[int, Callable[[bytes], None] | None] = {}
         count = 0
         for message in self.records.messages():
             count += 1
             if message.channel not in readers:
-                readers[message.channel] = self._choose(message.channel, known)
+                readers[message.channel] = self._choose(message.channel)
             take = readers[message.channel]
             if take is not None:
                 try:
@@ -186,22 +206,11 @@ class _Content:
         end = min((at for at in last.values() if at > end - HOLE_S), default=end)
         return duration if end > duration - EARLY_S else end
 
-    def _choose(self, channel: int, known: Mapping[str, _Sink]) -> Callable[[bytes], None] | None:
-        about = self.records.channels[channel]
-        schema = self.records.schemas.get(about.schema_id)
-        if schema is None or schema.name not in known:
+    def _choose(self, channel: int) -> Callable[[bytes], None] | None:
+        if (topic := topic_of(self.records, channel)) is None:
             return None
-        made, append = known[schema.name]
-        if schema.data.decode(errors="replace") != made.schema:
-            raise RecordingError(
-                f"{self.records.path}: {about.topic} was recorded by a version of zenpark with other fields of "
-                f"{schema.name}; read it with that version"
-            )
-        decode = made.decode
+        decode, append = codec(topic.recorded).decode, self._lists[topic.recorded].append
         return lambda data: append(decode(data))
-
-
-_Sink = tuple[Codec[Any], Callable[[Any], None]]
 
 
 def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trace:

@@ -20,7 +20,7 @@ from agents.decision.lifecycle import Phase
 from agents.network.messages import Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.recording.clocks import Correction
-from experiments.recording.playback import AboutRun
+from experiments.recording.playback import AboutRun, topic_of
 from experiments.recording.reader import HEAD, RecordingError, Records
 from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import SentPose
@@ -97,16 +97,14 @@ def read(path: Path) -> Tracks:
     samples: dict[str, list[Array]] = {}
     sent: dict[str, list[Array]] = {}
     rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock)}
-    kinds = {codec(kind).name: kind for kind in (State, SentPose, *rare)}
     for data, starts in _batches(records):
         heads = _gathered(data, starts, HEAD)[:, 0]
         for channel in np.unique(heads["channel"]).tolist():
-            about = records.channels.get(channel)
-            kind = kinds.get(records.schemas[about.schema_id].name) if about else None
-            if about is None or kind is None:
+            if channel not in records.channels or (topic := topic_of(records, channel)) is None:
                 continue
+            kind, name = topic.recorded, records.channels[channel].topic
             rows = np.flatnonzero(heads["channel"] == channel)
-            robot = about.topic.split("/")[1]
+            robot = name.split("/")[1]
             if kind is SentPose:
                 sent.setdefault(robot, []).append(heads["published"][rows] / 1e9)
                 continue
@@ -114,10 +112,10 @@ def read(path: Path) -> Tracks:
             try:
                 if kind is State:
                     samples.setdefault(robot, []).append(_samples(data, begins, ends, robot))
-                else:
+                elif kind in rare:
                     rare[kind] += [codec(kind).decode(data[at:end]) for at, end in zip(begins, ends, strict=True)]
             except Undecodable as error:
-                raise RecordingError(f"{path}: a message of {about.topic} is damaged: {error}") from None
+                raise RecordingError(f"{path}: a message of {name} is damaged: {error}") from None
     run = AboutRun.of(records)
     experiment = run.experiment
     events, statuses = sorted(rare[Event], key=lambda event: event.stamp), rare[Status]

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 import zenoh
 
 from agents.clock import Clock as Utc
@@ -20,11 +19,11 @@ from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck, claim
-from experiments.definition.experiment import Experiment
 from experiments.file import document
+from experiments.recording.playback import AboutRun, topic_of
 from experiments.recording.reader import RecordingError, Records
-from experiments.recording.ros2.cdr import Codec, Undecodable, codec
-from experiments.recording.topics import JSON, METADATA, TOPICS, Topic
+from experiments.recording.ros2.cdr import Undecodable, codec
+from experiments.recording.topics import Topic
 from experiments.view.replay import Clock
 
 STEP_S: Final = 0.01
@@ -43,26 +42,16 @@ class Broadcast:
     def __init__(self, session: zenoh.Session, path: Path, realm: str | None = None) -> None:
         """Reads the recording; its keys begin with `realm`, or with that of the run."""
         records = Records(path)
-        made = {codec(topic.recorded).name: (topic, codec(topic.recorded)) for topic in TOPICS}
+        self._topics: dict[int, Topic | None] = {}  # by channel
         self._sent: list[tuple[int, int, bytes]] = []  # log time [ns], channel, data
-        self._known: dict[int, tuple[Topic, Codec[Any]]] = {}
         for message in records.messages():
-            about = records.channels[message.channel]
-            kind = records.schemas[about.schema_id]
-            if kind.name in made:
-                topic, own = made[kind.name]
-                if kind.data.decode(errors="replace") != own.schema:
-                    raise RecordingError(f"{path}: {about.topic} is of another version; replay it with that version")
-                self._known[message.channel] = topic, own
+            if message.channel not in self._topics:
+                self._topics[message.channel] = topic_of(records, message.channel)
+            if self._topics[message.channel] is not None:
                 self._sent.append((message.logged, message.channel, message.data))
         self._sent.sort(key=lambda each: each[0])
-        attached = next((each.data for each in records.attachments if each.name == JSON), b"")
-        try:
-            self.experiment = msgspec.json.decode(attached, type=Experiment)
-        except (msgspec.MsgspecError, RecursionError) as error:
-            raise RecordingError(f"{path}: holds no experiment that this version can read ({error})") from None
-        about_run = next((each.metadata for each in records.metadata if each.name == METADATA), {})
-        self.case = about_run.get("case", document.UNNAMED)
+        about = AboutRun.of(records)
+        self.experiment, self.case = about.experiment, about.case
         if not self._sent:
             raise RecordingError(f"{path}: holds no message; there is nothing to replay")
         self._session, self.keys = session, Keys(realm or self.experiment.network.realm)
@@ -121,9 +110,10 @@ class Broadcast:
         return count
 
     def _send(self, channel: int, data: bytes) -> None:
-        topic, own = self._known[channel]
+        topic = self._topics[channel]
+        assert topic is not None
         try:
-            entry = own.decode(data)
+            entry: Any = codec(topic.recorded).decode(data)
         except Undecodable:
             return
         if topic.recorded is not topic.message:  # less what the recorder added

@@ -13,6 +13,7 @@ from agents.network.messages import Event, HostClock, PoseReceipt
 from experiments.definition.experiment import Formation, Rates
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
+from experiments.scene import tracks
 from tests.experiments.recordings import (
     PAIR,
     START,
@@ -420,7 +421,8 @@ def test_a_file_without_an_experiment(path, metadata, attachment):
         read(path)
 
 
-def test_a_file_of_another_version(path):
+@pytest.mark.parametrize("read", [read, tracks.read])
+def test_a_file_of_another_version(path, read):
     foreign(path, ("/TB01/state", "zenpark_msgs/msg/State", b"string robot\n", b"\0\1\0\0"))
     with pytest.raises(RecordingError, match=r"/TB01/state was recorded by a version of zenpark with other fields"):
         read(path)
