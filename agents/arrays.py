@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from math import nan
 from typing import Any, Self
 
 import msgspec
@@ -45,6 +46,12 @@ def span(rows: Index) -> Rows:
     if len(rows) and (np.diff(rows) == 1).all():
         return slice(int(rows[0]), int(rows[-1]) + 1)
     return rows
+
+
+def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1) -> Array:
+    """Numbers or vectors as rows (n, width); NaN where there is none."""
+    blank = nan if width == 1 else (nan,) * width
+    return np.array([blank if each is None else each for each in values], dtype=float).reshape(-1, width)
 
 
 class Columns(msgspec.Struct, frozen=True):

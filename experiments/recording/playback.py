@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index, PoseTable
+from agents.arrays import Array, Index, PoseTable, known_rows
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
@@ -38,7 +38,6 @@ HOLD_PERIODS: Final = 2.0  # a sample is valid for so many state periods
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early
 LANDED: Final = (Phase.LANDING.word, Phase.DONE.word)
 NOWHERE: Final = (math.nan, math.nan, math.nan)
-UNKNOWN: Final = (*NOWHERE, math.nan)
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -284,21 +283,19 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
     t = np.array([state.stamp for state in states]) - start
     grid = (time, hold)
 
-    def column(what: str, unknown: tuple[float, ...]) -> Array:
-        values = [getattr(state, what) for state in states]
-        blank = unknown if len(unknown) > 1 else unknown[0]
-        return np.array([blank if each is None else each for each in values], dtype=float).reshape(-1, len(unknown))
+    def column(what: str, width: int) -> Array:
+        return known_rows((getattr(state, what) for state in states), width)
 
-    measured, truth = column("position", NOWHERE), column("true_position", NOWHERE)
+    measured, truth = column("position", 3), column("true_position", 3)
     return {
         "position": line(t, measured, *grid),
-        "yaw": turn(t, column("yaw", (math.nan,)), *grid)[:, 0],
+        "yaw": turn(t, column("yaw", 1), *grid)[:, 0],
         "true_position": line(t, np.where(np.isfinite(truth), truth, measured), *grid),
-        "goal": step(t, column("goal", NOWHERE), *grid),
-        "setpoint": step(t, column("setpoint", UNKNOWN), *grid),
-        "attitude": attitude(t, column("attitude", UNKNOWN), *grid),
-        "shadow_position": line(t, column("shadow_position", NOWHERE), *grid),
-        "shadow_yaw": turn(t, column("shadow_yaw", (math.nan,)), *grid)[:, 0],
+        "goal": step(t, column("goal", 3), *grid),
+        "setpoint": step(t, column("setpoint", 4), *grid),
+        "attitude": attitude(t, column("attitude", 4), *grid),
+        "shadow_position": line(t, column("shadow_position", 3), *grid),
+        "shadow_yaw": turn(t, column("shadow_yaw", 1), *grid)[:, 0],
     }
 
 

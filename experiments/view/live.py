@@ -23,8 +23,8 @@ from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
 from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
 from experiments.view.acting import Acting, Watched
-from experiments.view.observer import Observer, RobotReport
-from experiments.view.panel import PLOT_S, Panel, Row, known
+from experiments.view.observer import Observer
+from experiments.view.panel import PLOT_S, Panel, known, robot_row
 
 if TYPE_CHECKING:
     import viser
@@ -226,10 +226,11 @@ class LiveView:
     def _tabulate(self, moment: Moment) -> None:
         observer, stage, panel = self.observer, self.observer.stage, self._page.panel
         errors = self._errors.of_robots(moment.error)
-        rows = [
-            _row(name, observer.robots[name], Condition(int(moment.condition[k])), known(errors[k]))
-            for k, name in enumerate(stage.names)
-        ]
+        rows = []
+        for k, name in enumerate(stage.names):
+            report, condition = observer.robots[name], Condition(int(moment.condition[k]))
+            delay = max(report.delay.values(), default=None)
+            rows.append(robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay))
         elapsed = observer.elapsed
         start = None if elapsed is None else time.time() - elapsed
         phase = observer.phase
@@ -244,14 +245,3 @@ class LiveView:
         ends = zip(net.receiver.tolist(), net.sender.tolist(), strict=True)
         panel.show_links(moment.error, [observer.robots[names[i]].delay.get(names[j]) for i, j in ends])
         panel.show_events(list(observer.events), start)
-
-
-def _row(name: str, report: RobotReport, condition: Condition, error: float | None) -> Row:
-    status = report.status
-    if status is None:
-        return Row(name, condition)
-    note = status.hazard or (status.reason if condition > Condition.DONE else "")
-    if not note and status.missing:
-        note = "misses " + ", ".join(status.missing)
-    delay = max(report.delay.values(), default=None)
-    return Row(name, condition, error, report.rate, status.battery, status.missed, delay, note)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, nan
@@ -13,7 +13,7 @@ from typing import Final, TypeVar
 import numpy as np
 import zenoh
 
-from agents.arrays import Array
+from agents.arrays import known_rows
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
@@ -197,7 +197,7 @@ class Observer:
         now, stage = time.monotonic(), self.stage
         reports = [self.robots[name] for name in stage.names]
         states = [report.state for report in reports]
-        position = _rows([None if s is None else s.true_position or s.position for s in states])
+        position = known_rows((s.true_position or s.position if s else None for s in states), 3)
         elapsed = self.elapsed
         error = self._tracker.errors(elapsed, position)
         self._trail.add(now, position)
@@ -206,25 +206,16 @@ class Observer:
                      for s, c in zip(states, conditions, strict=True)]  # fmt: skip
         return Moment(
             position=position,
-            yaw=np.array([_number(None if s is None else s.yaw if s.true_yaw is None else s.true_yaw) for s in states]),
-            goal=_rows(under_way),
+            yaw=known_rows((s.yaw if s.true_yaw is None else s.true_yaw) if s else None for s in states)[:, 0],
+            goal=known_rows(under_way, 3),
             condition=np.array(conditions, dtype=np.intp),
             silent_for=np.array([now - report.sent_at for report in reports]),
             error=error,
             broken=stage.broken_links(np.array(conditions), [report.status for report in reports]),
             obstacles=stage.obstacles_at(elapsed or 0.0, self.world),
             trail=self._trail.points,
-            attitude=_rows([None if s is None else s.attitude for s in states], 4),
-            shadow=_rows([None if s is None else s.shadow_position for s in states]),
-            shadow_yaw=np.array([_number(None if s is None else s.shadow_yaw) for s in states]),
+            attitude=known_rows((s.attitude if s else None for s in states), 4),
+            shadow=known_rows((s.shadow_position if s else None for s in states), 3),
+            shadow_yaw=known_rows(s.shadow_yaw if s else None for s in states)[:, 0],
             time=elapsed,
         )
-
-
-def _number(value: float | None) -> float:
-    return nan if value is None else value
-
-
-def _rows(values: Sequence[tuple[float, ...] | None], width: int = 3) -> Array:
-    """Optional vectors as rows (N, width)."""
-    return np.array([(nan,) * width if each is None else each for each in values], dtype=float).reshape(-1, width)

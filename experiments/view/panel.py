@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from agents.arrays import Array
-from agents.network.messages import Event
+from agents.network.messages import Event, Status
 from experiments.file.document import UNNAMED
 from experiments.scene.stage import (
     BAD,
@@ -53,6 +53,25 @@ class Row:
     missed: int | None = None  # ticks
     delay: float | None = None  # [s] largest of its links
     note: str = ""
+
+
+def robot_row(
+    name: str,
+    condition: Condition,
+    status: Status | None,
+    error: float | None,
+    rate: float,
+    *,
+    delay: float | None = None,
+    ticks: bool = True,  # whether they can be missed
+) -> Row:
+    """The row of a robot by its last status."""
+    if status is None:
+        return Row(name, condition, error, rate, delay=delay)
+    note = status.hazard or (status.reason if condition > Condition.DONE else "")
+    if not note and status.missing:
+        note = "misses " + ", ".join(status.missing)
+    return Row(name, condition, error, rate, status.battery, status.missed if ticks else None, delay, note)
 
 
 def known(value: float) -> float | None:

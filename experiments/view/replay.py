@@ -20,7 +20,7 @@ from experiments.scene.drawing import SceneDrawing
 from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Moment, Stage
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
-from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known
+from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known, robot_row
 
 if TYPE_CHECKING:
     import viser
@@ -73,10 +73,12 @@ class Film:
         moment = self.moment(t)
         errors = self._links.of_robots(moment.error)
         ticks = self.tracks.clock == "real"  # virtual time misses none
-        return [
-            _row(name, track, Condition(int(moment.condition[k])), known(errors[k]), t, ticks=ticks)
-            for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True))
-        ]
+        rows = []
+        for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True)):
+            condition, status = Condition(int(moment.condition[k])), _last_status(track.statuses, t)
+            rate = float(np.subtract(*np.searchsorted(track.sent, (t, t - 1.0), side="right")))
+            rows.append(robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks))
+        return rows
 
     def history(self) -> History:
         """Errors and rates of the whole case, four times a second."""
@@ -124,15 +126,6 @@ def _taken(tracks: Sequence[Track], at: Sequence[int], name: str, width: int) ->
     blank = np.full(width, nan)
     rows = [np.atleast_1d(getattr(track, name)[k]) if k >= 0 else blank for track, k in zip(tracks, at, strict=True)]
     return np.array(rows, dtype=float).reshape(-1, width)
-
-
-def _row(name: str, track: Track, condition: Condition, error: float | None, t: float, *, ticks: bool) -> Row:
-    status = _last_status(track.statuses, t)
-    rate = float(np.searchsorted(track.sent, t, side="right") - np.searchsorted(track.sent, t - 1.0, side="right"))
-    if status is None:
-        return Row(name, condition, error, rate)
-    note = status.hazard or (status.reason if condition > Condition.DONE else "")
-    return Row(name, condition, error, rate, status.battery, status.missed if ticks else None, None, note)
 
 
 class Clock:
