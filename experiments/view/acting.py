@@ -70,10 +70,7 @@ class Acting:
         self._session, self._watched, self._clock = session, watched, Clock()
         self._keys = keys = Keys(watched.realm)
         self._events = pubsub.pose_publisher(session, keys.event, messages.JSON, pubsub.EVENTS)
-        self._urgent = session.declare_publisher(
-            keys.estop, encoding=messages.JSON, congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.REAL_TIME, express=True,
-        )  # fmt: skip
+        self._urgent = orders.stop_publisher(session, keys)
         self._alive: Sequence[str] = ()
         self._stage = Stage.of_robots(())
         self._parts: list[Any] = []  # of the present stage
@@ -140,9 +137,9 @@ class Acting:
 
     def emergency_stop(self) -> None:
         """Cuts the motors of all robots of the run, and says which run it was and what answered."""
-        stop = messages.encode(messages.Stop(self._watched.identity, REASON))
-        sent = orders.EmergencyStop(self._watched.endpoints, self._watched.realm, self._watched.identity)
-        sent.run = self._watched.run
+        watched = self._watched
+        stop = messages.encode(messages.Stop(watched.identity, REASON))
+        sent = orders.EmergencyStop(watched.endpoints, watched.realm, watched.identity, watched.run)
         sending = threading.Thread(target=sent.send, args=(REASON,), daemon=True)  # the session here may be blocked
         sending.start()
         self._urgent.put(stop)

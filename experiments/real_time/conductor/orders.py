@@ -86,6 +86,17 @@ def _read(asked: Iterable[zenoh.Reply], kind: type[R]) -> tuple[R | None, str]:
     return None, why
 
 
+def stop_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
+    """The publisher of emergency stops, which overtake and wait for nothing."""
+    return session.declare_publisher(
+        keys.estop,
+        encoding=messages.JSON,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        priority=zenoh.Priority.REAL_TIME,
+        express=True,
+    )
+
+
 @dataclass
 class EmergencyStop:
     """An emergency stop at the routers of one run."""
@@ -120,13 +131,7 @@ class EmergencyStop:
         opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity, gather_s=0.0)
         with held(opened) as (session, declared):
             stop = messages.encode(messages.Stop(self.identity, reason))
-            urgent = session.declare_publisher(
-                keys.estop,
-                encoding=messages.JSON,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.REAL_TIME,
-                express=True,
-            )
+            urgent = stop_publisher(session, keys)
             urgent.put(stop)
             begun = time.monotonic()
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
