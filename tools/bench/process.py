@@ -26,7 +26,7 @@ from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE
 from tools.bench.measuring import Figure
-from tools.reliability.run_process import Usage, usage_of
+from tools.reliability.soak_sampler import Usage, usage_of
 
 FLIGHT_S: Final = 20.0
 

@@ -53,8 +53,8 @@ def chaos(
     from tools.reliability import chaos_report
     from tools.reliability.chaos_report import ChaosResult
     from tools.reliability.chaos_round import ChaosRound
-    from tools.reliability.fault_script import script, take_round
-    from tools.reliability.injection import Setting
+    from tools.reliability.faults import script
+    from tools.reliability.spoilt_run import Setting
 
     changes = [*defaults(load(file).experiment), *(settings or [])]
     read = load(file, *changes)
@@ -72,10 +72,9 @@ def chaos(
     with interrupts() as interrupted:
         setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted)
         while waiting and not interrupted() and barren < BARREN:
-            flown = ChaosRound(setting, take_round(waiting, experiment.duration_s), len(ends) + 1)
+            flown = ChaosRound(setting, len(ends) + 1, waiting)
             ends.append(flown.run())
             outcomes += flown.outcomes
-            waiting += ends[-1].left  # those that had no time in it come again
             barren = 0 if flown.outcomes else barren + 1
     result = ChaosResult(read.experiment.title, seed, planned, outcomes, ends)
     words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
@@ -106,7 +105,7 @@ def _kinds(given: Sequence[str]) -> list[str]:
     """The kinds that were asked for, all without any."""
     from agents.plugins.registry import did_you_mean
     from experiments.file.problems import refusal
-    from tools.reliability.fault_script import FAULTS
+    from tools.reliability.faults import FAULTS
 
     words = [word for part in given for word in part.split(",") if word]
     for word in words:

@@ -16,7 +16,7 @@ from experiments.recording.playback import NotStarted
 from experiments.recording.reader import RecordingError, recover
 from experiments.report.page import Finding, Section, Table, date_of, render
 from experiments.report.page import Row as Line
-from tools.reliability.fault_script import FAULT_KINDS, FAULTS, Fault
+from tools.reliability.faults import FAULT_KINDS, FAULTS, Fault
 
 
 class FaultResult(msgspec.Struct, frozen=True):
@@ -25,9 +25,9 @@ class FaultResult(msgspec.Struct, frozen=True):
     round: int  # counted from 1
     fault: Fault  # as in the script
     victim: str  # a robot; empty: the whole run
-    at_s: float  # from the common start [s]
     note: str  # for the report
     recovered: bool  # in time
+    at_s: float  # from the common start [s]
     begin_s: float  # from its begin to the recovery [s]
     end_s: float  # from its end to the recovery [s]; 0 if that came earlier
     ended: bool  # robots came down instead of going on, dead ones not counted
@@ -38,12 +38,10 @@ class RoundResult(msgspec.Struct, frozen=True):
     """Result of one round."""
 
     round: int  # counted from 1
-    left: list[Fault]  # faults that it had no time for
     violations: list[str]  # of the invariants, outside of a fault
     nearest_m: float  # least distance between surfaces of two robots [m]
     gone_s: float  # from its end until all of its processes were gone [s]
     missed: float  # share of missed ticks of robots without a fault: the load of the machine
-    recording: str  # its folder, if there is a recording
 
 
 def line(outcome: FaultResult) -> str:
@@ -57,26 +55,23 @@ def line(outcome: FaultResult) -> str:
 
 def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_full: bool) -> list[str]:
     """Faults of the recording of a round, which must open and have the events."""
-    opened = recording
     try:
         if disk_full:
-            opened = recording.with_name("mended.mcap")
-            recover(recording, opened)
-        read = playback.read(opened)
+            mended = recording.with_name("mended.mcap")
+            recover(recording, mended)
+            recording = mended
+        read = playback.read(recording)
     except (RecordingError, NotStarted, DocumentError, OSError) as error:
         return [f"the recording does not open: {error}"]
-    wrong = []
-    if not (read.complete or disk_full):
-        wrong.append("the recording has no end")
-    events = {(event.kind, event.source) for event in read.trace.events}
-    kinds = {kind.rstrip("0123456789") for kind, _ in events}
-    if not disk_full:
-        for outcome in outcomes:
-            kind = outcome.fault.kind
-            if kind in ("kill", "read-error", "clock-behind") and ("lost", outcome.victim) not in events:
-                wrong.append(f"the recording has no loss of {outcome.victim}")
-            elif kind in ("router", "failover") and "router" not in kinds:
-                wrong.append("the recording has no end of the router")
+    if disk_full:
+        return []
+    events = {(event.kind.rstrip("0123456789"), event.source) for event in read.trace.events}
+    kinds = {kind for kind, _ in events}
+    wrong = [] if read.complete else ["the recording has no end"]
+    for each in outcomes:
+        kind = each.fault.properties.recorded
+        if kind and not ((kind, each.victim) in events if each.victim else kind in kinds):
+            wrong.append(f"the recording has no event {kind} {each.victim}".rstrip())
     return wrong
 
 

@@ -134,7 +134,12 @@ class Observer:
         self._truths = pubsub.Inbox(pubsub.subscriber(session, keys.truth("*"), 8192), messages.Position, **typed)
         self._commands = pubsub.Inbox(pubsub.subscriber(session, keys.setpoint("*"), 8192), messages.Command, **typed)
         self._contacts = pubsub.Inbox(pubsub.subscriber(session, keys.contact, 1024), messages.Contact)
+        self._events = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
+        self.receivers: dict[str, set[str]] = {name: set() for name in self.invariants.names}  # by sender
+        for link in Plan(experiment).one_way_links:
+            self.receivers[link.sender].add(link.receiver)
+        self.events: list[messages.Event] = []  # of the conductor
         # the last of each robot, and when it came; all times are monotonic [s]
         self.status: dict[str, messages.Status] = {}
         self.status_at: dict[str, float] = {}
@@ -149,6 +154,7 @@ class Observer:
         """Take in messages received since the last update."""
         now = time.monotonic()
         self.connected = network.connected(self.session)
+        self.events += self._events.read()
         for status in self._statuses.read():
             self.status[status.robot], self.status_at[status.robot] = status, now
         for truth in self._truths.read():
@@ -178,6 +184,10 @@ class Observer:
     def running(self) -> set[str]:
         """Robots whose phase is `running` and whose token stands."""
         return {name for name, status in self.status.items() if status.phase == "running" and name in self.alive}
+
+    def is_down(self, name: str) -> bool:
+        """Whether a robot reports that it comes down, or is down."""
+        return name in self.status and self.status[name].phase in ("landing", "done")
 
     def moved(self, name: str, before: Array) -> float:
         """Horizontal distance of a robot from an earlier position [m]."""

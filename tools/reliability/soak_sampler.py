@@ -4,26 +4,50 @@ from __future__ import annotations
 
 import csv
 import os
+import resource
 import secrets
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
 from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor.run_view import News, Progress, RobotView
 from experiments.real_time.hosts.launcher import RUN, tagged
-from tools.reliability.run_process import NAME, usage_of
-from tools.reliability.spoilt_process import OTHER, role_of
+from tools.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
 
 SAMPLE_S: Final = 5.0
 SAMPLES: Final = 60  # at least so many, however short it is
 TABLE: Final = "soak.csv"
 PRINT_S: Final = 60.0
+PAGE: Final = resource.getpagesize()
+
+
+class Usage(NamedTuple):
+    """Resources of a process."""
+
+    rss_mb: float  # resident memory [MB]
+    threads: int
+    files: int  # open file descriptors
+    cpu_s: float  # CPU time since it began [s]
+
+
+def usage_of(pid: int) -> Usage | None:
+    """Resources of a process; None if it has ended."""
+    folder = Path("/proc", str(pid))
+    try:
+        fields = (folder / "stat").read_bytes().rpartition(b")")[2].split()
+        files = sum(1 for _ in (folder / "fd").iterdir())
+        cpu_s = time.clock_gettime(~pid << 3 | 2)  # clock_getcpuclockid(3): exact, where /proc counts in 10 ms
+    except OSError:
+        return None
+    # counted from the state, which is field 3 of proc_pid_stat(5): num_threads 20, rss 24
+    return Usage(round(int(fields[21]) * PAGE / 1e6, 3), int(fields[17]), files, cpu_s)
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -117,7 +141,7 @@ class Sampler(ExitStack):
     def _rows(self, t: float, robots: Mapping[str, RobotView]) -> Iterator[Row]:
         """A row for each process of the run."""
         roles = {pid: role_of(words) for pid, words in tagged(f"{RUN}={self._tag}")}
-        for pid, process in {**roles, os.getpid(): NAME}.items():
+        for pid, process in {**roles, os.getpid(): CONDUCTOR}.items():
             if process == OTHER or (usage := usage_of(pid)) is None:
                 continue
             row = Row(t, process, *usage)

@@ -27,12 +27,13 @@ from agents.clock import READING
 
 MODULE: Final = "tools.reliability.spoilt_process"
 _NUMBER: Final = struct.Struct("d")
+CONDUCTOR: Final = "conductor"
 ROLES: Final = {  # by the module that a process runs
     "agents.runtime.router": "router",
     "experiments.real_time.processes.recorder": "recorder",
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
-    "tools.reliability.run_process": "conductor",
+    "tools.reliability.run_process": CONDUCTOR,
     "bridges.vicon.publisher": "positioning",
 }
 ROBOT: Final = "experiments.real_time.processes.robot"

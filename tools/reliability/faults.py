@@ -1,0 +1,372 @@
+"""Faults: what each does to a run, why the run may not yet be well after it, and their script.
+
+A fault is a function; its docstring is its definition in the report. It is given the fault that begins, and returns the
+check that goes on until all is well: the reason why it is not, or an empty text.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from signal import SIGKILL, SIGSTOP
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from agents.arrays import Array
+from agents.network import messages
+from tools.reliability.observer import Observer
+from tools.reliability.spoilt_run import MOCAP_CLOCK, SpoiltRun, Stage
+
+HELD_M: Final = 0.25  # largest distance of a robot that no process steers
+NOTICE_S: Final = 1.0  # after which it must have stopped
+DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
+NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
+REFUSED: Final = 2  # exit code of a process whose name is taken
+GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
+LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
+LAST_S: Final = 15.0  # before the end the launcher may die, with which a round ends
+
+Check = Callable[[], str]
+
+
+class Fault(msgspec.Struct, frozen=True):
+    """A fault of a script."""
+
+    kind: str
+    after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
+    lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
+    victim: str = ""  # a robot; if it has ended by then, the next that is alive. Empty: the whole run
+    size: float = 0.0  # clock step [s]
+
+    @property
+    def properties(self) -> FaultKind:
+        return FAULT_KINDS[self.kind]
+
+
+@dataclass
+class ActiveFault:
+    """A fault that was begun, and what is checked after it; all times are monotonic [s]."""
+
+    fault: Fault
+    victim: str
+    run: SpoiltRun
+    observer: Observer
+    there: set[str]  # robots under way before
+    begun: float = field(default_factory=time.monotonic)
+    live: set[str] = field(default_factory=set)  # robots under way now
+    lifted: float = 0.0
+    note: str = ""  # for the report
+    violations: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._utc, self._events = time.time(), len(self.observer.events)
+        statuses = self.observer.status
+        self._incidents = {name: each.incidents[-1].seq for name, each in statuses.items() if each.incidents}
+        self._held_at: Array | None = None
+        self.observer.orders.clear()
+
+    def add_violation(self, text: str) -> None:
+        """A violation of an invariant, reported once."""
+        if text not in self.violations:
+            self.violations.append(text)
+
+    def shift_clock(self, name: str, shift: float, before: float = 0.0) -> None:
+        """Shift the wall clock that a switch sets, by `before` + `shift` in all [s]."""
+        self.run.switch(name).write(before + shift)
+        self.note = f"{shift:+g} s"
+
+    def check_held(self) -> None:
+        """Check that the body of a victim stops soon, for no process steers it."""
+        if time.monotonic() < self.begun + NOTICE_S or not self.observer.connected:
+            return
+        if self._held_at is None:
+            self._held_at = self.observer.invariants.where(self.victim)
+        if self.observer.moved(self.victim, self._held_at) > HELD_M:
+            self.add_violation(f"{self.victim} moved although no process steered it")
+
+    def reported(self, process: str) -> Check:
+        """Check that the conductor has reported the end of a process since the fault began."""
+
+        def check() -> str:
+            ends = (each for each in self.observer.events[self._events :] if each.kind.startswith(process))
+            return "" if any("ended" in each.text for each in ends) else f"the end of the {process} is not reported"
+
+        return check
+
+    def lost(self) -> bool:
+        """Whether the conductor has reported the end of the victim's process since the fault began."""
+        return any(each.kind == "lost" and each.source == self.victim for each in self.observer.events[self._events :])
+
+    def back(self) -> str:
+        """Reason why a living victim is neither back nor down."""
+        observer, victim = self.observer, self.victim
+        if observer.status_at.get(victim, 0.0) < self.lifted:
+            return f"no status of {victim} yet"
+        if observer.is_down(victim):
+            return f"{victim} has not come down yet" if observer.invariants.in_the_air(victim) else ""
+        return "" if victim in self.live else f"{victim} is not back"
+
+    def loss_noticed(self) -> str:
+        """Reason why the loss of the victim is not known to all who receive it."""
+        observer, victim = self.observer, self.victim
+        if victim in observer.alive:
+            return f"{victim} is dead, and its token still stands"
+        unaware = [name for name in self.receivers() if victim not in observer.status[name].missing]
+        return f"{', '.join(unaware)}: not noticed that {victim} is lost" if unaware else ""
+
+    def receivers(self) -> list[str]:
+        """Living robots that receive the poses of the victim."""
+        return sorted(self.observer.receivers[self.victim] & self.live)
+
+    def positions_kept(self) -> str:
+        """Add a violation for each robot that lost its position."""
+        for name in self.observer.status:
+            for incident in self.incidents(name, "position"):
+                self.add_violation(f"{name}: {incident.text}")
+        return ""
+
+    def all_held(self) -> str:
+        """Reason why not all robots have held for a silent router; a violation for each that was late."""
+        limit = self.run.experiment.safety.link_silence_s + NOTICED_S
+        free = []
+        for name in sorted(self.live - self.run.shifted):
+            since = [each.stamp - self._utc for each in self.incidents(name, "router")]
+            if not since:
+                free.append(name)
+            elif min(since) > limit:
+                self.add_violation(f"{name} held only {min(since):.1f} s after the router had frozen")
+        return f"{', '.join(free)}: never held while the router was frozen" if free else ""
+
+    def all_landed(self) -> str:
+        """Reason why robots without a conductor are not down yet."""
+        observer = self.observer
+        up = [name for name in observer.invariants.names if observer.invariants.in_the_air(name)]
+        asked = sorted(observer.status.keys() - self.run.dead.keys())
+        awake = [name for name in asked if observer.status[name].phase != "done"]
+        return f"in the air {up}, not done {awake}" if up or awake else ""
+
+    def incidents(self, name: str, what: str) -> list[messages.Incident]:
+        """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
+        last = self._incidents.get(name, 0)
+        new = [each for each in self.observer.status[name].incidents if each.seq > last and what in each.text]
+        return [each for each in new if each.text.startswith(("hold", "land", "cut"))]
+
+
+# ---------------------------------------------------------------------- the faults
+
+
+def _kill(it: ActiveFault) -> Check:
+    """SIGKILL to a robot's process; its body stays in the room and must come down."""
+    it.run.send(it.victim, SIGKILL)
+    it.run.dead[it.victim] = it.begun
+    return it.loss_noticed
+
+
+def _freeze(it: ActiveFault) -> Check:
+    """SIGSTOP for 5 s, then SIGCONT."""
+    it.run.send(it.victim, SIGSTOP)
+    return it.back
+
+
+def _partition(it: ActiveFault) -> Check:
+    """Nothing passes between a robot and the router for 3 s; messages of that time arrive afterwards."""
+    it.run.cut(it.victim)
+    return it.back
+
+
+def _router(it: ActiveFault) -> Check:
+    """SIGKILL to the only router; the conductor starts it again."""
+    it.run.send("router", SIGKILL)
+    return it.reported("router")
+
+
+def _failover(it: ActiveFault) -> Check:
+    """SIGKILL to the first of two routers."""
+    return _router(it)
+
+
+def _frozen_router(it: ActiveFault) -> Check:
+    """SIGSTOP for 5 s to a router whose lease is 60 s: robots must notice by themselves, and hold."""
+    it.run.send("router", SIGSTOP)
+    return it.all_held
+
+
+def _conductor(it: ActiveFault) -> Check:
+    """SIGKILL to the launcher: robots land by themselves, and everything ends."""
+    it.run.send("conductor", SIGKILL)
+    return it.all_landed
+
+
+def _clock(it: ActiveFault) -> Check:
+    """The wall clock of all processes steps by 0.5 to 5 s, forward or back."""
+    it.shift_clock("clock", it.fault.size, it.run.switch("clock").read())
+    return it.positions_kept
+
+
+def _clock_behind(it: ActiveFault) -> Check:
+    """SIGKILL to a robot's process; it is started again with a clock 3 to 4.5 s behind, and must be received."""
+    run, observer, victim = it.run, it.observer, it.victim
+    run.send(victim, SIGKILL)
+    it.shift_clock(f"clock-{run.process_of(victim)}", -it.fault.size)
+    restarted = back = None
+
+    def check() -> str:
+        nonlocal restarted, back
+        if restarted is None:
+            if victim in observer.alive or not it.lost():
+                return f"the loss of {victim} is not reported"
+            run.shifted.add(victim)
+            restarted = time.monotonic()
+            run.restart(victim, observer.session)
+        if (why := run.answer.reason or run.answer.refused.get(victim)) and not run.over:
+            it.add_violation(f"{victim} is not let in again: {why}")
+            return ""
+        if victim not in observer.alive:
+            return f"{victim} is not back"
+        back = back or time.monotonic()
+        deaf = [name for name in it.receivers() if observer.received_at.get((name, victim), 0.0) < restarted]
+        names = ", ".join(deaf)
+        if deaf and time.monotonic() - back > DEAF_S:
+            it.add_violation(f"{names}: no pose of {victim} received in the first {DEAF_S:g} s after its restart")
+        if deaf or victim not in it.live:
+            return f"{victim} does not take part yet, or its poses do not reach {names or 'any robot'}"
+        return ""
+
+    return check
+
+
+def _mocap_clock(it: ActiveFault) -> Check:
+    """The wall clock of motion capture steps by 0.5 to 4.5 s, and back after 3 s: no robot may lose its position."""
+    it.shift_clock(MOCAP_CLOCK, it.fault.size)
+    return it.positions_kept
+
+
+def _double(it: ActiveFault) -> Check:
+    """A second process of a robot's name is started: it must be refused, and touch nothing."""
+    victim, second = it.victim, it.run.start_duplicate(it.victim)
+
+    def check() -> str:
+        for order in it.observer.orders:
+            if order.robot == victim and not it.run.over:
+                it.add_violation(f"the body of {victim} was ordered to {order.action}")
+        if second.alive:
+            return f"the second process of {victim} is not refused yet"
+        if second.handle.returncode != REFUSED:
+            it.add_violation(f"the second process of {victim}: {second.exit}, {second.tail()[-200:]}")
+        return "" if victim in it.live else f"{victim} is not running any more"
+
+    return check
+
+
+def _read_error(it: ActiveFault) -> Check:
+    """Reading a robot's body raises: it must be ordered to land or to stop all the same."""
+    observer, victim = it.observer, it.victim
+    it.run.switch(f"read-{victim}").write(1.0)
+
+    def check() -> str:
+        if not any(order.robot == victim and order.action in ("land", "stop") for order in observer.orders):
+            return f"the body of {victim} was ordered neither to land nor to stop"
+        if observer.invariants.in_the_air(victim):
+            return f"{victim} has not come down yet"
+        if not it.lost():  # it lands for as long as a landing may take, for it sees nothing of it
+            return f"the process of {victim} has not ended yet"
+        it.run.dead.setdefault(victim, time.monotonic())
+        return it.loss_noticed()
+
+    return check
+
+
+def _disk(it: ActiveFault) -> Check:
+    """The recording can grow no more."""
+    it.note = it.run.fill_disk()
+    return it.reported("recorder")
+
+
+def _corrupt(it: ActiveFault) -> Check:
+    """Payloads of nonsense on every key that a robot believes."""
+    it.note = f"{it.run.spoil(it.victim, it.observer.session)} payloads of nonsense"
+    return it.back
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """A kind of fault: how it begins, and what a script and a round must know of it."""
+
+    begin: Callable[[ActiveFault], Check]
+    lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
+    heals_s: float = 1.5  # usual time of the recovery [s]
+    victim: bool = True  # one robot; else the whole run
+    most: int = 1_000  # in one round
+    stage: Stage = "plain"  # the only one on which it can be done; "plain": on each
+    never: Stage | None = None  # a stage on which it cannot be done
+    size: tuple[float, float] = (0.0, 0.0)  # range of its size [s]
+    signed: bool = False  # the size may be negative as well
+    unsteered: bool = False  # nothing steers the victim while it lasts: its body must stop
+    recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
+
+    @property
+    def meant(self) -> str:
+        """Its definition."""
+        return self.begin.__doc__ or ""
+
+
+FAULT_KINDS: Final = {
+    "kill": FaultKind(_kill, most=2, recorded="lost"),
+    "freeze": FaultKind(_freeze, 5.0, unsteered=True),
+    "partition": FaultKind(_partition, 3.0, unsteered=True),
+    "router": FaultKind(_router, victim=False, most=3, never="two routers", recorded="router"),
+    "failover": FaultKind(_failover, victim=False, most=1, stage="two routers", recorded="router"),
+    "frozen-router": FaultKind(_frozen_router, 5.0, victim=False, most=2, stage="patient router"),
+    "conductor": FaultKind(_conductor, victim=False, most=1),
+    "clock": FaultKind(_clock, victim=False, size=(0.5, 5.0), signed=True),
+    "clock-behind": FaultKind(_clock_behind, heals_s=12.0, most=2, size=(3.0, 4.5), recorded="lost"),
+    "mocap-clock": FaultKind(
+        _mocap_clock, 3.0, victim=False, most=3, stage="motion capture", size=(0.5, 4.5), signed=True
+    ),
+    "double": FaultKind(_double, heals_s=6.0),
+    "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),
+    "disk": FaultKind(_disk, victim=False, most=1),
+    "corrupt": FaultKind(_corrupt, 1.0),
+}
+FAULTS: Final = tuple(FAULT_KINDS)
+
+
+# ---------------------------------------------------------------------- their script
+
+
+def script(robots: Sequence[str], count: int, seed: int, kinds: Sequence[str] = FAULTS) -> list[Fault]:
+    """`count` faults, each kind as often as any other; the same seed gives the same script.
+
+    Args:
+        robots: Possible victims.
+    """
+    random = np.random.default_rng(seed)
+    deck = [kinds[place % len(kinds)] for place in range(count)]
+    random.shuffle(deck)
+    return [_fault(kind, round(float(random.uniform(*GAP_S)), 2), robots, random) for kind in deck]
+
+
+def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int], left_s: float) -> Fault | None:
+    """The next fault of a round; None if none fits.
+
+    Args:
+        begun: Faults of the round by kind.
+        left_s: Rest of the round's time [s]. The death of the launcher, which ends the round, waits for the last of it.
+    """
+    fits = []
+    for fault in waiting:
+        kind = fault.properties
+        there = kind.stage in ("plain", stage) and kind.never != stage
+        if there and begun.get(fault.kind, 0) < kind.most and kind.lasts_s + max(LATEST_S, kind.heals_s) < left_s:
+            fits.append(fault)
+    return min(fits, key=lambda fault: (fault.kind == "conductor") == (left_s > LAST_S), default=None)
+
+
+def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:
+    nature = FAULT_KINDS[kind]
+    victim = str(random.choice(list(robots))) if nature.victim else ""
+    size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
+    return Fault(kind, after_s, nature.lasts_s, victim, size)
