@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import inf
@@ -10,8 +11,11 @@ from tempfile import TemporaryFile
 from typing import IO, Any, Final, Literal, Self, cast
 
 import msgspec
+from mcap._chunk_builder import ChunkBuilder
 from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, MessageIndex
+from mcap.records import Message as Record
 from mcap.writer import CompressionType, Writer
 
 from agents.network.messages import Event, State, Vector
@@ -24,7 +28,8 @@ from experiments.recording.ros2.viewers import Draw
 from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
-PRIVATE: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
+INDICES: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
+CHUNK: Final = "_Writer__chunk_builder"  # nor for this
 
 
 class ChunkIndices:
@@ -34,8 +39,8 @@ class ChunkIndices:
         """Takes the place of a new writer's list; the file without a name is in `folder`, and gone with the process."""
         self._kept = TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `close`
         self.end = 0  # [ns] latest log time in the chunks so far
-        assert getattr(writer, PRIVATE) == [], "another version of mcap"
-        setattr(writer, PRIVATE, self)
+        assert getattr(writer, INDICES) == [], "another version of mcap"
+        setattr(writer, INDICES, self)
 
     def append(self, index: ChunkIndex) -> None:
         """Keeps the index of a chunk."""
@@ -56,6 +61,37 @@ class ChunkIndices:
     def close(self) -> None:
         """Close the file, which is then deleted."""
         self._kept.close()
+
+
+class Chunk(ChunkBuilder):
+    """Chunk in progress of mcap's writer, to which a message is added in a third of the library's time."""
+
+    HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
+
+    def add_message(self, message: Record) -> None:
+        """Add a message and the entry of its index."""
+        logged, data, out = message.log_time, message.data, self.record_writer
+        if not self.num_messages or logged < self.message_start_time:
+            self.message_start_time = logged
+        self.message_end_time = max(self.message_end_time, logged)
+        index = self.message_indices.get(message.channel_id)
+        if index is None:
+            index = self.message_indices[message.channel_id] = _MessageIndex(message.channel_id, [])
+        index.records.append((logged, out.count))
+        self.num_messages += 1
+        length = len(data) + self.HEAD.size - 9  # an opcode and the length itself stand before what is counted
+        out.write(
+            self.HEAD.pack(Opcode.MESSAGE, length, message.channel_id, message.sequence, logged, message.publish_time)
+        )
+        out.write(data)
+
+
+class _MessageIndex(MessageIndex):
+    def write(self, stream: RecordBuilder) -> None:
+        """Write all entries at once."""
+        numbers = [number for entry in self.records for number in entry]
+        head = (Opcode.MESSAGE_INDEX, 6 + 8 * len(numbers), self.channel_id, 8 * len(numbers))
+        stream.write(struct.pack(f"<BQHI{len(numbers)}Q", *head, *numbers))
 
 
 DRAWN: Final = "/{robot}/true_pose"
@@ -122,6 +158,7 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        setattr(self._writer, CHUNK, Chunk())
         self._index = ChunkIndices(path.parent, self._writer)
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
@@ -236,7 +273,6 @@ class Recording:
         """Writes. No writer survives an error or interrupt in the middle: the file then stays unfinished."""
         if self._over:
             raise RecordingError(self._over)
-        self._over = f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
         try:
             write(*what)
         except OSError as error:
@@ -245,7 +281,11 @@ class Recording:
                 "make room, then run `./zenpark recover` on it"
             )
             raise RecordingError(self._over) from error
-        self._over = ""
+        except BaseException:
+            self._over = (
+                f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
+            )
+            raise
 
 
 @dataclass(frozen=True)

@@ -84,8 +84,42 @@ class Marker:
     position: Vector = (0.0, 0.0, 0.0)  # [m] in its frame
     attitude: Setpoint = LEVEL
     points: Sequence[Vector] = ()  # [m] of lines
-    colours: Sequence[Colour] = field(default=())  # one a point, or none
+    colours: Sequence[Colour] = ()  # one a point, or none
     text: str = ""
+    # CDR behind the stamp, by number and place in the message modulo 8: most markers are drawn again and again
+    _encoded: dict[tuple[int, int], bytes] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def encoded(self, number: int, place: int) -> bytes:
+        """Everything behind the stamp as CDR."""
+        if (number, place) in self._encoded:
+            return self._encoded[number, place]
+        out = _Cdr()
+        out.data += bytes(place)
+        out.text(self.frame)
+        out.text(self.group)
+        out.numbers("i", number, self.type, 0)
+        w, *turned = self.attitude
+        out.numbers("d", *self.position, *turned, w, *self.scale)
+        out.colour(self.colour, self.opacity)
+        out.numbers("i", 0, 0)  # stays until it is replaced
+        out.numbers("B", self.frame != FRAME)
+        out.numbers("I", len(self.points))
+        for point in self.points:
+            out.numbers("d", *point)
+        out.numbers("I", len(self.colours))
+        for colour in self.colours:
+            out.colour(colour, self.opacity)
+        out.text("")  # texture
+        out.header(0, 0, "")
+        out.text("")
+        out.numbers("I", 0, 0)
+        out.text(self.text)
+        out.text("")  # mesh
+        out.text("")
+        out.numbers("I", 0)
+        out.numbers("B", 0)
+        self._encoded[number, place] = bytes(out.data[place:])
+        return self._encoded[number, place]
 
 
 class _Cdr:
@@ -120,33 +154,12 @@ def markers(stamp: float, drawn: Sequence[Marker]) -> bytes:
     Raises:
         Unencodable: If a number is none of its type.
     """
-    out, (seconds, nanoseconds) = _Cdr(), _moment(stamp)
+    out = _Cdr()
     try:
         out.numbers("I", len(drawn))
         for number, each in enumerate(drawn):
-            out.header(seconds, nanoseconds, each.frame)
-            out.text(each.group)
-            out.numbers("i", number, each.type, 0)
-            w, *turned = each.attitude
-            out.numbers("d", *each.position, *turned, w, *each.scale)
-            out.colour(each.colour, each.opacity)
-            out.numbers("i", 0, 0)  # stays until it is replaced
-            out.numbers("B", each.frame != FRAME)
-            out.numbers("I", len(each.points))
-            for point in each.points:
-                out.numbers("d", *point)
-            out.numbers("I", len(each.colours))
-            for colour in each.colours:
-                out.colour(colour, each.opacity)
-            out.text("")  # texture
-            out.header(0, 0, "")
-            out.text("")
-            out.numbers("I", 0, 0)
-            out.text(each.text)
-            out.text("")  # mesh
-            out.text("")
-            out.numbers("I", 0)
-            out.numbers("B", 0)
+            out.numbers("I", *_moment(stamp))
+            out.data += each.encoded(number, len(out.data) % 8)
     except (struct.error, OverflowError, ValueError) as error:
         raise Unencodable(f"{MARKERS}: {error}") from None
     return LITTLE_ENDIAN + bytes(out.data)

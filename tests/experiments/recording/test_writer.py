@@ -7,13 +7,16 @@ import resource
 import msgspec
 import numpy as np
 import pytest
+from mcap._chunk_builder import ChunkBuilder
 from mcap.reader import make_reader
+from mcap.records import Message
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from agents.network.messages import Event
 from bridges import ros2 as bridge
 from experiments.definition.experiment import Experiment
+from experiments.recording import writer
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, recover
 from experiments.recording.ros2 import viewers
@@ -136,6 +139,31 @@ def test_after_a_write_error_nothing_more_is_written(path):
         recording.write(messages[0])
     recording.close()
     assert path.stat().st_size == 40_000
+
+
+def test_after_an_interrupt_inside_a_write_nothing_more_is_written(path, monkeypatch):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    recording = Recording(path, PAIR, case="only", seed=4, clock="real")
+    monkeypatch.setattr(recording._writer, "flush", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recording.flush()
+    with pytest.raises(RecordingError, match=r"interrupted while it wrote; run `\./zenpark recover`"):
+        recording.write(begun())
+    recording.close()
+
+
+def test_a_chunk_is_the_librarys_own():
+    theirs, ours = ChunkBuilder(), writer.Chunk()
+    for channel, time, data in ((1, 20, b"a"), (2, 10, b""), (1, 30, bytes(300))):
+        for chunk in (theirs, ours):
+            chunk.add_message(Message(channel, time, data, time - 5, 7))
+    assert (ours.message_start_time, ours.message_end_time, ours.num_messages) == (10, 30, 3)
+    for chunk in (theirs, ours):
+        for index in chunk.message_indices.values():
+            index.write(chunk.record_writer)
+    assert ours.end() == theirs.end()
 
 
 @pytest.mark.usefixtures("small_disk")
