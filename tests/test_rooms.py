@@ -17,7 +17,7 @@ MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one oth
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
 agents.errors
-agents.arrays agents.clock agents.user_folder
+agents.arrays agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import ceil, floor, isfinite
+from math import ceil, isfinite
 from typing import Final, Literal
 
 import msgspec
@@ -46,6 +46,7 @@ from agents.runtime.range_inbox import RangeInbox, replace_rows
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, SILENCE_S, Watchdog
 from agents.safety.detection import SLOWEST
+from agents.ticks import Ticks
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
 ROUTER_S: Final = 0.045  # between two checks of the router
@@ -96,7 +97,8 @@ class Runtime:
         self._state: BodyState | None = None  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
-        self._utc = self._now = self._next = 0.0
+        self._ticks = Ticks(assignment.body_hz)
+        self._utc = 0.0
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names], network.ROBOT_LEASE_S)
         self._hands_off = False  # another process drives the bodies, or may do so
         self._reason_to_end: Callable[[], str | None] = lambda: None
@@ -185,28 +187,26 @@ class Runtime:
         if self._hands_off:
             return
         failures: list[Exception] = []
-        zero, begin, again = time.monotonic(), self._now, -np.inf
-        obeyed = False
+        begin, again, obeyed = self._ticks.elapsed(), -np.inf, False
         while True:
             self._watchdog.beat()
             self._await_ownership()
-            if self._now >= again:
-                again = self._now + AGAIN_S
+            if (now := self._ticks.elapsed()) >= again:
+                again = now + AGAIN_S
                 obeyed = False
                 with _noted(failures):
                     order(self._everyone)
                     obeyed = True
-            if (obeyed and not self._in_the_air(failures)) or self._now > begin + limit_s:
+            if (obeyed and not self._in_the_air(failures)) or now > begin + limit_s:
                 break
             time.sleep(self._dt)
-            self._now = begin + time.monotonic() - zero
         if failures:
             raise failures[0]
 
     def _in_the_air(self, failures: list[Exception]) -> bool:
         """Whether a row flies, by the last successful reading of its body; an error is noted."""
         with _noted(failures):
-            self._airborne = some(self._body.read(self._now).flying)
+            self._airborne = some(self._body.read(self._ticks.elapsed()).flying)
         return self._airborne
 
     # ------------------------------------------------------------------ the network
@@ -324,7 +324,7 @@ class Runtime:
 
     def _hold_after_suspend(self, slept: float) -> None:
         """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
-        self.agent.health.mark_resumed(self._next, slept)
+        self.agent.health.mark_resumed(self._ticks.t, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _receive(self, t: float) -> None:
@@ -395,7 +395,7 @@ class Runtime:
             if (
                 order.order == "start" and order.at is not None and not refusal and waits
             ):  # a running robot keeps its ticks
-                self._align(order.at - self._utc)
+                self._ticks.align(order.at - self._utc)  # robots that start together decide together
                 self._telemetry.due = t  # the central controller must know the start in time
             phase = Phase(self.agent.lifecycle.phase[row]).word
             found = self._inspect(row, t) if order.order == "inspect" else None
@@ -415,45 +415,36 @@ class Runtime:
 
     # ------------------------------------------------------------------ the loop
 
-    def _align(self, at: float) -> None:
-        """Shifts the ticks so that one falls on `at`: robots that start together then decide together."""
-        self._next = at - floor((at - self._now) / self._dt - 1e-6) * self._dt
-
     def _loop(self, stopping: Callable[[], str | None]) -> None:
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
         self._reason_to_end = stopping
         self._await_ownership()  # opening the body may have taken long
-        zero = time.monotonic()
         # one reading: a step of the wall clock in mid-run does not move the experiment
-        self._utc = self._telemetry.utc = self._setup.clock.utc()
+        self._utc = self._telemetry.utc = self._setup.clock.at(self._ticks.start())
         self._joined = True
         self._watchdog.start()
-        self._run_ticks(zero, stopping)
+        self._run_ticks(stopping)
 
-    def _run_ticks(self, zero: float, stopping: Callable[[], str | None]) -> None:
-        farewell = np.inf
+    def _run_ticks(self, stopping: Callable[[], str | None]) -> None:
+        ticks, counts, farewell = self._ticks, self._counts, np.inf
         while True:
             self._watchdog.beat()
             if self._watchdog.tripped:
                 self._recover(self._watchdog.forgive())
-            wait = zero + self._next - time.monotonic()
-            behind = max(0, int(-wait / self._dt))
-            if wait > 0.0:
-                time.sleep(wait)
+            time.sleep(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
             if self._await_ownership():
                 continue
-            self._counts.missed += behind
-            self._next += behind * self._dt
-            self.agent.skip_ticks(behind)
-            if behind * self._dt > self._setup.loop_silence_s:
-                self._hold_after_suspend(behind * self._dt)
-            t = self._now = self._next
-            self._counts.late_s = max(self._counts.late_s, time.monotonic() - zero - t)
-            self._next = t + self._dt
-            zero -= self._setup.clock.slew(self._dt)
+            missed = ticks.begin()
+            counts.missed += missed
+            counts.late_s = max(counts.late_s, ticks.late_s)
+            self.agent.skip_ticks(missed)
+            if missed * self._dt > self._setup.loop_silence_s:
+                self._hold_after_suspend(missed * self._dt)
+            t = ticks.t
+            ticks.zero -= self._setup.clock.slew(self._dt)
             self._tick(t)
             if farewell == np.inf and (reason := stopping()) is not None:
                 farewell = t + max(FAREWELL_S, self._descent_s)
@@ -469,7 +460,7 @@ class Runtime:
     def _yield_after_stop(self) -> None:
         """Sleeps, so that other processes get the CPU to stop their motors."""
         ticks = ceil(STOP_YIELD_S / self._dt)
-        self._next += ticks * self._dt
+        self._ticks.next += ticks * self._dt
         self.agent.tick += ticks
         time.sleep(STOP_YIELD_S)
 

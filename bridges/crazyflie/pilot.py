@@ -11,6 +11,7 @@ from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
+from agents.ticks import Ticks
 from bridges.crazyflie.flight import LANDING_GAP_S, Flight, Phase
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
@@ -80,7 +81,7 @@ class CrazyfliePilot:
         rate = max(settings.stream_hz, LOOP_HZ)
         if isinstance(settings.positioning, Outside):
             rate = max(rate, settings.positioning.rate_hz)
-        self._period = 1.0 / rate
+        self._ticks = Ticks(rate)
         self._thread = threading.Thread(target=self._run, name=f"pilot of {name}", daemon=True)
 
     # ------------------------------------------------------------------ calls of the robot's loop, none blocks
@@ -293,15 +294,17 @@ class CrazyfliePilot:
 
     def _serve(self, link: CrazyflieLink) -> None:
         """Loop of the thread, until `close` or the loss of the link; raises LinkError if the link is lost."""
-        due = time.monotonic()
+        ticks = self._ticks
+        ticks.start()
         landed_by = inf
         link.take_gap()
         while True:
-            begin = time.monotonic()
-            self._wake.wait(max(0.0, due - begin))
+            begin, wait = time.monotonic(), ticks.until_next()
+            self._wake.wait(wait)
             self._wake.clear()
-            now = self._note_standstill(begin, due)
-            due = max(due + self._period, now) if now >= due else due
+            now = self._note_standstill(begin + wait)
+            if ticks.elapsed() >= ticks.next:  # else an order has woken it
+                ticks.begin()
             self._check(link)
             try:
                 self._mend_gap(link, now)
@@ -379,15 +382,15 @@ class CrazyfliePilot:
             self._forward_external_pose(link, now)
             if now >= until:
                 return
-            time.sleep(min(until - now, self._period))
-            self._note_standstill(now, until)
+            time.sleep(min(until - now, self._ticks.period))
+            self._note_standstill(until)
             if self._stood_still:
                 raise OrderReplaced
 
-    def _note_standstill(self, begin: float, due: float) -> float:
-        """Note whether a wait from `begin` until `due` [s] took far longer, as in a suspended process; returns now."""
+    def _note_standstill(self, due: float) -> float:
+        """Note whether a wait until `due` [s] took far longer, as in a suspended process; returns now."""
         now = time.monotonic()
-        late = now - max(begin, due)
+        late = now - due
         if late > LANDING_GAP_S:
             self._stood_still = late
         return now

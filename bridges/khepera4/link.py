@@ -19,6 +19,7 @@ from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, TROUBLE, BodyError
 from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
+from agents.ticks import Ticks
 from bridges.khepera4.drivers import Driver, KTeam, Wire, WrongServer, identify
 from bridges.khepera4.odometry import Odometer
 
@@ -233,11 +234,11 @@ class Khepera4Link:
         driver.begin()
         driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched on anew
         self._stands = True
-        period = 1.0 / self._settings.poll_hz
-        ranges_due = battery_due = due = answered = time.monotonic()
+        ticks = Ticks(self._settings.poll_hz)
+        ranges_due = battery_due = answered = ticks.zero
         silent = False
-        while not self._ending.wait(max(0.0, due - time.monotonic())):
-            due = max(due + period, time.monotonic())
+        while not self._ending.wait(ticks.until_next()):
+            ticks.begin()
             v, turn, until = (0.0, 0.0, math.inf) if silent else self._current_twist()
             moves = v != 0.0 or turn != 0.0
             self._stands = self._stands and not moves

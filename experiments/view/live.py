@@ -187,7 +187,6 @@ class LiveView:
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Draws while a page is open, until `ended`."""
-        due = time.monotonic()
         while not ended():
             begun = time.monotonic()
             pages = bool(self._server.get_clients())
@@ -195,8 +194,7 @@ class LiveView:
                 self._begin()
             if pages:
                 self.draw(begun)
-            due = max(due + (FRAME_S if pages else IDLE_S), begun)
-            time.sleep(max(0.001, due - time.monotonic()))
+            time.sleep(max(0.001, begun + (FRAME_S if pages else IDLE_S) - time.monotonic()))
 
     def _begin(self) -> None:
         """Another case."""

@@ -9,7 +9,6 @@ import select
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +30,7 @@ from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
 from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
+from agents.ticks import Ticks
 from twins.devices.device import Faults, FaultyLink
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
@@ -227,16 +227,14 @@ class TruthSubscription:
 
 def serve(vicon: ViconTwin, truth: TruthSubscription, rate_hz: float, over: Callable[[], bool]) -> None:
     """Serve until `over()`, with a frame every 1 / `rate_hz` [s]."""
-    zero, clock = time.monotonic(), Clock()
-    frame = 0
+    ticks, clock = Ticks(rate_hz), Clock()
     while not over():
-        wait = zero + (frame + 1) / rate_hz - time.monotonic()
-        ready, _, _ = select.select(vicon.sockets(), [], [], max(0.0, wait))
-        t = time.monotonic() - zero
+        ready, _, _ = select.select(vicon.sockets(), [], [], ticks.until_next())
+        t = ticks.elapsed()
         for waiting in ready:
             vicon.serve(waiting, t)
-        if int(t * rate_hz) > frame:
-            frame = int(t * rate_hz)
+        if t >= ticks.next:
+            ticks.begin()
             truth.update(vicon, clock.utc())
         vicon.advance(t)
 

@@ -12,7 +12,7 @@ import gc
 import os
 import threading
 import time
-from math import floor, isfinite
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -30,6 +30,7 @@ from agents.network.validation import reach_of
 from agents.runtime import command_line
 from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
+from agents.ticks import Ticks
 from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -55,7 +56,7 @@ class CentreProcess:
         self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
-        self._period = assignment.decide_every / assignment.body_hz
+        self._ticks = Ticks(assignment.body_hz / assignment.decide_every)
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.needed.tolist()
@@ -76,7 +77,6 @@ class CentreProcess:
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
         self._phase, self._start = np.full(len(names), IDLE), np.full(len(names), np.inf)
         self._begun = np.inf
-        self._next = self._utc = 0.0
         self._clock = Clock()
         self._seq = round(self._clock.utc() * 1e3)  # beyond any number of a former central controller
         self._sent = self._missed = 0
@@ -86,25 +86,23 @@ class CentreProcess:
         """Decides until `over` is set."""
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
-        zero = time.monotonic()
-        self._utc = self._clock.at(zero)
+        ticks = self._ticks
+        self._utc = self._clock.at(ticks.start())
+        ticks.zero += self._patience
         token = pubsub.alive_token(self._session, self._keys.centre_alive)
-        while not over.wait(max(0.0, zero + self._next + self._patience - time.monotonic())):
+        while not over.wait(ticks.until_next()):
             if self._ownership.settle(self._session, over.is_set):
                 continue
-            now = time.monotonic() - zero - self._patience
-            behind = int((now - self._next) / self._period)
-            self._missed += behind
-            t = self._next + behind * self._period
-            self._late_s = max(self._late_s, now - self._next)
-            self._next = t + self._period
+            self._missed += ticks.begin()
+            self._late_s = max(self._late_s, ticks.late_s)
+            t = ticks.t
             self._receive(t)
             goals = self.centre.decide(t, self._phase, self._start)
             if not self._ownership.settle(self._session, over.is_set):
                 self._send(goals, t)
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
-        self._report(self._next)
+        self._report(ticks.next)
         token.undeclare()  # type: ignore[no-untyped-call]
 
     def _receive(self, t: float) -> None:
@@ -119,7 +117,7 @@ class CentreProcess:
         if begun != self._begun:
             self._begun = begun
             if isfinite(begun):  # decisions fall on the same instants as those of the robots
-                self._next = begun - floor((begun - t) / self._period - 1e-6) * self._period
+                self._ticks.align(begun)
         received = self._poses.receive(t, self._utc, lambda: np.full(len(self._names), begun))
         if received is not None:
             assert received.extra is not None
@@ -161,7 +159,7 @@ class CentreProcess:
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
             missing=[self._names[row] for row in self.centre.missing_robots()],
-            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._period), 4),
+            load=round((cpu_s - self._cpu_s) / max(t - self._reported, self._ticks.period), 4),
             late_s=round(self._late_s, 6),
             decisions=self.centre.decisions,
             missed=self._missed,

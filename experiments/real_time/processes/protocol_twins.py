@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import selectors
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Annotated
@@ -27,6 +26,7 @@ from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
+from agents.ticks import Ticks
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import structure
@@ -49,7 +49,7 @@ class DeviceProcess:
         lost: threading.Event,
     ) -> None:
         """Without a session no true pose is published; `lost` is set when the launcher is gone."""
-        self._device, self._names, self._dt = device, names, 1.0 / rate_hz
+        self._device, self._names, self._ticks = device, names, Ticks(rate_hz)
         known = names if session is not None else ()
         self._truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in known if session]
         self._lost = lost
@@ -57,19 +57,18 @@ class DeviceProcess:
 
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
-        zero, clock = time.monotonic(), Clock()
-        due = 0.0
+        ticks, clock = self._ticks, Clock()
+        zero = ticks.start()
         with selectors.DefaultSelector() as waiting:
             while not over.is_set():
                 self._register(waiting)
-                now = time.monotonic() - zero
-                for ready, _ in waiting.select(max(0.0, due - now)):
-                    self._device.serve(ready.fileobj, time.monotonic() - zero)  # type: ignore[arg-type]
-                now = time.monotonic() - zero
-                if now >= due:
+                for ready, _ in waiting.select(ticks.until_next()):
+                    self._device.serve(ready.fileobj, ticks.elapsed())  # type: ignore[arg-type]
+                now = ticks.elapsed()
+                if now >= ticks.next:
+                    ticks.begin()
                     self._device.advance(now)
                     self._publish(clock.at(zero + now))
-                    due = max(due + self._dt, now - 10.0 * self._dt)  # after a suspension lost time is not caught up
                     if self._farewell.over() if self._farewell is not None else self._lost.is_set():
                         return
 

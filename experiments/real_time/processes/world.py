@@ -21,6 +21,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end
 from agents.plugins import registry
 from agents.runtime import command_line
+from agents.ticks import Ticks
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.file.problems import refusal
@@ -61,7 +62,8 @@ class WorldProcess:
         self._ownership, self._over = joint.ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
         self._engine = registry.split(experiment.world.engine)[0]
-        self._dt = 1.0 / experiment.rates.body_hz
+        hz = experiment.rates.body_hz
+        self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz))
         self.exchange = Exchange(experiment, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
@@ -73,29 +75,24 @@ class WorldProcess:
 
     def run(self, over: threading.Event) -> None:
         """Runs until `over` is set, or until launcher and then robots are gone."""
-        exchange, pace, dt = self.exchange, self._pace, self._dt
+        exchange, pace, ticks = self.exchange, self._pace, self._ticks
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
-        zero = time.monotonic()
-        exchange.begin(zero)
+        exchange.begin(ticks.start())
         token = pubsub.alive_token(self._session, self._keys.world_alive)
         self._report(0.0)
-        due = 0.0
         self._over = over
         while not over.is_set():
-            wait = zero + due - time.monotonic()
-            if wait > 0.0:
-                time.sleep(wait)
-            self._ownership.settle(self._session, self._ended)
-            began = time.monotonic() - zero
-            if began - due > SLIP_S:
-                exchange.slept(began - due, began)
-                due = began - SLIP_S
-            self._tick(due)
-            due += dt
-            pace.worked += time.monotonic() - zero - began
-            if pace.update(began, dt):
-                self._report(due)
+            time.sleep(ticks.until_next())
+            if self._ownership.settle(self._session, self._ended):
+                continue
+            if missed := ticks.begin():
+                exchange.slept(missed * ticks.period, ticks.t)
+            began = ticks.elapsed()
+            self._tick(ticks.t)
+            pace.worked += ticks.elapsed() - began
+            if pace.update(began, ticks.period):
+                self._report(ticks.next)
             if self._ended():
                 break
         token.undeclare()  # type: ignore[no-untyped-call]

@@ -113,16 +113,16 @@ def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs()
     with Net().worn() as net:
         robot = Runtime(Plan(pair()).assignment(("A",)), Airborne(), setup)
         robot._join(net.session)
-        robot._utc, robot._now, robot._next = UTC, 7.0, 7.01
+        robot._utc, robot._ticks.t, robot._ticks.next = UTC, 7.0, 7.01
 
         def start(at: float) -> None:
             net.deliver(sent("park/A/order", messages.Order("start", at=UTC + at))[0])
             for query, order in robot._orders[0].read():
-                robot._obey(0, query, order, robot._now)
+                robot._obey(0, query, order, robot._ticks.t)
 
         robot.agent.lifecycle.phase[0] = AIRBORNE
         start(7.504)
-        assert robot._next == pytest.approx(7.004)
+        assert robot._ticks.next == pytest.approx(7.004)
         robot.agent.lifecycle.phase[0] = RUNNING
         start(7.508)
-        assert robot._next == pytest.approx(7.004)
+        assert robot._ticks.next == pytest.approx(7.004)

@@ -1,0 +1,53 @@
+"""Pace of the world on a simulated clock: a little lateness is caught up, the time of a standstill is lost."""
+
+import threading
+import types
+
+import pytest
+
+from agents.network.keys import Keys
+from agents.network.name_ownership import OwnershipCheck
+from agents.ticks import Ticks
+from experiments.definition.experiment import Formation, Robot
+from experiments.real_time.processes import world, world_network
+from experiments.real_time.processes.joining import Network
+from experiments.real_time.processes.world import SLIP_S, WorldProcess
+from experiments.real_time.processes.world_population import Population
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net
+
+HZ, KEYS = 100.0, Keys("park")
+
+
+@pytest.mark.parametrize(("stands_s", "lost", "forgiven"), [(0.05, 0, False), (0.255, 19, False), (2.0, 194, True)])
+def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven, monkeypatch):
+    now, simulated, slept = [1000.0], [], []
+    over = threading.Event()
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    monkeypatch.setattr(world, "time", types.SimpleNamespace(sleep=sleep))
+    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    experiment = pair(robots={"F": drone}, formation=Formation())
+    with Net().worn() as net:
+        population = Population(experiment)
+        joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.world_alive]))
+        process = WorldProcess(experiment, population, joint, threading.Event())
+        process._ticks = Ticks(HZ, catch_up=round(SLIP_S * HZ), clock=lambda: now[0])
+        monkeypatch.setattr(process.exchange, "slept", lambda seconds, t: slept.append((seconds, t)))
+        advance = population.advance
+
+        def stand():
+            advance()
+            simulated.append(population.time)
+            now[0] += stands_s if len(simulated) == 20 else 0.001
+            if len(simulated) == 150:
+                over.set()
+
+        monkeypatch.setattr(population, "advance", stand)
+        process.run(over)
+    assert population.time == pytest.approx(150 / HZ), "each tick simulates its period"
+    assert now[0] - 1000.0 == pytest.approx((149 + lost) / HZ + 0.001), "in time again"
+    assert slept == ([(pytest.approx(lost / HZ), pytest.approx((20 + lost) / HZ))] if lost else [])
+    assert any(seconds > world_network.HANG_S for seconds, _ in slept) == forgiven
