@@ -30,7 +30,7 @@ from experiments.metrics.signals import (
     LinkErrors,
     after_last,
     belief_errors,
-    closest_approach,
+    closest_distance,
     integral,
     integrals,
     leaders,
@@ -119,7 +119,6 @@ def measure(trace: Trace) -> CaseMetrics:
     held = belief_errors(trace, errors.net)
     rms = np.sqrt(mean_known(held**2))
     largest = np.where(np.isfinite(held), held, -np.inf).max(axis=0, initial=-np.inf)
-    gap, row, one, other = closest_approach(trace.true_position)
     beyond = outside_arena(trace)
     farthest = int(beyond.argmax())
     ticks = int(trace.ticks.sum())
@@ -146,9 +145,7 @@ def measure(trace: Trace) -> CaseMetrics:
         ),
         belief_rms=_number(math.sqrt(mean_known(held.reshape(-1) ** 2))),
         belief_max=_number(largest.max(initial=-np.inf)),
-        closest=_number(gap),
-        closest_between=(names[one], names[other]) if math.isfinite(gap) else (),
-        closest_at_s=float(trace.time[row]) if math.isfinite(gap) else None,
+        closest=_number(closest_distance(trace.true_position)),
         excursion=max(0.0, float(beyond[farthest])),
         excursion_robot=names[farthest] if beyond[farthest] > 0.0 else "",
         lost=int(trace.lost.sum()),

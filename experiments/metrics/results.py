@@ -177,8 +177,6 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     belief_rms: float | None  # [m] over all links
     belief_max: float | None  # [m] over all links
     closest: float | None  # [m] smallest distance between two robots' centres
-    closest_between: tuple[str, ...]
-    closest_at_s: float | None  # [s]
     excursion: float  # [m] farthest outside the arena
     excursion_robot: str  # empty if none was outside
     lost: int  # sum over the robots

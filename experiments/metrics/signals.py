@@ -254,15 +254,10 @@ def belief_errors(trace: Trace, net: Links) -> Array:
     return error
 
 
-def closest_approach(position: Array) -> tuple[float, int, int, int]:
-    """Smallest distance [m] between two robots, its row in time, and their rows; infinite if there are no two."""
-    best = (math.inf, 0, 0, 0)
-    for i in range(position.shape[1] - 1):
-        gap = norm(position[:, i + 1 :] - position[:, i, None])
-        gap = np.where(np.isfinite(gap), gap, np.inf)
-        k, j = divmod(int(gap.argmin()), gap.shape[1])
-        best = min(best, (float(gap[k, j]), k, i, i + 1 + j))
-    return best
+def closest_distance(position: Array) -> float:
+    """Smallest distance between two robots' centres [m]; infinite if there are no two."""
+    gaps = (norm(position[:, i + 1 :] - position[:, i, None]) for i in range(position.shape[1] - 1))
+    return min((float(gap[np.isfinite(gap)].min(initial=math.inf)) for gap in gaps), default=math.inf)
 
 
 def outside_arena(trace: Trace) -> Array:
