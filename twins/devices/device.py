@@ -6,6 +6,7 @@ loopback sockets. `experiments.real_time.processes.protocol_twins` runs devices 
 
 from __future__ import annotations
 
+import select
 import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,7 @@ import numpy as np
 
 from agents.arrays import Array
 from agents.body.interface import BodyRequest
+from agents.ticks import Ticks
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -89,10 +91,8 @@ class FaultyLink(Generic[Item]):
             yield self._waiting.popleft()[1]
 
 
-class Device(Protocol):
-    """Simulated device for some robots of one kind."""
-
-    addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
+class Server(Protocol):
+    """Simulated far end of a protocol."""
 
     def sockets(self) -> Sequence[socket.socket]:
         """Sockets to wait on; read again after every `serve`, because clients come and go."""
@@ -106,11 +106,27 @@ class Device(Protocol):
         """Advance the models to `t` [s] and send due packets; called once per tick of `request.rate_hz`."""
         ...
 
+
+class Device(Server, Protocol):
+    """Simulated device for some robots of one kind."""
+
+    addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
+
     def truth(self) -> tuple[Array, Array]:
         """True positions (n, 3) [m] and yaws (n,) [rad] of the robots."""
         ...
 
     def close(self) -> None: ...
+
+
+def serve_until_next(server: Server, ticks: Ticks) -> float:
+    """Serve sockets until the next tick, and begin it; returns the time since the start of the ticks [s]."""
+    while True:
+        for ready in select.select(server.sockets(), [], [], ticks.until_next())[0]:
+            server.serve(ready, ticks.elapsed())
+        if (now := ticks.elapsed()) >= ticks.next:
+            ticks.begin()
+            return now
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,10 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Final
@@ -31,7 +30,7 @@ from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
-from twins.devices.device import Faults, FaultyLink
+from twins.devices.device import Faults, FaultyLink, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -225,20 +224,6 @@ class TruthSubscription:
         vicon.latency_s = max(0.0, float(age[fresh].mean())) if fresh.any() else 0.0
 
 
-def serve(vicon: ViconTwin, truth: TruthSubscription, rate_hz: float, over: Callable[[], bool]) -> None:
-    """Serve until `over()`, with a frame every 1 / `rate_hz` [s]."""
-    ticks, clock = Ticks(rate_hz), Clock()
-    while not over():
-        ready, _, _ = select.select(vicon.sockets(), [], [], ticks.until_next())
-        t = ticks.elapsed()
-        for waiting in ready:
-            vicon.serve(waiting, t)
-        if t >= ticks.next:
-            ticks.begin()
-            truth.update(vicon, clock.utc())
-        vicon.advance(t)
-
-
 class TwinLaunch(NetworkLaunch, frozen=True, kw_only=True, rename="kebab"):
     """A simulated Vicon that sees simulated robots."""
 
@@ -288,7 +273,11 @@ def run(launch: TwinLaunch) -> int:
             keys = Keys(launch.realm)
             farewell = Farewell(session, keys, launch.robots, lost)
             truth = TruthSubscription(session, keys, launch.robots)
-            serve(vicon, truth, launch.rate, lambda: stop.is_set() or farewell.over())
+            ticks, clock = Ticks(launch.rate), Clock()
+            while not (stop.is_set() or farewell.over()):
+                t = serve_until_next(vicon, ticks)
+                truth.update(vicon, clock.utc())
+                vicon.advance(t)
         finally:
             vicon.close()
     return 0

@@ -6,7 +6,6 @@ and publishes true poses for recorder and simulated motion capture, never for ro
 
 from __future__ import annotations
 
-import selectors
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -32,62 +31,7 @@ from experiments.definition.experiment import Experiment, Robot
 from experiments.file import structure
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch
-from twins.devices.device import Device, DeviceRequest, Faults
-
-
-class DeviceProcess:
-    """Runs a device: serves its sockets, simulates it, publishes true poses."""
-
-    def __init__(
-        self,
-        device: Device,
-        names: Sequence[str],
-        session: zenoh.Session | None,
-        *,
-        keys: Keys,
-        rate_hz: float,
-        lost: threading.Event,
-    ) -> None:
-        """Without a session no true pose is published; `lost` is set when the launcher is gone."""
-        self._device, self._names, self._ticks = device, names, Ticks(rate_hz)
-        known = names if session is not None else ()
-        self._truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in known if session]
-        self._lost = lost
-        self._farewell = Farewell(session, keys, names, lost) if session is not None else None
-
-    def run(self, over: threading.Event) -> None:
-        """Runs until `over` is set, or until launcher and then robots are gone."""
-        ticks, clock = self._ticks, Clock()
-        zero = ticks.start()
-        with selectors.DefaultSelector() as waiting:
-            while not over.is_set():
-                self._register(waiting)
-                for ready, _ in waiting.select(ticks.until_next()):
-                    self._device.serve(ready.fileobj, ticks.elapsed())  # type: ignore[arg-type]
-                now = ticks.elapsed()
-                if now >= ticks.next:
-                    ticks.begin()
-                    self._device.advance(now)
-                    self._publish(clock.at(zero + now))
-                    if self._farewell.over() if self._farewell is not None else self._lost.is_set():
-                        return
-
-    def _register(self, waiting: selectors.DefaultSelector) -> None:
-        wanted = {sock.fileno(): sock for sock in self._device.sockets()}
-        known = dict(waiting.get_map())
-        for number, key in known.items():
-            if number not in wanted or wanted[number] is not key.fileobj:
-                waiting.unregister(key.fileobj)
-        for number, sock in wanted.items():
-            if number not in waiting.get_map():
-                waiting.register(sock, selectors.EVENT_READ)
-
-    def _publish(self, stamp: float) -> None:
-        position, yaw = self._device.truth()
-        for name, publisher, where, toward in zip(
-            self._names, self._truths, position.tolist(), yaw.tolist(), strict=False
-        ):
-            publisher.put(messages.encode(messages.position(name, stamp, where, toward)))
+from twins.devices.device import Device, DeviceRequest, Faults, serve_until_next
 
 
 class TwinLaunch(Launch, frozen=True, kw_only=True):
@@ -155,23 +99,31 @@ def _serve(
     identity: str = "twin",
 ) -> int:
     """Runs a device until a signal, or until its lifeline is lost and the robots are gone."""
-    names = request.body.names
+    names, keys = request.body.names, Keys(experiment.network.realm)
     over, lost = threading.Event(), threading.Event()
     if lifeline:
         Lifeline(lost).start()
     with on_termination(over.set), ExitStack() as stack:
-        session, declared = None, list[object]()
+        truths, ended = list[zenoh.Publisher](), lost.is_set
         if connect:
-            joined = held(network.open_session(connect, name=word, stop=over, identity=identity))
-            session, declared = stack.enter_context(joined)
+            opened = network.open_session(connect, name=word, stop=over, identity=identity)
+            session, declared = stack.enter_context(held(opened))
+            truths = [pubsub.publisher(session, keys.truth(name), messages.JSON) for name in names]
+            farewell = Farewell(session, keys, names, lost)
+            declared += [truths, farewell]
+            ended = farewell.over
         device: Device = registry.load(registry.DEVICES, word)(request)
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
-        keys, rate_hz = Keys(experiment.network.realm), experiment.rates.body_hz
-        process = DeviceProcess(device, names, session, keys=keys, rate_hz=rate_hz, lost=lost)
-        declared.append(process)
-        process.run(over)
+        ticks, clock = Ticks(experiment.rates.body_hz), Clock()
+        while not (over.is_set() or ended()):
+            now = serve_until_next(device, ticks)
+            device.advance(now)
+            position, yaw = (values.tolist() for values in device.truth())
+            for name, publisher, where, toward in zip(names, truths, position, yaw, strict=False):
+                truth = messages.position(name, clock.at(ticks.zero + now), where, toward)
+                publisher.put(messages.encode(truth))
     return 0
 
 
