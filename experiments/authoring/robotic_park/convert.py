@@ -9,23 +9,21 @@ from __future__ import annotations
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from agents.body.kinds import KINDS
-from experiments.authoring.robotic_park.file import PLACES, SURFACES, Park, Relation, Robot, Task, read, starts_from
+from experiments.authoring.robotic_park.file import PLACES, SURFACES, Park, Robot, Task, read, starts_from, text_of
 from experiments.authoring.robotic_park.heights import Heights, find_heights, origin_of
 from experiments.catalogue import index
 from experiments.check.findings import join_names
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.consistency import divisor
-from experiments.file.problems import refusal
 from experiments.file.reference import written
-from experiments.file.text import content
 
 V = TypeVar("V", bound=Hashable)
 RATE_HZ: Final = 100.0  # of bodies: their position controllers run at that
@@ -34,8 +32,7 @@ PARK: Final = (4.0, 4.0, 2.5)  # [m] the arena, if there is room in it
 WIDTH: Final = 110
 SAME: Final = 1e-6  # [m] two ends of a link mean the same
 LEVEL: Final = 0.02  # [m] heights that differ by less are the same
-KNOWN: Final = ("gradient", "pid")
-TASKS: Final = {"distance": "distance", "pose": "displacement"}  # their kinds of tasks, and the law of each
+LAWS: Final = {"distance": "distance", "pose": "displacement"}  # for their kinds of tasks
 RADIO: Final = re.compile(r"radio://(\d+)/\d+/(?:250K|1M|2M)/[0-9A-Fa-f]{10}")
 
 
@@ -45,14 +42,9 @@ def convert(file: str, target: str | None, duration_s: float, poses: str | None 
     Raises:
         DocumentError: If the file cannot be read, is no experiment of theirs, or the new one cannot be written.
     """
-    source = Path(file)
-    try:
-        text = content(source, file)
-    except FileNotFoundError:
-        hint = "name an experiment file of Robotic Park's authors (.yaml)"
-        raise refusal(file, "there is no such file", hint) from None
+    text = text_of(file, "name an experiment file of Robotic Park's authors (.yaml)")
     made, notes = convert_text(text, file, duration_s, poses)
-    path = entries.write_new(made, Path(target) if target else Path(f"{source.stem}.toml"))
+    path = entries.write_new(made, Path(target or f"{Path(file).stem}.toml"))
     document.read(path)
     return path, notes
 
@@ -69,21 +61,18 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
     """
     notes: list[str] = []
     park = read(label, text, {} if poses is None else starts_from(poses), notes)
-    _note_robots(park, notes)
-    pose_hz = _rate("local_pose.T", "poses", [robot.pose_s for robot in park.robots], notes)
-    coordination_hz = _rate(
-        "task.controller.period", "decisions", [task.period for _, task in park.tasks] or [0.1], notes
-    )
+    notes += _notes_on_robots(park)
+    pose_hz = _rate("local_pose.T", "poses", [1e-3 * robot.local_pose.T for robot in park.robots], notes)
+    periods = [task.period for _, task in park.tasks] or [0.1]
+    coordination_hz = _rate("task.controller.period", "decisions", periods, notes)
     trigger: dict[str, Any] = {"kind": "periodic", "period_s": 1.0 / pose_hz}
-    chosen = _commonest("communication", [robot.communication for robot in park.robots], notes)
-    if chosen is not None:
-        trigger = {"kind": "send-on-delta", "threshold": chosen[0]}
-        if chosen[1]:
-            notes.append(f"communication.threshold.ai = {chosen[1]:g}: the part of the threshold that grows")
+    if sent := _commonest("communication", [robot.communication.event for robot in park.robots], notes):
+        trigger = {"kind": "send-on-delta", "threshold": sent[0]}
+        if sent[1]:
+            notes.append(f"communication.threshold.ai = {sent[1]:g}: the part of the threshold that grows")
     found = find_heights(park, notes)
-    formation, links, anchors = _formation_table(park, found, notes)
-    update = _commonest("task.controller", [task.update for _, task in park.tasks] or [None], notes)
-    if update is not None:
+    formation, links, anchors = _formation(park, found, notes)
+    if update := _commonest("task.controller", [task.controller.event for _, task in park.tasks] or [None], notes):
         formation["update"] = {"kind": "relative-control", "floor": update[0], "share": update[1]}
     notes = list(dict.fromkeys(notes))
     name = Path(label)
@@ -94,7 +83,7 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
             "duration_s": duration_s,
             **({"architecture": "centralised"} if park.central else {}),
             "trigger": trigger,
-            **({"positioning": "vicon-twin"} if any(robot.external for robot in park.robots) else {}),
+            **({"positioning": "vicon-twin"} if any(robot.positioning != "Intern" for robot in park.robots) else {}),
         },
         "arena": {"size": _arena(found)},
         "rates": {"body_hz": RATE_HZ, "pose_hz": pose_hz, "coordination_hz": coordination_hz},
@@ -107,7 +96,7 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
     lines += ["# Not carried over, or not as it was:"] if notes else []
     for note in notes:
         lines += textwrap.wrap(_plain(note), WIDTH, initial_indent="# - ", subsequent_indent="#   ")
-    made_up = {robot.name for robot in park.robots if robot.pose is None}
+    made_up = {robot.name for robot in park.robots if robot.start is None}
     for header, table in tables.items():
         lines += [f"[{header}]"] if header and table else []
         for key, value in table.items():
@@ -126,64 +115,57 @@ def _arena(found: Heights) -> list[float]:
     """Their park, or as much as starts and shape need, to the next half metre [m]."""
     places = np.concatenate([found.start, found.shape])
     reach = 2.0 * (np.abs(places[:, :2]).max(axis=0) + ROOM)
-    needed = [*reach.tolist(), float(found.hover.max(initial=0.0)) + ROOM]
+    needed = [*reach, found.hover.max(initial=0.0) + ROOM]
     return [max(size, float(np.ceil(2.0 * need) / 2.0)) for size, need in zip(PARK, needed, strict=True)]
 
 
 def _robot(robot: Robot, found: Heights, row: int) -> dict[str, Any]:
     start, flies = found.start[row, :2].tolist(), KINDS[robot.kind].flies
-    if not flies and robot.pose is not None and robot.pose[2]:
-        start.append(robot.pose[2])
-    made: dict[str, Any] = {"kind": robot.kind, "start": start}
-    if flies:
-        made["hover"] = float(found.hover[row])
-    made |= _body(robot)
-    if robot.external:
-        made["position"] = "external"
-    if robot.place == "digital_twin":
-        made["shadow"] = {}
-    return made
+    if not flies and robot.start is not None and robot.start[2]:
+        start.append(robot.start[2])
+    return {
+        "kind": robot.kind,
+        "start": start,
+        **({"hover": float(found.hover[row])} if flies else {}),
+        **_body(robot),
+        **({"position": "external"} if robot.positioning != "Intern" else {}),
+        **({"shadow": {}} if robot.type == "digital_twin" else {}),
+    }
 
 
 def _body(robot: Robot) -> dict[str, str]:
     """Address of a real robot and its process; nothing for twins, and where there is no address."""
-    if robot.place == "virtual":
-        return {}
     radio = RADIO.fullmatch(robot.uri)
-    if robot.kind == "crazyflie" and radio:
+    if robot.type != "virtual" and robot.kind == "crazyflie" and radio:
         return {"body": robot.uri, "process": f"radio{radio[1]}"}
-    if robot.kind in ("khepera4", "tello") and re.fullmatch(r"[\w.-]+(:\d+)?", robot.host):
+    if robot.type != "virtual" and robot.kind in ("khepera4", "tello") and re.fullmatch(r"[\w.-]+(:\d+)?", robot.host):
         return {"body": f"{robot.kind}://{robot.host}"}
     return {}
 
 
-def _note_robots(park: Park, notes: list[str]) -> None:
+def _notes_on_robots(park: Park) -> Iterator[str]:
     """Notes on settings of the authors' robots that zenpark does not have."""
-
-    def those(what: Callable[[Robot], object], note: str) -> None:
-        if names := [robot.name for robot in park.robots if what(robot)]:
-            notes.append(note.format(join_names(names), "is" if len(names) == 1 else "are"))
-
-    those(
-        lambda robot: robot.place != "virtual" and not _body(robot),
-        "{} {} real, but without an address of a known kind: twins instead",
-    )
-    those(_body, "real robots ({}) keep their addresses; try the file with --virtual or --bodies twin first")
-    those(
-        lambda robot: robot.external,
-        "positioning Extern ({}): the motion capture's address is not in their file; positioning is a twin of it",
-    )
-    those(
-        lambda robot: robot.gated,
-        "{}: position controllers that act on events; zenpark's run at every tick",
-    )
+    robots = park.robots
+    idle = [robot for robot in robots if robot.task.written and not robot.task.enable]
+    rows = {
+        "{}: real, but without an address of a known kind; twins instead": [
+            robot for robot in robots if robot.type != "virtual" and not _body(robot)
+        ],
+        "real robots ({}) keep their addresses; try the file with --virtual or --bodies twin first": [
+            robot for robot in robots if _body(robot)
+        ],
+        "positioning Extern ({}): the motion capture's address is not in their file; positioning is a twin of it": [
+            robot for robot in robots if robot.positioning != "Intern"
+        ],
+        "{}: position controllers that act on events; zenpark's run at every tick": [
+            robot for robot in robots if "EventBased" in robot.controller.protocol + robot.controller_type
+        ],
+        f"task.enable is False for {{}}: {sum(len(robot.task.written) for robot in idle)} relations are left out, and"
+        " these robots have no neighbours": idle,
+    }
+    yield from (note.format(join_names([robot.name for robot in those])) for note, those in rows.items() if those)
     if roles := dict.fromkeys(task.role for _, task in park.tasks if task.role != "consensus"):
-        notes.append(f"task.role: {', '.join(roles)}; leaders are the robots without neighbours")
-    count = sum(robot.idle for robot in park.robots)
-    those(
-        lambda robot: robot.idle,
-        f"task.enable is False for {{}}: {count} relations are left out, and these robots have no neighbours",
-    )
+        yield f"task.role: {', '.join(roles)}; leaders are the robots without neighbours"
 
 
 def _rate(key: str, what: str, periods: Sequence[float], notes: list[str]) -> float:
@@ -195,9 +177,22 @@ def _rate(key: str, what: str, periods: Sequence[float], notes: list[str]) -> fl
     return nearest
 
 
-def _formation_table(
-    park: Park, found: Heights, notes: list[str]
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+def _commonest(what: str, given: Sequence[V], notes: list[str]) -> V:
+    """The value that most robots have."""
+    (value, _), *others = Counter(given).most_common()
+    if others:
+        words = ", ".join(_words(other) for other, _ in others)
+        notes.append(f"{what}: {words} of some robots; all get the commonest, {_words(value)}")
+    return value
+
+
+def _words(value: object) -> str:
+    if isinstance(value, tuple):
+        return "threshold {:g} + {:g}·|·|".format(*value)
+    return "no threshold" if value is None else f"{value:g}"
+
+
+def _formation(park: Park, found: Heights, notes: list[str]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Law and gains, links and anchors: the tables `[formation]`, `[formation.links]` and `[formation.anchors]`.
 
     The gradient law of their drivers is u = k (d² − ‖x‖²) x for each neighbour with x = p_i − p_j, which is zenpark's
@@ -208,7 +203,7 @@ def _formation_table(
     jobs = park.tasks
     if not jobs:
         return {"law": "distance"}, {}, {}
-    if unknown := dict.fromkeys(task.law for _, task in jobs if task.law not in KNOWN):
+    if unknown := dict.fromkeys(task.law for _, task in jobs if task.law not in ("gradient", "pid")):
         notes.append(f"task.controller.type: {', '.join(unknown)}; taken as gradient")
     distances = [
         relation.values[0]
@@ -218,27 +213,23 @@ def _formation_table(
     ]
     mean = float(np.mean(distances)) if distances else 1.0
     gains = {robot.name: _gain(park, robot, task, mean) for robot, task in jobs}
-    of_kind = {kind: [gains[robot.name] for robot, task in jobs if task.kind == kind] for kind in TASKS}
+    of_kind = {kind: [gains[robot.name] for robot, task in jobs if task.kind == kind] for kind in LAWS}
     usual = {kind: Counter(given).most_common(1)[0][0] for kind, given in of_kind.items() if given}
-    table: dict[str, Any] = {"law": TASKS[next(iter(usual))] if len(usual) == 1 else "mixed"}
+    table: dict[str, Any] = {"law": LAWS[next(iter(usual))] if len(usual) == 1 else "mixed"}
     if "distance" in usual:
-        table["gain"] = _rounded(usual["distance"])
+        table["gain"] = usual["distance"]
         if scaled := [robot.name for robot, task in jobs if task.law == "pid" or _divides(park, robot)]:
             notes.append(
                 f"gain of {join_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
                 " the distance that is wanted and weaker beyond"
             )
     if "pose" in usual:
-        table["stiffness"] = _rounded(usual["pose"])
+        table["stiffness"] = usual["pose"]
         if any(task.kind == "pose" and task.law != "pid" for _, task in jobs):
             notes.append("pose tasks by gradient: theirs knows no sides and acts on x and y apart; here it is linear")
-    table["clamp"] = _commonest("task.controller.upperLimit [m]", [task.clamp for _, task in jobs], notes)
-    own = {robot.name: _rounded(gains[robot.name]) for robot, task in jobs if gains[robot.name] != usual[task.kind]}
+    table["clamp"] = _commonest("task.controller.upperLimit [m]", [task.step[1] for _, task in jobs], notes)
+    own = {robot.name: gains[robot.name] for robot, task in jobs if gains[robot.name] != usual[task.kind]}
     return table, _links(park, found, own, notes), _anchors(park, found, gains, notes)
-
-
-def _rounded(gain: float) -> float:
-    return float(f"{gain:.4g}")
 
 
 def _divides(park: Park, robot: Robot) -> bool:
@@ -247,95 +238,68 @@ def _divides(park: Park, robot: Robot) -> bool:
     The driver on real Kheperas does, and so do the Webots drivers of the files that `recent` tells; those before, the
     driver of real Crazyflies and the central controller do not.
     """
-    return not park.central and (park.recent if robot.place == "virtual" else robot.kind == "khepera4")
+    return not park.central and (park.recent if robot.type == "virtual" else robot.kind == "khepera4")
 
 
-def _gain(park: Park, robot: Robot, task: Task, distance: float) -> float:
+def _gain(park: Park, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:
     """The gain of zenpark's law at a distance [m]: μ [1/m²] for distances, the stiffness for poses."""
-    if task.law == "pid":
-        return task.gain if task.kind == "pose" else task.gain / distance**2
-    return 2.0 * task.gain / (distance if task.kind == "distance" and _divides(park, robot) else 1.0)
-
-
-def _commonest(what: str, given: Sequence[V], notes: list[str]) -> V:
-    """The value that most robots have."""
-    counted = Counter(given)
-    value = counted.most_common(1)[0][0]
-    if len(counted) > 1:
-        others = ", ".join(_words(each) for each in counted if each != value)
-        notes.append(f"{what}: {others} of some robots; all get the commonest, {_words(value)}")
-    return value
-
-
-def _words(value: object) -> str:
-    if isinstance(value, tuple):
-        return "threshold {:g} + {:g}·|·|".format(*value)
-    return "no threshold" if value is None else f"{value:g}"
+    divisor_of_law = 1.0
+    if task.kind == "distance":
+        divisor_of_law = distance**2 if task.law == "pid" else distance if _divides(park, robot) else 1.0
+    gain = weight * (1.0 if task.law == "pid" else 2.0) * task.step[0] / divisor_of_law
+    return float(f"{gain:.4g}")
 
 
 def _links(park: Park, found: Heights, own: dict[str, float], notes: list[str]) -> dict[str, Any]:
     """The links: one that both ends ask for alike, else one for each end."""
-    row = {robot.name: number for number, robot in enumerate(park.robots)}
-    asked: dict[tuple[str, str], tuple[Relation, str]] = {}
+    hover = dict(zip((robot.name for robot in park.robots), found.hover.tolist(), strict=True))
+    asked: dict[tuple[str, str], tuple[str, tuple[float, ...]]] = {}
     for robot, task in park.tasks:
         for relation in task.relations:
             ends = robot.name, relation.name
             if ends in asked:
                 notes.append(f"{robot.name}: the second relation to {relation.name}")
             elif relation.name not in PLACES:
-                asked[ends] = relation, task.kind
+                asked[ends] = task.kind, relation.values
     lines: dict[str, Any] = {}
-    for (name, other), (relation, kind) in asked.items():
+    for (name, other), (kind, values) in asked.items():
         if f"{name} - {other}" in lines:
             continue
-        back, of_other = asked.get((other, name), (None, ""))
-        mirrored = back is not None and of_other == kind and _mirrored(relation, back, kind)
+        of_other, back = asked.get((other, name), ("", ()))
+        sign = 1.0 if kind == "distance" else -1.0
+        mirrored = of_other == kind and all(abs(a - sign * b) < SAME for a, b in zip(values, back, strict=True))
         if of_other == kind and not mirrored:
             notes.append(f"{name} and {other} ask for different things of their link: each keeps to its own")
         both = mirrored and own.get(name) == own.get(other)
-        # `relation` is p_name − p_other, and a link has its second robot relative to the first
-        what: dict[str, Any] = {"distance": relation.values[0]}
-        if kind == "pose":
-            what = {"offset": list(relation.values[:2])}
-            rise = float(found.hover[row[name]] - found.hover[row[other]])
-            if abs(relation.values[2] - rise) > LEVEL:
-                notes.append(f"{name}: {relation.values[2]:g} m above {other}; they hold heights {rise:.2f} m apart")
+        # `values` are of p_name − p_other, and a link has its second robot relative to the first
+        what: dict[str, Any] = {"distance": values[0]} if kind == "distance" else {"offset": list(values[:2])}
+        rise = hover[name] - hover[other]
+        if kind == "pose" and abs(values[2] - rise) > LEVEL:
+            notes.append(f"{name}: {values[2]:g} m above {other}; they hold heights {rise:.2f} m apart")
         what |= {"gain": own[name]} if name in own else {}
         lines[f"{other} {'-' if both else '>'} {name}"] = what["distance"] if what.keys() == {"distance"} else what
     return lines
 
 
-def _mirrored(one: Relation, other: Relation, kind: str) -> bool:
-    sign = 1.0 if kind == "distance" else -1.0
-    return all(abs(a - sign * b) < SAME for a, b in zip(one.values, other.values, strict=True))
-
-
 def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: list[str]) -> dict[str, Any]:
-    anchors = {}
-    for robot, task in park.tasks:
+    """The anchor of each robot that keeps to a place; that of a distance only if the shape has them."""
+    anchors: dict[str, Any] = {}
+    for row, (robot, task) in ((park.robots.index(each[0]), each) for each in park.tasks):
         places = [relation for relation in task.relations if relation.name in PLACES]
-        if surfaces := [relation.name for relation in places if relation.name in SURFACES]:
-            notes.append(f"{robot.name}: {', '.join(surfaces)}; zenpark has points, lines and planes")
-        there = [relation for relation in places if relation.name not in SURFACES]
-        if len(there) > 1:
-            notes.append(f"{robot.name}: {len(there)} places to keep a distance to; only the first is kept")
-        for relation in there[:1]:
-            anchor = _anchor(park, robot, task, relation, found, gains[robot.name])
-            if found.anchored or "distance" not in anchor:
-                anchors[robot.name] = anchor
+        kept = next((relation for relation in places if relation.name not in SURFACES), None)
+        if left := [relation.name for relation in places if relation is not kept]:
+            notes.append(f"{robot.name}: {', '.join(left)} left out; a robot has one place, a point or a line")
+        if kept is None:
+            continue
+        values = kept.values
+        if kept.name == "line":
+            anchors[robot.name] = {"to": list(values[:3]), "along": list(values[3:])}
+        elif len(values) == 3:
+            anchors[robot.name] = {"to": [*values[:2], float(found.hover[row])], "gain": gains[robot.name]}
+        elif found.anchored:
+            # the gain of the origin relative to a neighbour, as in the same drivers
+            weight = 2.0 if park.central or robot.type != "virtual" else 1.0 if park.recent else 4.0
+            centre = list(origin_of(park, robot, kept) or found.centre)
+            gain = _gain(park, robot, task, values[0], weight)
+            anchors[robot.name] = {"distance": values[0], "to": centre, "gain": gain}
     return anchors
-
-
-def _anchor(  # noqa: PLR0917 - one caller
-    park: Park, robot: Robot, task: Task, relation: Relation, found: Heights, gain: float
-) -> dict[str, Any]:
-    values = relation.values
-    if relation.name == "line":
-        return {"to": list(values[:3]), "along": list(values[3:])}
-    if len(values) == 3:
-        height = float(found.hover[park.robots.index(robot)])
-        return {"to": [*values[:2], height], "gain": _rounded(gain)}
-    # the gain of the origin relative to a neighbour, as in the same drivers
-    weight = 2.0 if park.central or robot.place != "virtual" else 1.0 if park.recent else 4.0
-    own = _rounded(weight * _gain(park, robot, task, values[0]))
-    return {"distance": values[0], "to": list(origin_of(park, robot, relation) or found.centre), "gain": own}

@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 import yaml
 from msgspec import Meta, Struct
 
+from agents.body.kinds import KINDS as BODIES
 from agents.plugins.registry import did_you_mean
-from experiments.file.problems import DocumentError, at_offset, refusal
+from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 from experiments.file.text import content
 
 T = TypeVar("T")
 Pose: TypeAlias = tuple[float, float, float]
-Threshold: TypeAlias = (
-    tuple[float, float] | None
-)  # c0 and a of an event trigger c0 + a·|·|; None: no event is waited for
+When: TypeAlias = Literal["Continuous", "EventBased", "EvenBased"]  # both spellings are theirs
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 KINDS: Final = {  # their launcher knows robots by parts of their names as well
@@ -43,16 +42,15 @@ CENTRES: Final = ("origin", "sphere")
 NOTHING: Final = ("none", "null")  # a relationship without another end
 SURFACES: Final = ("cone", "ellipsoid")
 PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
+TASKS: Final = ("distance", "pose", "relative_pose")
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-FORM: Final = "write name_d, name_x_y_z or origin_R, separated by commas"
-OLDER: Final = {"config_path", "communication", "task", "agent_ip", "control_mode"}  # a table with one is a robot
-OLDER_GAIN: Final = 0.25
-OLDER_CLAMP: Final = 0.08  # [m]
+TOOLS: Final = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
+OLDER: Final = {"pose", "config_path", "communication", "task", "agent_ip", "control_mode"}  # of a robot of 2023
+OLDER_LAW: Final = {"gain": 0.25, "upperLimit": 0.08, "lowerLimit": -0.08}
 WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # of a Webots world
 
 
-@dataclass(frozen=True)
-class Relation:
+class Relation(NamedTuple):
     """Link of a robot to another, or to a place: origin, line or a surface."""
 
     name: str
@@ -60,119 +58,139 @@ class Relation:
     centre: Pose | None = None  # [m] of an origin that stands elsewhere
 
 
-@dataclass(frozen=True)
-class Task:
-    """Part of a robot in the formation."""
-
-    kind: str  # distance or pose
-    relations: tuple[Relation, ...]
-    law: str  # gradient, pid, or another of theirs
-    gain: float  # per decision
-    clamp: float  # largest step of a decision [m]
-    period: float  # [s]
-    update: Threshold
-    role: str
-
-
-@dataclass(frozen=True)
-class Robot:
-    """Robot of theirs."""
-
-    name: str
-    kind: str  # as zenpark calls it
-    place: str  # physical, virtual or digital_twin
-    pose: Pose | None  # x, y [m] and z [m]; on wheels the yaw [rad] instead of z; None: not in the file
-    uri: str  # of a Crazyflie
-    host: str  # of a robot on Wi-Fi, with its port if there is one
-    external: bool  # position measured from outside
-    communication: Threshold
-    pose_s: float  # period of its pose [s]
-    gated: bool  # its position controller acts on events
-    task: Task | None  # None without one, or if it is switched off
-    idle: int  # relations of a task that is switched off
-
-
-@dataclass(frozen=True)
-class Park:
-    """Experiment of theirs."""
-
-    mode: str  # physical, virtual or hybrid
-    robots: tuple[Robot, ...]
-    central: bool = False  # decided by a central controller
-    recent: bool = False  # for the drivers of 2024 on, which read `mars_data`
-
-    @property
-    def tasks(self) -> list[tuple[Robot, Task]]:
-        return [(robot, robot.task) for robot in self.robots if robot.task is not None]
-
-
 class _Threshold(Struct, frozen=True):
     type: str = "Constant"
-    co: Number | None = None
-    threshold: Number | None = None  # for `co`, in 2023
+    co: Number = 0.01
     ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
 
-class _Communication(Struct, frozen=True):
-    type: Literal["Continuous", "EventBased", "EvenBased"] = "Continuous"  # both are written
+class Trigger(Struct, frozen=True):
+    """Time at which something is done: always, or on events."""
+
+    protocol: When = "Continuous"
     threshold: _Threshold = _Threshold()
 
+    @property
+    def event(self) -> tuple[float, float] | None:
+        """c0 and a of a threshold c0 + a·|·|; None if no event is waited for."""
+        if self.protocol == "Continuous":
+            return None
+        if self.threshold.co <= 0.0:
+            raise ValueError("a threshold of 0 or less is crossed always: give metres, such as 0.01")
+        return self.threshold.co, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
 
-class _Law(Struct, frozen=True):
-    protocol: Literal["Continuous", "EventBased"] = "Continuous"
-    threshold: _Threshold = _Threshold()
+
+class _Communication(Trigger, frozen=True):
+    protocol: When = msgspec.field(default="Continuous", name="type")
+
+
+class _Law(Trigger, frozen=True, rename="camel"):
     type: str = "gradient"
-    period: Positive = 0.1
+    period: Positive | None = None  # [s]
     gain: Positive = 0.1
-    upperLimit: Number = 0.1  # noqa: N815 - theirs
-    lowerLimit: Number = -0.1  # noqa: N815
+    upper_limit: Number = 0.1
+    lower_limit: Number = -0.1
 
 
-class _Task(Struct, frozen=True):
-    type: Literal["distance", "pose", "relative_pose"] = "distance"
+class Task(Struct, frozen=True, rename={"period_ms": "T"}):
+    """Part of a robot in the formation; of one that is switched off the relations are only counted."""
+
+    enable: bool = True
+    type: str = "distance"
     relationship: str = ""
     role: str = "consensus"
     controller: _Law = _Law()
-    T: Positive = 100.0
+    period_ms: Positive = 100.0
 
+    def __post_init__(self) -> None:
+        if not self.enable:
+            return
+        if self.type not in TASKS:
+            raise ValueError(f"the type '{self.type}' is unknown: write {', '.join(TASKS)}")
+        if self.step[1] <= 0.0:
+            raise ValueError("no step lies between lowerLimit and upperLimit: give such as -0.1 and 0.1")
+        _ = self.relations, self.controller.event  # what is wrong in them has the path of the task
 
-class _Switch(Struct, frozen=True):
-    enable: bool = False
+    @property
+    def written(self) -> list[str]:
+        """The relations, as they are written."""
+        parts = [each.strip() for each in self.relationship.split(",")]
+        return [part for part in parts if part and part.lower() not in NOTHING]
 
+    @property
+    def kind(self) -> str:
+        return "distance" if self.type == "distance" else "pose"
 
-class _TaskHead(Struct, frozen=True):
-    """Head of a task: all that is read of a task that is switched off."""
+    @property
+    def relations(self) -> list[Relation]:
+        return [_relation(part, self.kind) for part in self.written]
 
-    enable: bool = True
-    relationship: str = ""
+    @property
+    def law(self) -> str:
+        """Law of the task: gradient, pid, or another of theirs."""
+        return self.controller.type.partition("_")[0]
+
+    @property
+    def period(self) -> float:
+        """Time between decisions [s]."""
+        return self.controller.period or 1e-3 * self.period_ms
+
+    @property
+    def step(self) -> tuple[float, float]:
+        """Gain, and largest step [m], of a decision: their laws named _v give a velocity, the others a step."""
+        law = self.controller
+        scale = self.period if law.type.partition("_")[2] == "v" else 1.0
+        return scale * law.gain, scale * min(law.upper_limit, -law.lower_limit)
 
 
 class _Timed(Struct, frozen=True):
-    T: Positive = 20.0
+    T: Positive = 20.0  # [ms]
 
 
-class _Protocol(Struct, frozen=True):
-    protocol: Literal["Continuous", "EventBased"] = "Continuous"
+class Robot(Struct, frozen=True):
+    """Robot of theirs."""
 
-
-class _Robot(Struct, frozen=True):
-    """Settings of a robot, those of all formats."""
-
-    name: str = ""
-    id: str = ""
-    type: Literal["physical", "virtual", "digital_twin"] = "virtual"
-    pose: str | list[Number] | dict[str, Number] | None = None
-    uri: str = ""
+    name: str
+    type: Literal["physical", "virtual", "digital_twin"]
+    pose: Annotated[list[Number], Meta(min_length=2, max_length=3)] | dict[str, Number] | None
+    uri: str = ""  # of a Crazyflie
     agent_ip: str = ""
     ip: str = ""
     port_number: str | int = ""
     positioning: Literal["Intern", "Extern", "MoCap"] = "Intern"
-    communication: _Communication | Literal["Continuous", "EventBased", "EvenBased"] = _Communication()
+    communication: _Communication = _Communication()
     local_pose: _Timed = _Timed()
-    controller: _Protocol = _Protocol()
+    controller: Trigger = Trigger()  # of the position
     controller_type: str = ""
-    init_theta: Number = 0.0
-    config_path: str = ""
+    init_theta: Number = 0.0  # [rad] of Kheperas of 2023, whose pose has no third number
+    task: Task = Task(enable=False)
+    config_path: str = ""  # in an index
+
+    def __post_init__(self) -> None:
+        if not self.kind:
+            known = ", ".join(KINDS)
+            raise ValueError(
+                f"what kind of robot is '{self.name}'? use letters, digits and _, and in it one of: {known}"
+            )
+        _ = self.communication.event
+
+    @property
+    def kind(self) -> str:
+        return kind_of(self.name)
+
+    @property
+    def start(self) -> Pose | None:
+        """x, y [m], and z [m] or, on wheels, the yaw [rad]; None: not in the file."""
+        if self.pose is None:
+            return None
+        x, y, z = (*(self.pose.values() if isinstance(self.pose, dict) else self.pose), 0.0, 0.0)[:3]
+        return x, y, z or self.init_theta
+
+    @property
+    def host(self) -> str:
+        """Address of a robot on Wi-Fi, with its port if there is one."""
+        host = self.agent_ip or self.ip
+        return f"{host}:{self.port_number}" if host and self.port_number else host
 
 
 class _Operation(Struct, frozen=True):
@@ -181,36 +199,40 @@ class _Operation(Struct, frozen=True):
     world: str = ""
 
 
-class _Kind(Struct, frozen=True):
+class _Section(Struct, frozen=True):
     type: str = "formation"  # of the experience
     mode: str = "distributed"  # of the architecture
+    enable: bool = False
+
+
+class _Sections(Struct, frozen=True, rename="pascal"):
+    operation: _Operation = _Operation()
+    experience: _Section = _Section()
+    architecture: _Section = _Section()
+    robots: dict[str, Any] = {}
+    other: dict[str, Any] = {}
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A value of a YAML file, with the file and the path of its key."""
+class Park:
+    """Experiment of theirs."""
+
+    mode: str  # physical, virtual, hybrid
+    robots: list[Robot]
+    central: bool  # decided by a central controller
+    recent: bool  # for the drivers of 2024 on, which read `mars_data`
+
+    @property
+    def tasks(self) -> list[tuple[Robot, Task]]:
+        return [(robot, robot.task) for robot in self.robots if robot.task.enable]
+
+
+class Entry(NamedTuple):
+    """Value of a YAML file, with the file and the path of its key."""
 
     file: str
     key: str
     value: Any
-
-    @property
-    def name(self) -> str:
-        return self.key.rpartition(".")[2]
-
-    def has(self, key: str) -> bool:
-        return isinstance(self.value, dict) and key in self.value
-
-    def get(self, key: str) -> Entry:
-        """The value of a key; an empty table if there is none."""
-        path = f"{self.key}.{key}" if self.key else key
-        return Entry(self.file, path, self.value[key] if self.has(key) else {})
-
-    def tables(self) -> list[Entry]:
-        return [self.get(key) for key, value in self.typed(dict[str, Any]).items() if isinstance(value, dict)]
-
-    def refused(self, message: str, hint: str = "") -> DocumentError:
-        return refusal(self.file, f"{self.key or 'the file'}: {message}", hint)
 
     def typed(self, kind: type[T]) -> T:
         """The value as `kind`; numbers and truth values may stand in quotes.
@@ -222,11 +244,19 @@ class Entry:
             return msgspec.convert(self.value, kind, strict=False)
         except msgspec.ValidationError as error:
             message, _, below = str(error).partition(" - at `$")
-            raise replace(self, key=(self.key + below.rstrip("`")).strip(".")).refused(message) from None
+            key = (self.key + below.rstrip("`")).strip(".")
+            raise refusal(self.file, f"{key or 'the file'}: {message}") from None
+
+    def tables(self) -> list[Entry]:
+        """The tables in it."""
+        path = f"{self.key}." if self.key else ""
+        found = self.value.items()
+        return [Entry(self.file, path + key, value) for key, value in found if isinstance(value, dict)]
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
-    """PyYAML's safe loader, which refuses a key that stands twice, and drops keys that hold nothing; keys are text."""
+    """PyYAML's safe loader: a key that stands twice is refused, one that holds nothing dropped, the numbers of a pose
+    are listed, and keys are text."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
         keys = set()
@@ -236,8 +266,18 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
                     None, None, f"'{key.value}' stands twice in its table", key.start_mark
                 )
             keys.add(str(key.value))
-        made = super().construct_mapping(node, deep)
-        return {str(key): value for key, value in made.items() if value is not None}
+        made = {str(key): value for key, value in super().construct_mapping(node, deep).items() if value is not None}
+        if isinstance(pose := made.get("pose"), str):
+            made["pose"] = re.findall(r"[^,\s]+", pose)
+        return made
+
+
+def text_of(file: str, hint: str) -> str:
+    """The text of a file that the user named; raises DocumentError, with the hint if there is none."""
+    try:
+        return content(Path(file), file)
+    except FileNotFoundError:
+        raise refusal(file, "there is no such file", hint) from None
 
 
 def load(file: str, text: str) -> Entry:
@@ -269,207 +309,116 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         poses: Of robots by name, from elsewhere; they go before those of the file.
 
     Raises:
-        DocumentError: With all errors in it and in the files that it names, by the paths of the keys.
+        DocumentError: With the errors of all robots, by the paths of the keys, also in the files that it names.
     """
     root = load(file, text)
-    older = [] if root.has("Robots") else [each for each in root.tables() if OLDER & each.value.keys()]
-    park = _older(file, older, notes) if older else _sections(root, notes)
-    return replace(park, robots=tuple(replace(each, pose=poses.get(each.name, each.pose)) for each in park.robots))
-
-
-def _sections(root: Entry, notes: list[str]) -> Park:
-    """The format since December 2023."""
-    hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
-    if not root.has("Robots"):
-        raise root.refused("'Robots' is missing", hint)
-    given, entries = root.get("Operation").typed(_Operation), root.get("Robots").tables()
+    given, entries = root.typed(_Sections), _entries(root)
     if not entries:
-        raise root.get("Robots").refused("has none", hint)
-    if given.tool and given.mode != "physical":
-        tool = f"{given.tool} {given.world}".strip()
-        notes.append(f"Operation: the simulator and its world ({tool}); twins are zenpark's own, in an empty arena")
-    if (kind := root.get("Experience").typed(_Kind).type) != "formation":
-        notes.append(f"Experience: type {kind}; only formations are known")
-    mode = root.get("Architecture").typed(_Kind).mode
-    central = mode.lower() == CENTRAL
-    if central and mode != CENTRAL:
-        notes.append(f"Architecture: {mode}; their launcher starts a centre for '{CENTRAL}' alone, and for this"
-                     " spelling no robot moves there; taken as centralized")  # fmt: skip
-    elif not central and mode != "distributed":
-        notes.append(f"Architecture: {mode}; every robot decides for itself here")
-    tools = [root.get(name) for name in ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")]
-    on = [each.key for each in (*tools, *root.get("Other").tables()) if each.typed(_Switch).enable]
-    if "Other.Reconfiguration" in on:
-        on.remove("Other.Reconfiguration")
-        notes.append("Other.Reconfiguration: the shape changes in flight there, by a program of theirs; the first"
-                     " shape is imported, and [[formation.changes]] can tell the others")  # fmt: skip
-    if on:
-        notes.append(f"{', '.join(on)}: zenpark records, watches and reports by itself")
-    robots = _robots(entries, lambda entry: _robot(entry, entry, notes, central=central))
-    return Park(given.mode, robots, central, any(entry.has("mars_data") for entry in entries))
-
-
-def _older(file: str, entries: Sequence[Entry], notes: list[str]) -> Park:
-    """The flat files and the indices of 2023."""
-    notes.append(
-        "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
-    )
-    settings = {entry.key: _settings(entry, Path(file).parent) for entry in entries}
-    # entries that only let the drones' driver publish where another robot of the file is
-    marks = [
-        key
-        for key, own in settings.items()
-        if own.typed(_Robot).name in settings.keys() - {key} and not own.get("task").typed(_TaskHead).enable
-    ]
-    if marks:
-        notes.append(f"{', '.join(marks)}: the marker of a robot that stands in the file already")
-    entries = [entry for entry in entries if entry.key not in marks]
-    robots = _robots(entries, lambda entry: _robot(entry, settings[entry.key], notes, older=True), alone=True)
-    addresses = [f"{robot.name} {robot.host}" for robot in robots if robot.host]
-    if addresses and not any(entry.has("config_path") for entry in entries):
-        notes.append(
-            "the file does not say which robots are real: all are twins here; addresses in it: " + ", ".join(addresses)
-        )
-    kinds = {robot.place for robot in robots}
-    return Park(kinds.pop() if len(kinds) == 1 else "hybrid", robots)
-
-
-def _settings(entry: Entry, folder: Path) -> Entry:
-    """The settings of a robot: its entry, or what the file that an index names for it holds."""
-    name = entry.typed(_Robot).config_path
-    if not name:
-        return entry
-    file = folder / name
-    try:
-        tables = load(str(file), content(file, str(file))).tables()
-    except OSError:
-        hint = "put the files of its robots beside the index"
-        raise entry.refused(f"there is no file '{name}' beside this one", hint) from None
-    if not tables:
-        raise refusal(str(file), "has no robot", f"write its settings under '{entry.name}:'")
-    return next((each for each in tables if each.name == entry.name), tables[0])
-
-
-def _robots(entries: Sequence[Entry], made: Callable[[Entry], Robot], *, alone: bool = False) -> tuple[Robot, ...]:
-    """A robot from each entry; the problems of all of them at once.
-
-    Args:
-        alone: A file can hold one robot of an experiment, which says nothing without the others.
-    """
-    robots, problems = list[Robot](), []
+        hint = "an experiment of Robotic Park lists them as Robot01, Robot02, ..."
+        raise refusal(file, "'Robots' is missing or has none", hint)
+    central = given.architecture.mode.lower() == CENTRAL
+    if central:  # their central controller reads the relations of all robots, whatever `enable` says
+        for task in [each for entry in entries for each in entry.tables() if each.key.endswith(".task")]:
+            task.value["enable"] = bool(task.value.get("relationship")) or task.value.get("enable", True)
+    robots, problems = dict[str, Robot](), list[Problem]()
     for entry in entries:
         try:
-            robots.append(made(entry))
+            robots[entry.key] = (entry if given.robots else _settings(entry)).typed(Robot)
         except DocumentError as error:
             problems += error.problems
     if problems:
         raise DocumentError(problems)
-    names = [robot.name for robot in robots]
-    for entry, robot in zip(entries, robots, strict=True):
+    if given.robots:
+        notes += _notes_on_sections(root, given)
+    else:  # entries that only let the drones' driver publish where another robot of the file is
+        marks = {key for key, robot in robots.items() if robot.name in robots.keys() - {key} and not robot.task.enable}
+        robots = {key: robot for key, robot in robots.items() if key not in marks}
+        notes += _notes_on_older(entries, robots, marks)
+    _check_names(file, robots)
+    mode = given.operation.mode if given.robots else " and ".join(sorted({robot.type for robot in robots.values()}))
+    placed = [
+        msgspec.structs.replace(robot, pose=list(poses[robot.name]), init_theta=0.0) if robot.name in poses else robot
+        for robot in robots.values()
+    ]
+    return Park(mode, placed, central, any("mars_data" in entry.value for entry in entries))
+
+
+def _entries(root: Entry) -> list[Entry]:
+    """The robots of a file; those of 2023 get what they need not say."""
+    if "Robots" in root.value:
+        return Entry(root.file, "Robots", root.typed(_Sections).robots).tables()
+    return [
+        each._replace(value={"name": each.value.get("id", each.key), "type": "virtual", "pose": None} | each.value)
+        for each in root.tables()
+        if OLDER & each.value.keys()
+    ]
+
+
+def _settings(listed: Entry) -> Entry:
+    """A robot of 2023 as in sections, with what the file holds that an index names for it."""
+    own = listed
+    if "config_path" in listed.value:
+        file = str(Path(listed.file).parent / listed.typed(Robot).config_path)
+        tables = load(file, text_of(file, "put the files of the robots beside the index")).tables()
+        if not tables:
+            raise refusal(file, "has no robot", f"write its settings under '{listed.key}:'")
+        own = next((each for each in tables if each.key == listed.key), tables[0])
+    table = own.value | listed.value
+    if isinstance(table.get("task"), dict):
+        table["task"] = table["task"] | {"controller": OLDER_LAW}
+    if isinstance(table.get("communication"), str):
+        table["communication"] = {"type": table["communication"]}
+    return own._replace(value=table)
+
+
+def _notes_on_sections(root: Entry, given: _Sections) -> Iterator[str]:
+    operation, mode = given.operation, given.architecture.mode
+    if operation.tool and operation.mode != "physical":
+        tool = f"{operation.tool} {operation.world}".strip()
+        yield f"Operation: the simulator and its world ({tool}); twins are zenpark's own, in an empty arena"
+    if given.experience.type != "formation":
+        yield f"Experience: type {given.experience.type}; only formations are known"
+    if mode.lower() == CENTRAL != mode:
+        yield f"Architecture: {mode}; taken as {CENTRAL}, though their launcher starts a centre for that spelling alone"
+    elif mode not in (CENTRAL, "distributed"):
+        yield f"Architecture: {mode}; every robot decides for itself here"
+    tools = [each for each in root.tables() if each.key in TOOLS] + Entry(root.file, "Other", given.other).tables()
+    on = [each.key for each in tools if each.typed(_Section).enable]
+    if "Other.Reconfiguration" in on:
+        yield "Other.Reconfiguration: the first shape is imported; the others can stand in [[formation.changes]]"
+    if others := [name for name in on if name != "Other.Reconfiguration"]:
+        yield f"{', '.join(others)}: zenpark records, watches and reports by itself"
+
+
+def _notes_on_older(entries: list[Entry], robots: Mapping[str, Robot], marks: set[str]) -> Iterator[str]:
+    yield "law: gain and limit are not in files of 2023; 0.25 and 0.08 m per decision, as in the programs of that time"
+    if marks:
+        yield f"{', '.join(sorted(marks))}: the marker of a robot that stands in the file already"
+    addresses = ", ".join(f"{robot.name} {robot.host}" for robot in robots.values() if robot.host)
+    if addresses and not any("config_path" in entry.value for entry in entries):
+        yield f"the file does not say which robots are real: all are twins here; addresses in it: {addresses}"
+
+
+def _check_names(file: str, robots: Mapping[str, Robot]) -> None:
+    """Refuse two robots of one name, and relations to no robot."""
+    names = [robot.name for robot in robots.values()]
+    for key, robot in robots.items():
         if names.count(robot.name) > 1:
-            raise entry.refused(f"two robots are called '{robot.name}'", "rename one of them")
-        for relation in robot.task.relations if robot.task else ():
-            if relation.name == robot.name:
-                raise entry.refused(f"'{robot.name}' cannot keep a distance to itself", "name another robot")
-            if alone and len(robots) == 1 and relation.name not in PLACES:
-                hint = "import the file that lists the robots of the experiment: an index names this one as config_path"
-                raise entry.refused(f"'{robot.name}' is one robot of an experiment", hint)
-            if relation.name not in (*names, *PLACES):
-                hint = did_you_mean(relation.name, [*names, "origin"])
-                raise entry.refused(f"no robot is called '{relation.name}'", hint)
-    return tuple(robots)
-
-
-def _robot(entry: Entry, own: Entry, notes: list[str], *, central: bool = False, older: bool = False) -> Robot:
-    """A robot; an index of 2023 keeps what it lists (`entry`) apart from the robot's own settings."""
-    for key in () if older else ("name", "type", "pose"):
-        if not entry.has(key):
-            raise entry.refused(f"'{key}' is missing", "such as name: dron01, type: virtual, pose: 1.2, -0.5, 0.7")
-    listed, given, task = entry.typed(_Robot), own.typed(_Robot), own.get("task")
-    name = listed.name or listed.id or entry.name
-    kind = kind_of(name)
-    if not kind:
-        raise entry.refused(f"what kind of robot is '{name}'?", f"a name holds one of: {', '.join(KINDS)}")
-    if not NAME.fullmatch(name):
-        hint = "use letters, digits and _, beginning with a letter"
-        raise entry.refused(f"{name!r} cannot be the name of a robot", hint)
-    head = task.typed(_TaskHead)
-    relations = _parts(head.relationship)
-    # their central controller reads the relations of all robots, whatever `enable` says
-    on = own.has("task") and (head.enable or (central and bool(relations)))
-    if on and not older and not (task.has("type") and task.has("relationship")):
-        raise task.refused("type or relationship is missing", f"write distance or pose; {FORM}")
-    pose = listed.pose
-    if isinstance(pose, dict):
-        pose = [pose.get("x", 0.0), pose.get("y", 0.0)]
-    place = None if pose is None else pose_of(entry.get("pose"), pose)
-    host, speaks = given.agent_ip or given.ip, given.communication
-    if not isinstance(speaks, _Communication):
-        speaks = _Communication(speaks)  # a word, in 2023
-    return Robot(
-        name=name,
-        kind=kind,
-        place=listed.type,
-        pose=place and (*place[:2], place[2] or given.init_theta),  # Kheperas of 2023 have their yaw apart
-        uri=listed.uri,
-        host=f"{host}:{given.port_number}" if host and given.port_number else host,
-        external=given.positioning != "Intern",
-        communication=_threshold(own.get("communication"), speaks.threshold, notes, event=speaks.type != "Continuous"),
-        pose_s=1e-3 * given.local_pose.T,
-        gated=given.controller.protocol == "EventBased" or "EventBased" in given.controller_type,
-        task=_task(task, notes, older=older) if on else None,
-        idle=0 if on else len(relations),
-    )
+            raise refusal(file, f"{key}: two robots are called '{robot.name}'", "rename one of them")
+        others = [*(name for name in names if name != robot.name), *PLACES]
+        for relation in robot.task.relations if robot.task.enable else ():
+            if relation.name not in others:
+                hint = did_you_mean(relation.name, others) if names[1:] else "import the file that lists all robots"
+                raise refusal(file, f"{key}: no other robot is called '{relation.name}'", hint)
 
 
 def kind_of(name: str) -> str:
-    """Kind of a robot in zenpark by its name; empty for a name without a known kind."""
-    return next((kind for part, kind in KINDS.items() if part in name.lower()), "")
+    """Kind of a robot in zenpark by its name; empty for a name without a known kind, or that zenpark does not allow."""
+    return next((kind for part, kind in KINDS.items() if part in name.lower() and NAME.fullmatch(name)), "")
 
 
-def pose_of(entry: Entry, pose: str | list[float]) -> Pose:
-    """x, y and z or yaw of a text or a list; 0 where left out."""
-    parts = [part for part in re.split(r"[,\s]+", pose) if part] if isinstance(pose, str) else pose
-    values = replace(entry, value=parts).typed(list[Number])
-    if len(values) not in (2, 3):
-        raise entry.refused(f"has {len(values)} numbers", "give x, y and, if wanted, z or the yaw")
-    x, y, z = (*values, 0.0)[:3]
-    return x, y, z
-
-
-def _threshold(entry: Entry, given: _Threshold, notes: list[str], *, event: bool) -> Threshold:
-    if not event:
-        return None
-    constant = next((each for each in (given.co, given.threshold) if each is not None), 0.01)
-    if constant <= 0.0:
-        raise entry.refused("a threshold of 0 or less is crossed always", "give metres, such as 0.01")
-    if given.type != "Constant":
-        what = entry.name.replace("task", "task.controller")
-        notes.append(f"{what}.threshold.type: {given.type}; taken as a constant one with what ai adds")
-    return constant, 0.0 if isinstance(given.ai, str) else given.ai
-
-
-def _task(entry: Entry, notes: list[str], *, older: bool) -> Task:
-    given, law = entry.typed(_Task), entry.typed(_Task).controller
-    kind = "distance" if given.type == "distance" else "pose"
-    relations = tuple(_relation(entry, part, kind) for part in _parts(given.relationship))
-    if older:
-        return Task(kind, relations, "gradient", OLDER_GAIN, OLDER_CLAMP, 1e-3 * given.T, None, given.role)
-    name, _, signal = law.type.partition("_")
-    step = law.period if signal == "v" else 1.0  # their laws named _v give a velocity, the others a step
-    clamp = min(law.upperLimit, -law.lowerLimit)
-    if clamp <= 0.0:
-        raise entry.refused("no step lies between lowerLimit and upperLimit", "such as -0.1 and 0.1")
-    update = _threshold(entry, law.threshold, notes, event=law.protocol == "EventBased")
-    return Task(kind, relations, name, step * law.gain, step * clamp, law.period, update, given.role)
-
-
-def _parts(relationship: str) -> list[str]:
-    """The relations of a task, as they are written."""
-    return [part for each in relationship.split(",") if (part := each.strip()) and part.lower() not in NOTHING]
-
-
-def _relation(entry: Entry, part: str, kind: str) -> Relation:
+def _relation(part: str, kind: str) -> Relation:
+    """A relation as it is written, in a task by distance or pose; raises ValueError."""
     name, *rest = part.split("_")
     try:
         if name in CENTRES and len(rest) == 1 and re.fullmatch(r"[\d.]+(-[\d.]+){3}", rest[0]):
@@ -483,9 +432,9 @@ def _relation(entry: Entry, part: str, kind: str) -> Relation:
     name = "origin" if name in CENTRES else "line" if name.startswith("line") else name
     counts = {"origin": (1, 3), "line": (6,)}.get(name, (3,) if kind == "pose" else (1,))
     if len(values) not in counts or not all(map(math.isfinite, values)):
-        raise entry.refused(f"'{part}' is no relation of a {kind} task", FORM)
+        raise ValueError(f"'{part}' is no relation of a {kind} task: write name_d, name_x_y_z or origin_R")
     if len(values) == 1 and values[0] <= 0.0:
-        raise entry.refused(f"'{part}' asks for a distance that is not positive", "give metres, such as 0.8")
+        raise ValueError(f"'{part}' asks for a distance that is not positive: give metres, such as 0.8")
     return Relation(name, values)
 
 
@@ -496,59 +445,36 @@ def starts_from(file: str) -> dict[str, Pose]:
         DocumentError: If the file cannot be read, or tells no start.
     """
     hint = "name an index of robots (.yaml) or a Webots world (.wbt)"
-    try:
-        text = content(Path(file), file)
-    except FileNotFoundError:
-        raise refusal(file, "there is no such file", hint) from None
-    found = (_world if Path(file).suffix.lower() == ".wbt" else _index)(file, text)
+    text = text_of(file, hint)
+    if Path(file).suffix.lower() == ".wbt":
+        found = dict(_world(file, text))
+    else:
+        placed = [
+            entry._replace(value={key: entry.value[key] for key in ("name", "type", "pose") if key in entry.value})
+            for entry in _entries(load(file, text))
+        ]
+        found = {robot.name: robot.start for entry in placed if (robot := entry.typed(Robot)).start}
     if not found:
         raise refusal(file, "tells the start of no robot", hint)
     return found
 
 
-def _index(file: str, text: str) -> dict[str, Pose]:
-    root = load(file, text)
-    listed = (root.get("Robots") if root.has("Robots") else root).tables()
-    return {
-        str(each.value.get("name", each.name)): pose_of(each.get("pose"), each.value["pose"])
-        for each in listed
-        if each.has("pose") and not isinstance(each.value["pose"], dict)
-    }
-
-
-def _world(file: str, text: str) -> dict[str, Pose]:
-    """Starts in a Webots world: `name` and `translation` of its nodes; the yaw where `rotation` is about z."""
-    found: dict[str, Pose] = {}
-    words = [word for word in WORD.findall(text) if not word.startswith("#")]
-    depth, name, place, yaw = 0, "", [0.0, 0.0, 0.0], 0.0
-    for at, word in enumerate(words):
-        if word in "{[":
-            depth += 1
-            if depth == 1:
-                name = words[at - 2] if at >= 3 and words[at - 3] == "DEF" else ""
-                place, yaw = [0.0, 0.0, 0.0], 0.0
-        elif word in "}]":
-            depth -= 1
-            if depth == 0 and name:
-                flies = kind_of(name) in ("crazyflie", "tello")
-                found[name] = (place[0], place[1], place[2] if flies else yaw)
-        elif depth == 1 and word == "name":
-            name = words[at + 1].strip('"') if at + 1 < len(words) else ""
-        elif depth == 1 and word in ("translation", "rotation"):
-            values = _numbers(file, words[at + 1 : at + (4 if word == "translation" else 5)])
-            if word == "translation":
-                place = values
-            elif abs(values[2]) > 1.0 - 1e-3:
-                yaw = math.copysign(1.0, values[2]) * values[3]
-    return found
-
-
-def _numbers(file: str, words: list[str]) -> list[float]:
-    try:
-        found = [float(word) for word in words]
-    except ValueError:
-        found = []
-    if len(found) < 3 or not all(map(math.isfinite, found)):
-        hint = "name another file with --poses"
-        raise refusal(file, f"cannot be read near '{' '.join(words)}'", hint)
-    return [*found, 0.0][:4]
+def _world(file: str, text: str) -> Iterator[tuple[str, Pose]]:
+    """Robots in a Webots world: `name` and `translation` of its nodes; the yaw where `rotation` is about z."""
+    node, depth = list[str](), 0
+    for word in WORD.findall(text):
+        depth -= word in "}]"
+        if depth < 2 and not word.startswith("#"):
+            node.append(word)  # of the node itself, not of those in it
+        depth += word in "{["
+        if depth == 0 and word == "}":
+            behind = {each: node[at + 1 : at + 5] for at, each in enumerate(node)}
+            node = []
+            name = "".join(behind.get("name", behind.get("DEF", []))[:1]).strip('"')
+            if kind_of(name):
+                place = Entry(file, f"{name}.translation", behind.get("translation", [0.0, 0.0, 0.0])[:3])
+                turn = Entry(file, f"{name}.rotation", behind.get("rotation", [0.0, 0.0, 1.0, 0.0]))
+                x, y, z = place.typed(tuple[Number, Number, Number])
+                _, _, axis, angle = turn.typed(tuple[Number, Number, Number, Number])
+                yaw = math.copysign(1.0, axis) * angle if abs(axis) > 1.0 - 1e-3 else 0.0
+                yield name, (x, y, z if BODIES[kind_of(name)].flies else yaw)

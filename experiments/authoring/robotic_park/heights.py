@@ -141,7 +141,7 @@ def origin_of(park: Park, robot: Robot, relation: Relation) -> Pose | None:
     The file may give one. If not, the driver of real Crazyflies has one of its own (`REAL_ORIGIN`); those of Kheperas
     and in Webots, and the central controller, take that of the arena.
     """
-    own = robot.kind == "crazyflie" and robot.place != "virtual" and not park.central
+    own = robot.kind == "crazyflie" and robot.type != "virtual" and not park.central
     of_driver = REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
     return relation.centre or of_driver
 
@@ -152,36 +152,31 @@ def _starts(park: Park, notes: list[str]) -> Array:
     angle = 2.0 * np.pi * np.arange(count) / max(count, 1)
     radius = max(SPACING, count * SPACING / (2.0 * np.pi))
     ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)]).round(2)
-    unplaced = [robot.name for robot in park.robots if robot.pose is None]
+    unplaced = [robot.name for robot in park.robots if robot.start is None]
     if unplaced:
         notes.append(
             f"starts: the file has none for {', '.join(unplaced)}; MADE UP here, on a ring; name a file that has them"
             " with --poses (an index of robots or a Webots world)"
         )
-    return np.array([ring[row] if robot.pose is None else robot.pose for row, robot in enumerate(park.robots)])
+    return np.array([ring[row] if robot.start is None else robot.start for row, robot in enumerate(park.robots)])
 
 
 def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
     """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
-    pairs: list[tuple[int, int, float, Pose]] = []
-    anchored: list[tuple[int, Pose, float]] = []
-    for robot, task in park.tasks:
-        i = row[robot.name]
-        for relation in task.relations:
-            if relation.name in row:
-                j = row[relation.name]
-                x, y, z = (*relation.values, 0.0, 0.0)[:3]
-                distance = x if task.kind == "distance" else np.nan
-                pairs.append((i, j, distance, (x, y, z if flies[i] or flies[j] else start[i, 2] - start[j, 2])))
-            elif relation.name == "origin" and len(relation.values) == 1:
-                anchored.append((i, origin_of(park, robot, relation) or (0.0, 0.0, 0.0), relation.values[0]))
-    ends = np.array([pair[:2] for pair in pairs], dtype=np.intp).reshape(-1, 2)
-    lengths, vectors = np.array([pair[2] for pair in pairs]), np.array([pair[3] for pair in pairs]).reshape(-1, 3)
-    wants = np.where(np.isnan(lengths), BY_RELATIVE, BY_DISTANCE)
-    blank, one = np.full_like(vectors, np.nan), np.ones(len(anchored))
-    asked = Links(ends[:, 0], ends[:, 1], lengths, np.ones(len(ends)), vectors, blank, wants)
-    if not anchored:
-        return asked, None
-    rows, points, radii = (np.array(each) for each in zip(*anchored, strict=True))
-    return asked, Anchors(rows, points, np.zeros_like(points), one, 0.0 * one, radii, one)
+    every = [(robot, task.kind, relation) for robot, task in park.tasks for relation in task.relations]
+    asked = [each for each in every if each[2].name in row]
+    i = np.array([row[robot.name] for robot, _, _ in asked], dtype=np.intp)
+    j = np.array([row[relation.name] for _, _, relation in asked], dtype=np.intp)
+    value = np.array([(*relation.values, 0.0, 0.0)[:3] for _, _, relation in asked]).reshape(-1, 3)
+    value[:, 2] = np.where(flies[i] | flies[j], value[:, 2], start[i, 2] - start[j, 2])
+    by_pose = np.array([kind == "pose" for _, kind, _ in asked], dtype=bool)
+    wants, distance = np.where(by_pose, BY_RELATIVE, BY_DISTANCE), np.where(by_pose, np.nan, value[:, 0])
+    links = Links(i, j, distance, np.ones(len(i)), value, np.full_like(value, np.nan), wants)
+    rings = [(robot, each) for robot, _, each in every if each.name == "origin" and len(each.values) == 1]
+    if not rings:
+        return links, None
+    points = np.array([origin_of(park, robot, each) or (0.0, 0.0, 0.0) for robot, each in rings])
+    rows, radii = np.array([row[robot.name] for robot, _ in rings]), np.array([each.values[0] for _, each in rings])
+    one = np.ones(len(rows))
+    return links, Anchors(rows, points, np.zeros_like(points), one, 0.0 * one, radii, one)
