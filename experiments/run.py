@@ -121,10 +121,7 @@ class Run:
     def to_frame(self) -> Any:  # noqa: ANN401 - of pandas or of polars
         """Metrics as a data frame of pandas, or of polars where only that is installed: a row per case and robot.
 
-        Columns are those of `metrics.csv`; an unknown number is NaN.
-
-        Raises:
-            ImportError: If neither is installed.
+        Columns are those of `metrics.csv`; an unknown number is NaN. Raises ImportError if neither is installed.
         """
         rows = list(metrics_files.rows(list(self.metrics.values())))
         columns = {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
@@ -222,8 +219,7 @@ def _pass_progress(progress: Progress, case: str, duration_s: float, elapsed: fl
 def reopen(folder: str | Path) -> Run:
     """The run in a folder, read back from its recordings; without traces if no case had begun.
 
-    Raises:
-        RecordingError: If there is no recording, or one cannot be read.
+    Raises RecordingError if there is no recording, or one cannot be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -239,8 +235,7 @@ def reopen(folder: str | Path) -> Run:
 def reopen_seeds(folder: str | Path) -> list[Run]:
     """As `reopen`, and of seeds that were not recorded the metrics that the folder keeps, as runs without traces.
 
-    Raises:
-        RecordingError: If there is no recording, one cannot be read, or the metrics of another seed cannot.
+    Raises RecordingError if there is no recording, one cannot be read, or the metrics of another seed cannot.
     """
     recorded = reopen(folder)
     file = Path(folder) / METRICS

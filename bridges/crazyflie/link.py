@@ -58,8 +58,7 @@ class SilentError(LinkError):
 def prepare(addresses: Sequence[str]) -> None:
     """Load cflib and its drivers, once per process, and plug in the software radios that the addresses name.
 
-    Raises:
-        BodyError: If cflib is not installed, or one radio is to be in several simulated airs.
+    Raises BodyError if cflib is not installed, or one radio is to be in several simulated airs.
     """
     try:
         import cflib.crtp.radiodriver  # noqa: PLC0415 - an optional extra, under another licence
@@ -240,8 +239,7 @@ class CrazyflieLink:
     def send_parameter(self, parameter: str, value: float | None) -> None:
         """Set a parameter, or ask for its value (None), without waiting for the answer; see `parameter_answer`.
 
-        Raises:
-            BodyError: If the firmware has no such parameter, or a read-only one.
+        Raises BodyError if the firmware has no such parameter, or a read-only one.
         """
         element = self._parameter(parameter)
         if element is None:

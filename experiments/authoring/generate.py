@@ -80,8 +80,7 @@ def _allow(count: int) -> None:
 def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
     """The text of an experiment file, one line for each robot and each link.
 
-    Raises:
-        LayoutError: If robots of that kind cannot stand that near to one another.
+    Raises LayoutError if robots of that kind cannot stand that near to one another.
     """
     kind = _kind(wanted)
     if wanted.law not in LAWS:
@@ -149,8 +148,7 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
 def generate(what: str, size: str, target: str | None, wanted: LayoutOptions) -> tuple[Path, Layout]:
     """Write the experiment file of a formation; return its path and its layout.
 
-    Raises:
-        DocumentError: If there is no such formation, or the file cannot be written.
+    Raises DocumentError if there is no such formation, or the file cannot be written.
     """
     try:
         made = layout(what, size, wanted)

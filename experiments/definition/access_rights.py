@@ -29,8 +29,7 @@ ROS_TWIN: Final = "turtlebot3-twin"
 def rights(cases: Iterable[Experiment]) -> Rights:
     """Rights of all processes in the cases of an experiment, which share a router.
 
-    Raises:
-        LabError: If the cases are in different realms.
+    Raises LabError if the cases are in different realms.
     """
     return reduce(Rights.joined, map(_rights, cases))
 

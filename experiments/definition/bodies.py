@@ -202,8 +202,7 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
 def behind_protocols(experiment: Experiment) -> Experiment:
     """Put every robot behind its real bridge and a protocol twin, with simulated motion capture and radio.
 
-    Raises:
-        BodyError: If the kind of a robot has no protocol twin.
+    Raises BodyError if the kind of a robot has no protocol twin.
     """
     if strangers := sorted({robot.kind for robot in experiment.robots.values()} - PROTOCOL.keys()):
         known = ", ".join(sorted(PROTOCOL))

@@ -39,8 +39,7 @@ def router_endpoints(
 def read_endpoints(given: Iterable[str]) -> list[str]:
     """Endpoints, each as it is or, behind an @, line by line from a file.
 
-    Raises:
-        EndpointError: If a file cannot be read.
+    Raises EndpointError if a file cannot be read.
     """
     found: list[str] = []
     for each in given:

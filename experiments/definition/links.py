@@ -46,8 +46,7 @@ class OneWay:
 def link_pairs(text: str) -> tuple[tuple[str, str], ...]:
     """The (receiver, sender) pairs that a link stands for, one or two.
 
-    Raises:
-        ValueError: If it reads otherwise; the message is what to write instead.
+    Raises ValueError if it reads otherwise; the message is what to write instead.
     """
     match = _LINK.fullmatch(text)
     if match is None:

@@ -289,8 +289,7 @@ def chosen_case(read: Document, name: str | None) -> Experiment:
 def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
     """The cases of an experiment, all or those named, in the order of the file.
 
-    Raises:
-        DocumentError: If it has no case of that name.
+    Raises DocumentError if it has no case of that name.
     """
     cases = read.cases()
     for name in names:

@@ -85,8 +85,7 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
 def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Reference to the parameters of a plug-in, and the definitions that they need.
 
-    Raises:
-        PluginError: If the plug-in cannot be used, or no file can have a parameter of the type.
+    Raises PluginError if the plug-in cannot be used, or no file can have a parameter of the type.
     """
     chosen = registry.struct(group, name)
     try:

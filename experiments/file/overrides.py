@@ -52,8 +52,7 @@ def of_flag(flag: str, message: str, hint: str) -> DocumentError:
 def parse(flag: str, document: Mapping[str, Any]) -> Override:
     """`path=value`; the shell may have eaten the quotes of a key, so blanks are part of one.
 
-    Raises:
-        DocumentError: If it is not of that form, or names a case that the document does not have.
+    Raises DocumentError if it is not of that form, or names a case that the document does not have.
     """
     key, equals, text = flag.partition("=")
     path = _path(key)

@@ -93,8 +93,7 @@ def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
 def measure(trace: Trace) -> CaseMetrics:
     """All metrics of one case.
 
-    Raises:
-        ValueError: If the trace has fewer than two samples, so that nothing can be integrated.
+    Raises ValueError if the trace has fewer than two samples, so that nothing can be integrated.
     """
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")

@@ -71,8 +71,7 @@ class Records:
     def pieces(self) -> Iterator[tuple[bytes, list[int]]]:
         """Pieces of the file that are not damaged, each with the places in it where the records of messages begin.
 
-        Raises:
-            RecordingError: If the file cannot be read, or is no MCAP file.
+        Raises RecordingError if the file cannot be read, or is no MCAP file.
         """
         try:
             with self.path.open("rb") as file:
@@ -158,8 +157,7 @@ class Recovered:
 def recover(source: Path, target: Path) -> Recovered:
     """Writes every whole record of an unfinished recording into a new, finished one. The source stays as it is.
 
-    Raises:
-        RecordingError: If the source is no recording, or the target exists or cannot be written.
+    Raises RecordingError if the source is no recording, or the target exists or cannot be written.
     """
     records = Records(source)
     messages = sum(1 for _ in records.messages())

@@ -63,8 +63,7 @@ def keep_origin(folder: Path, origin: RunOrigin) -> None:
 def new_folder(read: Document, out: str | None, what: str = "") -> Path:
     """Makes the folder of a run: `out`, or one below `runs` with experiment and time in its name, and `what`, if given.
 
-    Raises:
-        DocumentError: If it holds something already, or cannot be made.
+    Raises DocumentError if it holds something already, or cannot be made.
     """
     folder = RUNS if out is None else Path(out)
     try:

@@ -85,9 +85,7 @@ def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], f
     """Writes a struct for each case, named after it, into a file of MATLAB's version 5.
 
     Numbers are doubles, robots are counted from 1, what is unknown is NaN. What is in the structs: docs/matlab.md.
-
-    Raises:
-        ExplainedError: If scipy is missing, the file cannot be written, or a case is too large for it.
+    Raises ExplainedError if scipy is missing, the file cannot be written, or a case is too large for it.
     """
     savemat = require_savemat()
     names = matlab_names(traces)
@@ -125,8 +123,7 @@ FRAMES_HZ: Final = 15.0  # of a film
 def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> None:
     """All cases side by side as a film, `speed` times as fast as the run: .mp4 (H.264, by ffmpeg) or .gif.
 
-    Raises:
-        ExplainedError: If there is no ffmpeg for an .mp4, or the file cannot be written.
+    Raises ExplainedError if there is no ffmpeg for an .mp4, or the file cannot be written.
     """
     from matplotlib.animation import FFMpegWriter, PillowWriter  # noqa: PLC0415
 

@@ -102,11 +102,7 @@ def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
 
 
 def read_json(path: Path) -> list[CaseMetrics]:
-    """The metrics of a file.
-
-    Raises:
-        ValueError: If they are those of another version.
-    """
+    """The metrics of a file; raises ValueError if they are those of another version."""
     return msgspec.json.decode(path.read_bytes(), type=list[CaseMetrics])
 
 

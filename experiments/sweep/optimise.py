@@ -106,8 +106,7 @@ class TuningResult:
 def wish_of(text: str) -> Wish:
     """`messages, iae<=1.01, itae<=1.05`: first what is to be least, then limits.
 
-    Raises:
-        DocumentError: If it cannot be understood.
+    Raises DocumentError if it cannot be understood.
     """
     place = f'--optimize "{text}"'
     first, *rest = (part.strip() for part in text.split(","))

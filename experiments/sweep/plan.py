@@ -90,11 +90,7 @@ class Cell:
 
 
 def arguments(given: Sequence[str]) -> tuple[list[Axis], dict[str, str]]:
-    """Axes and words (`seeds=`, `tuning=`) apart.
-
-    Raises:
-        DocumentError: If one is not of the form, or comes twice.
-    """
+    """Axes and words (`seeds=`, `tuning=`) apart; raises DocumentError if one is not of the form, or comes twice."""
     axes: list[Axis] = []
     words: dict[str, str] = {}
     for argument in given:
@@ -115,8 +111,7 @@ def arguments(given: Sequence[str]) -> tuple[list[Axis], dict[str, str]]:
 def seeds_of(argument: str | None, first: int, count: int = SEEDS) -> tuple[int, ...]:
     """The seeds that `seeds=50` (from `first` on) or `seeds=101:150` (both included) names.
 
-    Raises:
-        DocumentError: If it names none, or cannot be understood.
+    Raises DocumentError if it names none, or cannot be understood.
     """
     if argument is None:
         return tuple(range(first, first + count))
@@ -160,8 +155,7 @@ def combination(
 ) -> Iterator[Cell]:
     """The reference, then the named cases, with these values.
 
-    Raises:
-        DocumentError: If a path leads nowhere, or a value is refused.
+    Raises DocumentError if a path leads nowhere, or a value is refused.
     """
     paths = {axis: _parsed(axis, value, read) for axis, value in values.items()}
     first = compared(read)

@@ -53,8 +53,7 @@ class Store:
     def __enter__(self) -> Self:
         """Opens the folder, and reads what is there.
 
-        Raises:
-            DocumentError: If it cannot be made or written, or another sweep is at work in it.
+        Raises DocumentError if it cannot be made or written, or another sweep is at work in it.
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -107,8 +106,7 @@ class Store:
     def add(self, cell: str, code: str, outcome: WorkResult) -> None:
         """Keeps results of some seeds; they are on the disk when this returns.
 
-        Raises:
-            DocumentError: If the disk is full.
+        Raises DocumentError if the disk is full.
         """
         line = _Line(cell, code, outcome.runs, outcome.failed)
         try:

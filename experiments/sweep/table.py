@@ -102,8 +102,7 @@ def write_json(path: Path, table: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
     """A table that `write_json` has written, and its rows.
 
-    Raises:
-        ValueError: If there is none, or that of another version.
+    Raises ValueError if there is none, or that of another version.
     """
     try:
         found = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])

@@ -49,8 +49,7 @@ class Workers:
     def done(self, works: Sequence[Work]) -> Iterator[tuple[Work, WorkResult]]:
         """Runs all works, and yields each when it is done, in any order.
 
-        Raises:
-            ExplainedError: If the workers are lost, or have other code.
+        Raises ExplainedError if the workers are lost, or have other code.
         """
         if self.executor is None:
             for work in works:
@@ -81,8 +80,7 @@ class Workers:
 def workers(scheduler: str | None, processes: int | None) -> AbstractContextManager[Workers]:
     """The workers of a scheduler, if one is named, else of this machine; the end of the block ends their work.
 
-    Raises:
-        ExplainedError: At the beginning of the block, if a scheduler is not there, or has no worker.
+    Raises ExplainedError at the beginning of the block, if a scheduler is not there, or has no worker.
     """
     return _local(processes) if scheduler is None else _cluster(scheduler)
 

@@ -62,8 +62,7 @@ class Broadcast:
     def run(self, ended: threading.Event, clock: Clock, endpoints: Sequence[str] = ()) -> int:
         """Plays until `ended`, by a clock from 0 to the recording's length [s]; returns the number of messages sent.
 
-        Raises:
-            ExplainedError: If a run or a robot is up in the realm, before or while it plays.
+        Raises ExplainedError if a run or a robot is up in the realm, before or while it plays.
         """
         keys, names = self.keys, [self.keys.alive(name) for name in self.experiment.robots]
         began, mine = Utc().utc(), str(self._session.zid())

@@ -86,8 +86,7 @@ def create(
 def issue(folder: Path, identities: Mapping[str, Role], *, hosts: Sequence[str] = (), days: float = DAYS) -> Register:
     """Add identities to a lab. With `hosts` they may listen there, as a router does.
 
-    Raises:
-        LabError: If one is there already, or the authority's key is not on this machine.
+    Raises LabError if one is there already, or the authority's key is not on this machine.
     """
     known = register(folder)
     if there := [name for name in identities if name in known.identities]:
@@ -126,8 +125,7 @@ def renew(
 def revoke(folder: Path, names: Sequence[str], *, days: float = DAYS) -> Register:
     """Take all rights from the present certificates of identities, and make them new ones.
 
-    Raises:
-        LabError: If there is no such identity, or the authority's key is not on this machine.
+    Raises LabError if there is no such identity, or the authority's key is not on this machine.
     """
     known = register(folder)
     moved = {

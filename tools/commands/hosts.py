@@ -192,8 +192,7 @@ def stations(
 ) -> Iterator[list[Station | HostError]]:
     """A connection to each host, or why there is none, and, if `routed`, a router as a run would have it.
 
-    Raises:
-        LabError: If a certificate is missing here.
+    Raises LabError if a certificate is missing here.
     """
     import tempfile
 
@@ -337,8 +336,7 @@ def _recognised(row: Row, there: Station, folder: Path, robots: Sequence[str]) -
 def put(name: str, host: Host) -> str:
     """Put this zenpark on a host, and make it ready; return what it then says of itself.
 
-    Raises:
-        HostError: If there is no place for it, or it cannot be made ready there.
+    Raises HostError if there is no place for it, or it cannot be made ready there.
     """
     from experiments.real_time.hosts.hosts import HostError, run_script
     from experiments.recording import version

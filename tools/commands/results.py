@@ -171,8 +171,7 @@ def _report_sweep(
 def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
     """Seeds of several runs as those of one, with the cases that all of them have.
 
-    Raises:
-        DocumentError: If experiments, clocks or bodies differ, or a seed is there twice.
+    Raises DocumentError if experiments, clocks or bodies differ, or a seed is there twice.
     """
     from dataclasses import replace
 

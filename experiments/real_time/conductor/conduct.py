@@ -220,8 +220,7 @@ def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
 def check_other_runs(me: run_registry.Run, others: Iterable[run_registry.Run], file: str) -> list[str]:
     """Notes on other runs that are up and have robots of the same names.
 
-    Raises:
-        DocumentError: If a robot of the run is hardware that another one has.
+    Raises DocumentError if a robot of the run is hardware that another one has.
     """
     notes = []
     for other in others:
@@ -251,10 +250,8 @@ def write_rights(
 ) -> Path | None:
     """Rights of all identities, as a file for the router; None without a lab.
 
-    Robots on hosts have their certificates there, and need none here.
-
-    Raises:
-        LabError: If a certificate is missing, or of another role.
+    Robots on hosts have their certificates there, and need none here. Raises LabError if a certificate is missing, or
+    of another role.
     """
     of = lab_of(endpoints)
     if of is None:

@@ -41,10 +41,8 @@ class Emergency:
     ) -> Iterator[None]:
         """Receive stops by a session of its own: those of the cases are closed between them.
 
-        `identity` is the name in the certificate, in a lab; `starting`: the routers were just started.
-
-        Raises:
-            Unreachable: If no router answers.
+        `identity` is the name in the certificate, in a lab; `starting`: the routers were just started. Raises
+        Unreachable if no router answers.
         """
         wait_s = STARTING_S if starting else ASK_S
         opened = network.open_session(endpoints, name="emergency stops", identity=identity, wait_s=wait_s)

@@ -159,9 +159,8 @@ class NetworkView:
     def update(self) -> list[str]:
         """Receive all since the last update; return the robots whose token has vanished for good.
 
-        Raises:
-            RunFailed: If this process stood still for so long that its robots have landed; other ones may have their
-                names now.
+        Raises RunFailed if this process stood still for so long that its robots have landed; other ones may have their
+        names now.
         """
         if self._launcher.last_silence > self._begun:
             raise RunFailed(

@@ -106,8 +106,7 @@ class Servants:
     def start(self) -> Experiment:
         """Start what the robots of the case need; return its experiment with the addresses of its robots.
 
-        Raises:
-            StandInError: If a protocol twin or a positioning system does not start in time.
+        Raises StandInError if a protocol twin or a positioning system does not start in time.
         """
         context, experiment = self._context, self._context.experiment
         world = start_world(context)

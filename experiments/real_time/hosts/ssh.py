@@ -67,8 +67,7 @@ def explained(address: str, zenpark: str, output: str) -> str:
 def forwarded(endpoint: Endpoint) -> str:
     """The argument of `ssh -R` by which another machine reaches an endpoint of this one, at a port that sshd chooses.
 
-    Raises:
-        ValueError: If ssh carries no such protocol.
+    Raises ValueError if ssh carries no such protocol.
     """
     if endpoint.protocol not in ("tcp", "tls", UNIX):
         raise ValueError(

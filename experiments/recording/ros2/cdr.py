@@ -55,10 +55,7 @@ def codec(kind: type[S]) -> Codec[S]:
 
     Fields may be bool, int, float, str, fixed tuples of floats, other structs, lists of these (except of tuples), and
     dict[str, int], which becomes `<name>_keys` and `<name>_values`. A float or fixed tuple that may be None is NaN then
-    (and NaN is read as None).
-
-    Raises:
-        TypeError: If a field has another type, or a name that ROS does not allow.
+    (and NaN is read as None). Raises TypeError if a field has another type, or a name that ROS does not allow.
     """
     writer = _Writer()
     rebuilt = writer.struct(kind, "o")

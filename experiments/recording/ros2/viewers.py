@@ -149,11 +149,7 @@ def _moment(stamp: float) -> tuple[int, int]:
 
 
 def markers(stamp: float, drawn: Sequence[Marker]) -> bytes:
-    """A `MarkerArray` at a UTC stamp [s].
-
-    Raises:
-        Unencodable: If a number is none of its type.
-    """
+    """A `MarkerArray` at a UTC stamp [s]; raises Unencodable if a number is none of its type."""
     out = _Cdr()
     try:
         out.numbers("I", len(drawn))

@@ -113,9 +113,7 @@ def inventory(files: tuple[str, ...] = ()) -> Inventory:
     """Tables built in, or those of `files` of cflib's cache, one for parameters, one for log variables.
 
     Variables of a file start with the value that the variable of the same name has in the built-in table, otherwise 0.
-
-    Raises:
-        BodyError: If a file is no table of cflib's cache, or two are of the same kind.
+    Raises BodyError if a file is no table of cflib's cache, or two are of the same kind.
     """
     sections = list(_sections(BUILT_IN.read_text("ascii")))
     read: dict[type, list[Variable]] = {}
