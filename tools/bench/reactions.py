@@ -18,11 +18,11 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from math import cos, pi, sin
+from contextlib import ExitStack, contextmanager
+from math import cos, inf, pi, sin
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import zenoh
 from zenoh.handlers import Callback
@@ -38,7 +38,7 @@ from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.launcher import Launcher
 from tools.bench.measuring import Figure
 from tools.reliability import spoilt_process
-from tools.reliability.spoilt_process import Switch
+from tools.reliability.spoilt_process import ROBOT, Switch
 
 ROBOTS: Final = 20
 BODIES: Final = ("twin", "external")
@@ -52,39 +52,37 @@ SPACING: Final = 0.8  # [m] around the ring
 POSITION_HZ: Final = 50.0
 PINGS: Final = 20  # round trips of nothing, before each measurement
 
-STOP_S, KILL_S, FREEZE_S = 0.020, 0.1, 1.5  # limits
+LIMITS_S: Final = {
+    "emergency stop until motors off, twin": 0.020,
+    "emergency stop until motors off, external": 0.020,
+    "neighbour killed until known": 0.1,
+    "neighbour frozen until known": 1.5,
+}
 
 
 def safety() -> Iterator[Figure]:
     """Reaction times with twenty robots running, beside an empty way over the router in the same run."""
     pings: list[float] = []
-    stops: dict[str, list[float]] = {body: [] for body in BODIES}
-    killed: list[float] = []
-    frozen: list[float] = []
-    missed = wrong = 0
-    for _ in range(STOPS):
-        for body, ways in stops.items():
-            with _Park(body) as park:
-                pings += park.pings()
-                taken, lost = park.stop()
-                ways.extend(taken)
-                missed, wrong = missed + lost, wrong + park.wrong()
+    taken: dict[str, list[float]] = {what: [] for what in LIMITS_S}
+    wrong = 0
+    for body in BODIES * STOPS:
+        with _running(body) as park:
+            pings += park.pings()
+            taken[f"emergency stop until motors off, {body}"] += park.stop()
+            wrong += park.wrong()
     for _ in range(DEATHS):
-        with _Park() as park:
+        with _running() as park:
             pings += park.pings()
             # every second robot at most: both neighbours of each dead robot must live to notice
             for number, row in enumerate(range(0, 2 * (KILLED + FROZEN), 2)):
-                cause = signal.SIGKILL if number < KILLED else signal.SIGSTOP
-                found, lost = park.lose(row, cause)
-                (killed if cause == signal.SIGKILL else frozen).extend(found)
-                missed += lost
+                what, cause = ("killed", signal.SIGKILL) if number < KILLED else ("frozen", signal.SIGSTOP)
+                taken[f"neighbour {what} until known"] += park.lose(row, cause)
             wrong += park.wrong()
     empty = statistics.median(pings)
     yield from _figures("an empty way over the router", pings, empty, empty, "yardstick")
-    for body, ways in stops.items():
-        yield from _figures(f"emergency stop until motors off, {body}", ways, empty, STOP_S, "of 20 ms")
-    yield from _figures("neighbour killed until known", killed, empty, KILL_S, "of 0.1 s")
-    yield from _figures("neighbour frozen until known", frozen, empty, FREEZE_S, "of 1.5 s")
+    for what, limit_s in LIMITS_S.items():
+        yield from _figures(what, taken[what], empty, limit_s, f"of {limit_s:g} s")
+    missed = sum(time == inf for times in taken.values() for time in times)
     yield Figure("safety", "reactions that did not come", float(missed), "", float(missed), "wanted: 0")
     yield Figure("safety", "robots held for dead that were not", float(wrong), "", float(wrong), "wanted: 0")
     load = os.getloadavg()[0]
@@ -93,11 +91,11 @@ def safety() -> Iterator[Figure]:
 
 def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of: str) -> Iterator[Figure]:
     """Median, 99th percentile and largest of some times [s]; the median over an empty way, the others over the aim."""
-    ordered = sorted(taken)
+    ordered = sorted(time for time in taken if time < inf)
     if not ordered:
         return
     middle = statistics.median(ordered)
-    late = ordered[min(len(ordered) - 1, round(0.99 * (len(ordered) - 1)))]
+    late = ordered[round(0.99 * (len(ordered) - 1))]
     yield Figure("safety", f"{what}, median of {len(ordered)}", 1e3 * middle, "ms", middle / empty, "× an empty way")
     yield Figure("safety", f"{what}, 99 %", 1e3 * late, "ms", late / wanted, of)
     yield Figure("safety", f"{what}, slowest", 1e3 * ordered[-1], "ms", ordered[-1] / wanted, of)
@@ -134,36 +132,79 @@ def places(endpoint: str, realm: str, starts: Mapping[str, Sequence[float]]) -> 
                 publishers[name].put(messages.encode(messages.Position(name, now, (x, y, 0.0), 0.0)))
 
 
-class _Park:
-    """A run of the ring: its processes, and the far end of all bodies; robots run when it is entered."""
+@contextmanager
+def _running(body: str = BODIES[0]) -> Iterator[_Park]:
+    """A run of the ring, all robots running."""
+    with ExitStack() as stack:
+        park = _Park(stack, body)
+        park.await_phase("ready")
+        park.order(messages.Order("takeoff"))
+        park.await_phase("airborne")
+        park.order(messages.Order("start", at=time.time() + 0.5))
+        park.await_phase("running")
+        time.sleep(SETTLE_S)
+        park.missing.clear()  # at the begin of the run no pose had been received
+        yield park
 
-    def __init__(self, body: str = BODIES[0]) -> None:
-        self._experiment, self._body = ring(ROBOTS, body), body
-        self._names = list(self._experiment.robots)
-        self._keys = Keys(self._experiment.network.realm)
+
+class _Park:
+    """The processes of a run of the ring, and the far end of all bodies.
+
+    Attributes:
+        missing: (robot, its missing neighbour) -> since [monotonic s].
+    """
+
+    def __init__(self, stack: ExitStack, body: str) -> None:
+        """Start the processes; `stack` ends them."""
+        experiment = ring(ROBOTS, body)
+        self._names, self._keys = list(experiment.robots), Keys(experiment.network.realm)
         self._ended: set[str] = set()
         self._pong, self._pinged = threading.Event(), 0.0
         # filled by callbacks, all times are monotonic [s]
         self._phase: dict[str, str] = {}
-        self._missing: dict[tuple[str, str], float] = {}  # (robot, its missing neighbour) -> since
+        self.missing: dict[tuple[str, str], float] = {}
         self._stopped: dict[str, float] = {}  # first stop of an external body, by robot
         self._cuts: dict[str, Switch] = {}  # and that of a twin
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        self._launcher = stack.enter_context(Launcher(folder / "logs"))
+        stack.callback(lambda: [*map(self._launcher.kill, self._names)])  # a frozen process cannot land
+        file = folder / "ring.json"
+        file.write_bytes(write_json(experiment))
+        endpoints = [free_endpoint(0)]
+        start_router(self._launcher, endpoints)
+        self._session = stack.enter_context(network.open_session(endpoints, name="bench"))
+        listener = stack.enter_context(network.open_session(endpoints, name="bench listens"))
+        callbacks: dict[str, Callable[[zenoh.Sample], None]] = {
+            self._keys.status("*"): self._take_status,
+            self._keys.setpoint("*"): self._take_command,
+            f"{self._keys.realm}/bench/ping": self._take_pong,
+        }
+        self._held = [
+            listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in callbacks.items()
+        ]
+        start = [ROBOT]
+        if body == "external":
+            # in a process of its own: arriving messages would wait for an interpreter that is busy with this
+            starts = {name: tuple(robot.start) for name, robot in experiment.robots.items()}
+            arguments = (endpoints[0], self._keys.realm, starts)
+            far_end = get_context("spawn").Process(target=places, args=arguments, daemon=True)
+            far_end.start()
+            stack.callback(far_end.join)
+            stack.callback(far_end.terminate)
+        else:
+            self._cuts = {name: Switch(folder / f"cut-{name}") for name in self._names}
+            start = [spoilt_process.MODULE, str(folder), ROBOT]
+        for name in self._names:
+            self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
 
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._open(stack)
-            self._await("ready")
-            self._order(messages.Order("takeoff"))
-            self._await("airborne")
-            self._order(messages.Order("start", at=time.time() + 0.5))
-            self._await("running")
-            time.sleep(SETTLE_S)
-            self._missing.clear()  # at the begin of the run no pose had been received
-            self._stack = stack.pop_all()
-        return self
+    def await_phase(self, phase: str) -> None:
+        if not _wait(lambda: all(self._phase.get(name) == phase for name in self._names), PATIENCE_S):
+            raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {phase}: {self._phase}")
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    def order(self, order: messages.Order) -> None:
+        for name, reply in orders.send_order(self._session, self._keys, self._names, order).items():
+            if not reply.ok:
+                raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")
 
     def pings(self) -> list[float]:
         """Times of empty messages from one session to a callback of the other [s]."""
@@ -177,9 +218,8 @@ class _Park:
             time.sleep(0.01)
         return taken
 
-    def stop(self) -> tuple[list[float], int]:
-        """Times from an emergency stop to the command at each body [s], and the number of commands that never came."""
-
+    def stop(self) -> list[float]:
+        """Times from an emergency stop to the command at each body [s]; inf: it never came."""
         payload = messages.encode(messages.Stop("bench", "to see how long it takes"))
         for cut in self._cuts.values():  # a body that is opened has its motors cut
             cut.write(0.0)
@@ -188,76 +228,34 @@ class _Park:
         urgent = zenoh.Priority.REAL_TIME
         self._session.put(self._keys.estop, payload, encoding=messages.JSON, priority=urgent, express=True)
         _wait(lambda: len(self._stops()) == len(self._names), MISSED_S)
-        taken = [at - began for at in self._stops().values()]
-        return taken, len(self._names) - len(taken)
+        stops = self._stops()
+        return [stops.get(name, inf) - began for name in self._names]
 
     def _stops(self) -> dict[str, float]:
         """Time of the first command to cut the motors, by robot [monotonic s]."""
         return self._stopped | {name: at for name, cut in self._cuts.items() if (at := cut.read())}
 
-    def lose(self, row: int, cause: signal.Signals) -> tuple[list[float], int]:
-        """Times from the end of a robot until each of its two neighbours knows [s], and the number that never did."""
+    def lose(self, row: int, cause: signal.Signals) -> list[float]:
+        """Times from the end of a robot until each of its two neighbours knows [s]; inf: it never did."""
         name = self._names[row]
         around = [(self._names[(row + step) % len(self._names)], name) for step in (-1, 1)]
         self._ended.add(name)
         began = time.monotonic()
         os.kill(self._launcher.get(name).handle.pid, cause)
-        _wait(lambda: all(pair in self._missing for pair in around), MISSED_S)
+        _wait(lambda: all(pair in self.missing for pair in around), MISSED_S)
         time.sleep(0.3)  # the next measurement begins undisturbed
-        known = [self._missing[pair] - began for pair in around if pair in self._missing]
-        return known, len(around) - len(known)
+        return [self.missing.get(pair, inf) - began for pair in around]
 
     def wrong(self) -> int:
         """Number of reports that a robot is missing which is there."""
-        return sum(name not in self._ended for _, name in self._missing)
-
-    # ------------------------------------------------------------------ processes and sessions
-
-    def _open(self, stack: ExitStack) -> None:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        self._launcher = stack.enter_context(Launcher(folder / "logs"))
-        stack.callback(self._kill)
-        file = folder / "ring.json"
-        file.write_bytes(write_json(self._experiment))
-        endpoints = [free_endpoint(0)]
-        start_router(self._launcher, endpoints)
-        self._session = stack.enter_context(network.open_session(endpoints, name="bench"))
-        listener = stack.enter_context(network.open_session(endpoints, name="bench listens"))
-        callbacks: dict[str, Callable[[zenoh.Sample], None]] = {
-            self._keys.status("*"): self._take_status,
-            self._keys.setpoint("*"): self._take_command,
-            f"{self._keys.realm}/bench/ping": self._take_pong,
-        }
-        self._held = [
-            listener.declare_subscriber(key, Callback(take, indirect=False)) for key, take in callbacks.items()
-        ]
-        start = ["experiments.real_time.processes.robot"]
-        if self._body == "external":
-            # in a process of its own: arriving messages would wait for an interpreter that is busy with this
-            starts = {name: tuple(robot.start) for name, robot in self._experiment.robots.items()}
-            arguments = (endpoints[0], self._keys.realm, starts)
-            far_end = get_context("spawn").Process(target=places, args=arguments, daemon=True)
-            far_end.start()
-            stack.callback(far_end.join)
-            stack.callback(far_end.terminate)
-        else:
-            self._cuts = {name: Switch(folder / f"cut-{name}") for name in self._names}
-            start = [spoilt_process.MODULE, str(folder), *start]
-        for name in self._names:
-            self._launcher.start(name, *start, str(file), name, "--connect", endpoints[0], "--lifeline")
-
-    def _kill(self) -> None:
-        """Kill the robots: a frozen process cannot land."""
-        for name in self._names:
-            if (process := self._launcher.get(name)).alive:
-                os.kill(process.handle.pid, signal.SIGKILL)
+        return sum(name not in self._ended for _, name in self.missing)
 
     def _take_status(self, sample: zenoh.Sample) -> None:
         now = time.monotonic()
         status = messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Status)
         self._phase[status.robot] = status.phase
         for name in status.missing:
-            self._missing.setdefault((status.robot, name), now)
+            self.missing.setdefault((status.robot, name), now)
 
     def _take_command(self, sample: zenoh.Sample) -> None:
         now = time.monotonic()
@@ -269,15 +267,6 @@ class _Park:
     def _take_pong(self, _sample: zenoh.Sample) -> None:
         self._pinged = time.monotonic()
         self._pong.set()
-
-    def _await(self, phase: str) -> None:
-        if not _wait(lambda: all(self._phase.get(name) == phase for name in self._names), PATIENCE_S):
-            raise RuntimeError(f"after {PATIENCE_S:g} s not all robots were {phase}: {self._phase}")
-
-    def _order(self, order: messages.Order) -> None:
-        for name, reply in orders.send_order(self._session, self._keys, self._names, order).items():
-            if not reply.ok:
-                raise RuntimeError(f"{name} refuses {order.order}: {reply.reason}")
 
 
 def _wait(true: Callable[[], bool], limit_s: float) -> bool:
