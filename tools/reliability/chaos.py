@@ -70,7 +70,7 @@ def chaos(
     outcomes: list[FaultResult] = []
     ends: list[RoundResult] = []
     with interrupts() as interrupted:
-        setting = Setting(folder / SOURCE, name, experiment, folder, changes, seed, interrupted)
+        setting = Setting(folder / SOURCE, name, experiment, folder, changes, interrupted)
         while waiting and not interrupted() and barren < BARREN:
             flown = ChaosRound(setting, len(ends) + 1, waiting)
             ends.append(flown.run())

@@ -33,7 +33,7 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.real_time.processes.recorder": "recorder",
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
-    "tools.reliability.run_process": CONDUCTOR,
+    "tools.reliability.spoilt_run": CONDUCTOR,
     "bridges.vicon.publisher": "positioning",
 }
 ROBOT: Final = "experiments.real_time.processes.robot"

@@ -1,7 +1,8 @@
 """A run to which faults are done: its start, the levers by which they are done, and its end.
 
-It is a process of its own, which may be killed. Its robots reach their routers through cables
-(`tools.reliability.cables`), and live in one world, so that the body of a robot whose process is dead, frozen or cut
+It is a process of its own, which may be killed: `python -m tools.reliability.spoilt_run REQUEST`, a struct as JSON; its
+standard input is the lifeline, without which all robots land. Its robots reach their routers through cables
+(`tools.reliability.cable`), and live in one world, so that the body of a robot whose process is dead, frozen or cut
 off stays in the room.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import resource
 import secrets
 import signal
@@ -19,28 +21,34 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
 import zenoh
 
 from agents.body.kinds import KINDS
+from agents.errors import ExplainedError
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
+from agents.runtime.command_line import on_termination
+from agents.runtime.lifeline import Lifeline
 from experiments.definition.experiment import Experiment
+from experiments.file.document import load
 from experiments.real_time.conductor import orders
+from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged
+from tools.progress import Lines
 from tools.reliability import spoilt_process
-from tools.reliability.cables import Cables
-from tools.reliability.run_process import Request
 from tools.reliability.spoilt_process import CONDUCTOR, Switch, role_of
 
 Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
 GARBAGE: Final = 20  # payloads of nonsense at a time, on each key of a victim
+CABLE: Final = "cable"
+MODULE: Final = "tools.reliability.spoilt_run"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
 END_S: Final = 1.0  # before its time is over: then the conductor lands all robots, and lets none in again
 MOCAP_CLOCK: Final = "clock-positioning"
@@ -55,8 +63,31 @@ class Setting:
     experiment: Experiment  # the same, changes applied
     folder: Path  # where each round gets a folder
     changes: Sequence[str]  # as behind `--set`
-    seed: int  # of nonsense, which the script leaves open
     interrupted: Callable[[], bool]  # by the user
+
+
+class Request(msgspec.Struct):
+    """A run in real time on this machine, its bodies in one world."""
+
+    file: str  # experiment file
+    folder: str  # for recordings and logs; it exists
+    case: str
+    changes: list[str]  # as behind `--set`
+    cables: dict[str, dict[str, str]]  # for each process of robots, by its role, an endpoint in place of each router's
+    switches: str  # folder, with which `tools.reliability.spoilt_process` spoils processes
+
+
+class SpoiltLauncher(Launcher):
+    """Starts processes that can be spoiled, and whose robots find their routers at the ends of cables of their own."""
+
+    def __init__(self, request: Request, logs: Path) -> None:
+        super().__init__(logs)
+        self._request = request
+
+    def start(self, name: str, module: str, *arguments: str) -> Process:
+        own = self._request.cables.get(spoilt_process.role_of([module, *arguments]), {})
+        words = (own.get(word, word) for word in arguments)
+        return super().start(name, spoilt_process.MODULE, self._request.switches, module, *words)
 
 
 class SpoiltRun:
@@ -82,7 +113,7 @@ class SpoiltRun:
         self.shifted: set[str] = set()
         self.started: float | None = None
         self.answer = messages.RunReply()
-        self._keys, self._random = Keys(experiment.network.realm), np.random.default_rng([setting.seed, number])
+        self._keys = Keys(experiment.network.realm)
         self._stopped: list[int] = []
         groups: dict[str, list[str]] = {}
         for name, robot in experiment.robots.items():
@@ -95,12 +126,16 @@ class SpoiltRun:
             flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
             changes += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
             changes.append('positioning="vicon-twin"')
-        self._cables = stack.enter_context(Cables())
-        laid = {role: {end: self._cables.lay(role, end) for end in self.routers} for role in self._process_of.values()}
-        request = Request(str(setting.file), str(folder), setting.case, changes, laid, str(self._switches))
+        near = {
+            role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
+        }
+        request = Request(str(setting.file), str(folder), setting.case, changes, near, str(self._switches))
         self._tag = f"{RUN}={secrets.token_hex(8)}"  # in the environment of all its processes
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
-        words = ["tools.reliability.run_process", msgspec.json.encode(request).decode()]
+        for role, ends in near.items():
+            ports = [end.rpartition(":")[2] for way in ends.items() for end in reversed(way)]
+            self._launcher.start(f"{CABLE}-{role}", "tools.reliability.cable", *ports)
+        words = [MODULE, msgspec.json.encode(request).decode()]
         self.process = self._spawn(CONDUCTOR, [sys.executable, "-m", spoilt_process.MODULE, request.switches, *words])
         stack.callback(self._kill)
 
@@ -139,18 +174,16 @@ class SpoiltRun:
         """Send a signal to the first process of a role, or of a robot."""
         for pid in self._running(role)[:1]:
             self._signal(pid, number)
-            self._stopped += [pid] if number == signal.SIGSTOP else []
 
     def cut(self, robot: str) -> None:
         """Let nothing pass between a robot and its routers."""
-        self._cables.cut(self.process_of(robot))
+        self._signal(self._launcher.get(f"{CABLE}-{self.process_of(robot)}").handle.pid, signal.SIGSTOP)
 
     def release(self) -> None:
-        """Undo what can be undone: continue stopped processes, mend all cables, set the clock of motion capture."""
+        """Undo what can be undone: continue stopped processes, cables too, and set the clock of motion capture."""
         for pid in self._stopped:
             self._signal(pid, signal.SIGCONT)
         self._stopped.clear()
-        self._cables.mend()
         self.switch(MOCAP_CLOCK).write(0.0)
 
     def restart(self, robot: str, session: zenoh.Session) -> None:
@@ -180,29 +213,47 @@ class SpoiltRun:
 
     def spoil(self, robot: str, session: zenoh.Session) -> int:
         """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
-        keys = self._keys
+        keys, whole = self._keys, messages.encode(messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
         read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
-        for key in read:
-            for _ in range(GARBAGE):
-                session.put(key(robot), self._malformed_payload(robot), encoding=messages.JSON)
+        for key in read * GARBAGE:
+            payloads = (
+                random.randbytes(random.randrange(1, 400)),
+                b"[" * 10_000,
+                b'{"robot": "' + robot.encode() + b'", "seq": 1e999, "stamp": -1, "position": [1e308, 0, 0]}',
+                b"x" * 100_000,
+                whole[: random.randrange(len(whole))],
+            )
+            session.put(key(robot), random.choice(payloads), encoding=messages.JSON)
         return GARBAGE * len(read)
-
-    def _malformed_payload(self, robot: str) -> bytes:
-        whole = messages.encode(messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
-        payloads = (
-            self._random.bytes(int(self._random.integers(1, 400))),
-            b"[" * 10_000,
-            b'{"robot": "' + robot.encode() + b'", "seq": 1e999, "stamp": -1, "position": [1e308, 0, 0]}',
-            b"x" * 100_000,
-            whole[: int(self._random.integers(len(whole)))],
-        )
-        return payloads[int(self._random.integers(len(payloads)))]
 
     def _running(self, role: str) -> list[int]:
         """The processes of a role, or of a robot."""
         return [pid for pid, name in sorted(self.processes().items()) if role in name.split("+")]
 
-    @staticmethod
-    def _signal(pid: int, number: signal.Signals) -> None:
+    def _signal(self, pid: int, number: signal.Signals) -> None:
+        self._stopped += [pid] if number == signal.SIGSTOP else []
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)
+
+
+# ---------------------------------------------------------------------- in the process of the run
+
+
+def main() -> int:
+    """Run the request of the command line."""
+    request = msgspec.json.decode(sys.argv[1], type=Request)
+    over = threading.Event()
+    Lifeline(over).start()
+    user = Supervision(Lines(), over.is_set, launching=partial(SpoiltLauncher, request))
+    try:
+        with on_termination(over.set):
+            options = RunOptions([request.case], "world", here=True)
+            conduct(load(request.file, *request.changes), Path(request.folder), options, user)
+    except ExplainedError as error:
+        print(f"zenpark: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

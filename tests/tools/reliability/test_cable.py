@@ -1,10 +1,15 @@
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 
-from tools.reliability.cables import Cables
+from agents.network.endpoints import free_endpoint
+from tests.waiting import until
 
 
 def answer_everything(listener):
@@ -24,12 +29,24 @@ def echo(end):
 
 @contextmanager
 def laid():
-    with socket.create_server(("127.0.0.1", 0)) as far, Cables() as cables:
+    near = int(free_endpoint(0).rpartition(":")[2])
+    with socket.create_server(("127.0.0.1", 0)) as far:
         thread = threading.Thread(target=answer_everything, args=(far,), daemon=True)
         thread.start()
-        near = cables.lay("CF01", f"tcp/127.0.0.1:{far.getsockname()[1]}")
-        with socket.create_connection(("127.0.0.1", int(near.rpartition(":")[2])), timeout=30.0) as end:
-            yield cables, end
+        words = [sys.executable, "-m", "tools.reliability.cable", str(near), str(far.getsockname()[1])]
+        with subprocess.Popen(words, stdin=subprocess.PIPE) as cable:
+
+            def reached():
+                with suppress(ConnectionRefusedError):
+                    ends.append(socket.create_connection(("127.0.0.1", near), timeout=30.0))
+                return ends
+
+            ends = []
+            until(reached, "it listens")
+            with ends[0] as end:
+                yield cable, end
+            cable.stdin.close()
+            assert cable.wait(30.0) == 0, "it ends with its standard input"
         far.shutdown(socket.SHUT_RDWR)
 
 
@@ -46,23 +63,18 @@ def test_everything_passes():
 
 
 def test_a_cut_holds_everything_back_and_loses_nothing():
-    with laid() as (cables, end):
-        cables.cut("CF01")
+    with laid() as (cable, end):
+        end.sendall(b"first")
+        assert end.recv(10) == b"first"
+        os.kill(cable.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, cable.pid, os.WSTOPPED)
         end.sendall(b"late")
         end.settimeout(0.3)
         with pytest.raises(TimeoutError):
             end.recv(10)
-        cables.mend()
-        end.settimeout(5.0)
+        os.kill(cable.pid, signal.SIGCONT)
+        end.settimeout(30.0)
         assert end.recv(10) == b"late"
-
-
-def test_another_cable_is_not_cut():
-    with laid() as (cables, end):
-        cables.lay("CF02", "tcp/127.0.0.1:9")
-        cables.cut("CF02")
-        end.sendall(b"there")
-        assert end.recv(10) == b"there"
 
 
 def test_the_end_of_a_connection_passes():
