@@ -26,7 +26,7 @@ from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
-from experiments.recording.run_folder import METRICS, SOURCE, read_origin
+from experiments.recording.run_folder import METRICS, SOURCE, case_figures, read_origin
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files
 from experiments.virtual_time import simulation
@@ -224,7 +224,7 @@ def reopen(folder: str | Path) -> Run:
     folder = Path(folder)
     if not folder.is_dir():
         raise RecordingError(f"{folder}: is no folder of a run; `./zenpark run` prints the folder that it makes")
-    order = [case for case, _ in metrics_files.cases_and_seeds(folder / METRICS)]  # a copy's files have other times
+    order = [each.case for each in case_figures(folder / METRICS)]  # a copy's files have other times
     files = sorted(folder.glob("*.mcap"), key=lambda file: file.stat().st_mtime_ns)
     files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
     if not files:
@@ -239,7 +239,7 @@ def reopen_seeds(folder: str | Path) -> list[Run]:
     """
     recorded = reopen(folder)
     file = Path(folder) / METRICS
-    seeds = list(dict.fromkeys(seed for _, seed in metrics_files.cases_and_seeds(file)))
+    seeds = list(dict.fromkeys(each.seed for each in case_figures(file)))
     asked = origin.seeds if (origin := read_origin(Path(folder))) else 1
     if not {*seeds} - {recorded.seed}:
         note = f"{asked} seeds were to be run; what is kept is of seed {recorded.seed} alone"

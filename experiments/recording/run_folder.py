@@ -134,30 +134,33 @@ def _past_run(folder: Path) -> PastRun | None:
     if not source.is_file():
         return None
     origin = read_origin(folder) or RunOrigin()
-    cases = _cases(folder)
+    cases = case_figures(folder / METRICS)
     recorded = any(folder.glob("*.mcap"))
     if not (recorded or cases or origin.begun):
         return None
     figures: dict[str, dict[str, dict[int, float | None]]] = {}
-    for case in dict.fromkeys(each["case"] for each in cases):
-        means = {each["seed"]: each["mean"] for each in cases if each["case"] == case}
-        figures[case] = {name: {seed: _number(mean.get(name)) for seed, mean in means.items()} for name in KEY_FIGURES}
+    for case in dict.fromkeys(each.case for each in cases):
+        means = {each.seed: each.mean for each in cases if each.case == case}
+        figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in KEY_FIGURES}
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    seeds = sorted({each["seed"] for each in cases})
+    seeds = sorted({each.seed for each in cases})
     return PastRun(str(folder), origin, origin.begun or source.stat().st_mtime, size / 1e6, recorded, seeds, figures)
 
 
-def _cases(folder: Path) -> list[dict[str, Any]]:
-    """The metrics of each case and seed; empty if there are none that can be read."""
+class CaseFigures(msgspec.Struct, frozen=True):
+    """The figures of a case with one seed: means over its robots, by index."""
+
+    case: str
+    seed: int
+    mean: dict[str, float | None]
+
+
+def case_figures(file: Path) -> list[CaseFigures]:
+    """The figures in `metrics.json` of any version, in order; empty if it holds none."""
     try:
-        read = msgspec.json.decode((folder / METRICS).read_bytes(), type=list[dict[str, Any]])
+        return msgspec.json.decode(file.read_bytes(), type=list[CaseFigures])
     except (OSError, ValueError, RecursionError):
         return []
-    return [each for each in read if {"case", "seed", "mean"} <= each.keys() and isinstance(each["mean"], dict)]
-
-
-def _number(value: object) -> float | None:
-    return value if isinstance(value, int | float) else None
 
 
 def differences(first: PastRun, other: PastRun) -> list[str]:

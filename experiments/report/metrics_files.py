@@ -106,19 +106,6 @@ def read_json(path: Path) -> list[CaseMetrics]:
     return msgspec.json.decode(path.read_bytes(), type=list[CaseMetrics])
 
 
-class _Which(msgspec.Struct):
-    case: str
-    seed: int
-
-
-def cases_and_seeds(path: Path) -> list[tuple[str, int]]:
-    """Case and seed of all metrics in a file of any version, in order; empty if it holds none."""
-    try:
-        return [(each.case, each.seed) for each in msgspec.json.decode(path.read_bytes(), type=list[_Which])]
-    except (OSError, ValueError, RecursionError):
-        return []
-
-
 class Band(NamedTuple):
     """Error of the worst link of a formation over several seeds."""
 
