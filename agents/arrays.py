@@ -1,19 +1,25 @@
-"""Array types of the row-wise core and the table of poses: first axis is robots (N), links (E) or poses (M)."""
+"""Types of arrays and numbers, and the table of poses: the first axis is robots (N), links (E) or poses (M)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import nan
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Rows = Index | slice  # what selects rows: numbers, or a run of them
+
+# of settings
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 def clamp(value: Array, low: Array | float, high: Array | float) -> Array:

@@ -11,11 +11,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, norm
+from agents.arrays import Array, Index, Mask, NotNegative, Positive, norm
 from agents.plugins.planners import Planner
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Planar = tuple[float, float]
 Points = Annotated[list[Planar], Meta(min_length=2)]
 

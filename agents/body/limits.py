@@ -8,11 +8,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array
-
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
+from agents.arrays import Array, NotNegative, Positive, Share
 
 
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -17,12 +17,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index, Mask, PoseTable, every, some
+from agents.arrays import Array, Index, Mask, PoseTable, Positive, Share, every, some
 
-Share = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=60)]
 AtLeastOne = Annotated[float, Meta(ge=1)]
-Positive = Annotated[float, Meta(gt=0)]
 Words = NDArray[np.uint64]
 Counter = NDArray[np.integer] | int
 

@@ -14,10 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Columns, Index, Mask, every, norm
-
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+from agents.arrays import Array, Columns, Index, Mask, NotNegative, Positive, every, norm
 
 COINCIDENT = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING = 1e-3  # [m] smallest gap in a force: forces stay finite

@@ -7,8 +7,8 @@ from typing import Annotated, Final
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, clamp, every, norm, some
-from agents.plugins.avoidance import Avoidance, Nearby, NotNegative, OwnState, Positive
+from agents.arrays import Array, Index, Mask, NotNegative, Positive, clamp, every, norm, some
+from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 
 SECTORS: Final = 8  # of what surrounds a robot; the tightest half-plane of each takes part in the exact solution
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic

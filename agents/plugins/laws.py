@@ -13,10 +13,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, clamp, norm
+from agents.arrays import Array, NotNegative, clamp, norm
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, Links
 
-NotNegative = Annotated[float, Meta(ge=0)]
 Need = Literal["distance", "relative", "bearing", "any"]
 Gain = Literal["gain", "stiffness", "by link"]
 

@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask
+from agents.arrays import Array, Index, Mask, Positive
 
-Positive = Annotated[float, Meta(gt=0)]
 Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
 
 

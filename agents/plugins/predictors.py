@@ -13,9 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array
-
-Positive = Annotated[float, Meta(gt=0)]
+from agents.arrays import Array, Positive
 
 
 class Predictor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

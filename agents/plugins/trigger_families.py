@@ -12,8 +12,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Mask, norm
-from agents.plugins.triggers import ROUNDING_S, NotNegative, Place, Positive, SendOnDelta, Trigger, View
+from agents.arrays import Array, Mask, NotNegative, Positive, norm
+from agents.plugins.triggers import ROUNDING_S, Place, SendOnDelta, Trigger, View
 
 
 class Relative(Trigger, frozen=True):

@@ -16,11 +16,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, norm, some
+from agents.arrays import Array, Index, Mask, NotNegative, Positive, norm, some
 from agents.plugins.predictors import HOLD, Predictor
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Place = Literal["communication", "control"]
 
 ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this

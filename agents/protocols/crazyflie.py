@@ -10,12 +10,11 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from agents.arrays import NotNegative, Positive
 from agents.body.device_locks import numeric
 from agents.body.interface import BodyError, settings
 from agents.protocols.crazyradio import software
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Rate = Annotated[float, Meta(ge=1, le=100)]
 LogRate = Annotated[float, Meta(ge=5, le=100)]
 Wait = Annotated[float, Meta(gt=0, le=60)]

@@ -10,16 +10,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from agents.arrays import NotNegative, Positive, Share
 from agents.body.interface import Disturbance
 from agents.body.limits import Safety
-from agents.network.channel_model import AtLeastOne, Delay, LinkEffects, Share
-from twins.scene import Obstacle
+from agents.network.channel_model import AtLeastOne, Delay, LinkEffects
+from twins.scene import Obstacle, Planar
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Rate = Annotated[float, Meta(gt=0, le=2000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-Planar = tuple[float, float]
 Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]
 Spatial = tuple[Positive, Positive, Positive]
 Choice = str | dict[str, Any]  # a plug-in by name, or a table with its `kind` and its parameters

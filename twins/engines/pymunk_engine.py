@@ -11,7 +11,7 @@ import pymunk
 import pymunk.batch
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, clamp, every, norm, some, span
+from agents.arrays import Array, Index, Mask, Share, clamp, every, norm, some, span
 from twins.engines.engine import Stage, Touch
 from twins.engines.point_mass import Models
 from twins.engines.pymunk_contacts import Contacts, Layers
@@ -34,7 +34,6 @@ AWAY: Final = 1e6  # [m] position of absent mirrored robots
 UNFELT: Final = 1e-12  # [m/s] smaller changes of speed are rounding
 LEAP: Final = 10.0  # [m/s] faster motion of a plan is a jump
 
-Share = Annotated[float, Meta(ge=0, le=1)]
 Friction = Annotated[float, Meta(ge=0, le=10)]
 
 
