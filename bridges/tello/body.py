@@ -25,7 +25,6 @@ from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import FRESH_S, TROUBLE, BodyError, BodyRequest, BodyState, call_all, settings
 from agents.protocols import tello as protocol
-from agents.ticks import Ticks
 from bridges.tello.pilot import Duty, TelloPilot, Vendor
 
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
@@ -150,9 +149,8 @@ class TelloBody:
             self._claims.release()
 
     def _run(self) -> None:
-        ticks = Ticks(max(chosen.rc_hz for chosen in self._settings))
-        while not self._ending.wait(ticks.until_next()):
-            ticks.begin()
+        period = 1.0 / max(chosen.rc_hz for chosen in self._settings)
+        while not self._ending.wait(period):  # not by `Ticks`: a stop needs the lock, and gets it in this pause
             with self._lock:
                 now = time.monotonic()
                 for pilot in self._pilots:
