@@ -146,18 +146,21 @@ class Shape:
         return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
 
 
-def find_shapes(links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None) -> list[Shape]:
+def find_shapes(
+    links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None, climbs: Mask | None = None
+) -> list[Shape]:
     """Places where links and anchors have what they ask for, one for each guess, until one is good.
 
     Args:
         links: With what they ask for, see `residuals.targets_of_law`.
-        guesses: (N, 3) each [m]; heights are held where they are.
+        guesses: (N, 3) each [m].
         moves: (N,) rows that may be placed elsewhere in the plane.
+        climbs: (N,) rows whose heights are free as well; the others are held where they are.
 
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.
     """
-    found, free = [], np.column_stack([moves, moves, np.zeros_like(moves)])
+    found, free = [], np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
     for guess in guesses:
         found.append(fitted_shape(links, anchors, guess, free))
         if found[-1].worst < ENOUGH:

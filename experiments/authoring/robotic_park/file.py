@@ -29,6 +29,7 @@ Pose: TypeAlias = tuple[float, float, float]
 When: TypeAlias = Literal["Continuous", "EventBased", "EvenBased"]  # both spellings are theirs
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
+LENGTH: Final = Meta(min_length=2, max_length=3)  # of a pose
 KINDS: Final = {  # their launcher knows robots by parts of their names as well
     "dron": "crazyflie",
     "crazyflie": "crazyflie",
@@ -54,8 +55,7 @@ class Relation(NamedTuple):
     """Link of a robot to another, or to a place: origin, line or a surface."""
 
     name: str
-    values: tuple[float, ...]
-    centre: Pose | None = None  # [m] of an origin that stands elsewhere
+    values: tuple[float, ...]  # a distance, and of an origin that stands elsewhere its place; or a place; or a line
 
 
 class _Threshold(Struct, frozen=True):
@@ -152,7 +152,7 @@ class Robot(Struct, frozen=True):
 
     name: str
     type: Literal["physical", "virtual", "digital_twin"]
-    pose: Annotated[list[Number], Meta(min_length=2, max_length=3)] | dict[str, Number] | None
+    pose: Annotated[list[Number], LENGTH] | Annotated[dict[str, Number], LENGTH] | None
     uri: str = ""  # of a Crazyflie
     agent_ip: str = ""
     ip: str = ""
@@ -183,7 +183,7 @@ class Robot(Struct, frozen=True):
         """x, y [m], and z [m] or, on wheels, the yaw [rad]; None: not in the file."""
         if self.pose is None:
             return None
-        x, y, z = (*(self.pose.values() if isinstance(self.pose, dict) else self.pose), 0.0, 0.0)[:3]
+        x, y, z = (*(self.pose.values() if isinstance(self.pose, dict) else self.pose), 0.0)[:3]
         return x, y, z or self.init_theta
 
     @property
@@ -420,20 +420,19 @@ def kind_of(name: str) -> str:
 def _relation(part: str, kind: str) -> Relation:
     """A relation as it is written, in a task by distance or pose; raises ValueError."""
     name, *rest = part.split("_")
+    if name in SURFACES:
+        return Relation(name, ())
+    if name in CENTRES and len(rest) == 1:  # sphere_R-x-y-z
+        rest = re.split(r"(?<=[\d.])-", rest[0])
+    name = "origin" if name in CENTRES else "line" if name.startswith("line") else name
+    counts = {"origin": (1, 3, 4), "line": (6,)}.get(name, (3,) if kind == "pose" else (1,))
     try:
-        if name in CENTRES and len(rest) == 1 and re.fullmatch(r"[\d.]+(-[\d.]+){3}", rest[0]):
-            radius, x, y, z = (float(each) for each in rest[0].split("-"))
-            return Relation("origin", (radius,), (x, y, z))
-        if name in SURFACES:
-            return Relation(name, ())
         values = tuple(float(each) for each in rest)
     except ValueError:
-        values = (math.nan,)
-    name = "origin" if name in CENTRES else "line" if name.startswith("line") else name
-    counts = {"origin": (1, 3), "line": (6,)}.get(name, (3,) if kind == "pose" else (1,))
+        values = ()
     if len(values) not in counts or not all(map(math.isfinite, values)):
         raise ValueError(f"'{part}' is no relation of a {kind} task: write name_d, name_x_y_z or origin_R")
-    if len(values) == 1 and values[0] <= 0.0:
+    if len(values) in (1, 4) and values[0] <= 0.0:
         raise ValueError(f"'{part}' asks for a distance that is not positive: give metres, such as 0.8")
     return Relation(name, values)
 

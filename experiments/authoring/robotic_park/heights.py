@@ -12,12 +12,10 @@ from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchors
 from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links
-from experiments.authoring.robotic_park.file import Park, Pose, Relation, Robot
-from experiments.check.realisation import ENOUGH, Shape, fitted_shape
+from experiments.authoring.robotic_park.file import Park, Relation, Robot
+from experiments.check.realisation import ENOUGH, Shape, find_shapes
 
-MET: Final = 1e-3  # [m] and those with three: no further beginnings are drawn
 BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
-DRAWN: Final = 4  # beginnings before the random ones
 ATTEMPTS: Final = 40  # random beginnings
 SPREAD: Final = (0.05, 0.1, 0.3, 0.6)  # [m] standard deviations of theirs
 SHAPE_MET: Final = 0.01  # [m] a larger error is another shape
@@ -39,39 +37,25 @@ def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mas
         start: (N, 3) [m].
         climbs: (N,) robots whose height may be another; the others keep theirs.
     """
-    best: Shape | None = None
-    for number, (guess, free) in enumerate(_beginnings(start, climbs), 1):
-        level = np.ones_like(free)
-        found = fitted_shape(wanted, anchors, guess, np.column_stack([level, level, free]))
-        if best is None or round(found.worst, 4) < round(best.worst, 4):
-            best = found
-        if best.worst <= (ENOUGH if number < DRAWN else MET):
-            break
-    assert best is not None
-    return best
+    moves = np.ones_like(climbs)
+    mirrored = start * [1.0, -1.0, 1.0] + [0.0, 2.0 * start[:, 1].mean(), 0.0]
+    found = find_shapes(wanted, [start, mirrored], moves, anchors)
+    if climbs.any() and found[-1].worst >= ENOUGH:
+        found += find_shapes(wanted, _guesses_in_space(start, climbs), moves, anchors, climbs)
+    return min(found, key=lambda each: round(each.worst, 4))
 
 
-def _beginnings(start: Array, climbs: Mask) -> Iterator[tuple[Array, Mask]]:
-    """Guesses (N, 3) [m] at the places, each with the robots (N,) whose heights are free."""
-    none = np.zeros_like(climbs)
-    middle = start[:, :2].mean(axis=0)
-    away = start[:, :2] - middle
-    way = norm(away)
-    mirrored = start.copy()
-    mirrored[:, 1] = 2.0 * middle[1] - start[:, 1]
-    yield start, none
-    yield mirrored, none
-    if not climbs.any():
-        return
+def _guesses_in_space(start: Array, climbs: Mask) -> Iterator[Array]:
+    yield start
+    way = norm(start[:, :2] - start[:, :2].mean(axis=0))
     dome = start.copy()
     dome[climbs, 2] += np.sqrt(np.maximum((BULGE * way.max(initial=0.0)) ** 2 - way[climbs] ** 2, 0.0))
-    yield start, climbs
-    yield dome, climbs
+    yield dome
     random = np.random.default_rng(0)
     for attempt in range(ATTEMPTS):
         moved = (start, dome)[attempt % 2] + random.normal(0.0, SPREAD[attempt % len(SPREAD)], start.shape)
         moved[~climbs, 2] = start[~climbs, 2]
-        yield moved, climbs
+        yield moved
 
 
 @dataclass(frozen=True)
@@ -135,15 +119,16 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     return Heights(start, shape, hover, anchored, (0.0, 0.0, round(lift, 3)))
 
 
-def origin_of(park: Park, robot: Robot, relation: Relation) -> Pose | None:
+def origin_of(park: Park, robot: Robot, relation: Relation) -> tuple[float, ...] | None:
     """Place [m] of the origin that a robot keeps a distance to; None where it is that of the arena.
 
     The file may give one. If not, the driver of real Crazyflies has one of its own (`REAL_ORIGIN`); those of Kheperas
     and in Webots, and the central controller, take that of the arena.
     """
+    if len(relation.values) == 4:
+        return relation.values[1:]
     own = robot.kind == "crazyflie" and robot.type != "virtual" and not park.central
-    of_driver = REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
-    return relation.centre or of_driver
+    return REAL_ORIGIN if own and relation.name == "origin" and len(relation.values) == 1 else None
 
 
 def _starts(park: Park, notes: list[str]) -> Array:
@@ -173,7 +158,7 @@ def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anc
     by_pose = np.array([kind == "pose" for _, kind, _ in asked], dtype=bool)
     wants, distance = np.where(by_pose, BY_RELATIVE, BY_DISTANCE), np.where(by_pose, np.nan, value[:, 0])
     links = Links(i, j, distance, np.ones(len(i)), value, np.full_like(value, np.nan), wants)
-    rings = [(robot, each) for robot, _, each in every if each.name == "origin" and len(each.values) == 1]
+    rings = [(robot, each) for robot, _, each in every if each.name == "origin" and len(each.values) != 3]
     if not rings:
         return links, None
     points = np.array([origin_of(park, robot, each) or (0.0, 0.0, 0.0) for robot, each in rings])

@@ -288,6 +288,7 @@ def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
         ("type: virtual\n    name: khepera02", "type: imagined\n    name: khepera02", "type: Invalid enum value", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90; 0.00", "Robots.Robot02.pose[0]: Expected `float`", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "Robots.Robot02.pose: Expected", 0),
+        ("pose: 0.90, 0.00, 0.00", "pose: {}", "Robots.Robot02.pose: Expected `object` of length >= 2", 0),
         ("    pose: 0.90, 0.00, 0.00\n", "", "Robots.Robot02: Object missing required field `pose`", 0),
         ("khepera03_0.8", "khepera04_0.8", "no other robot is called 'khepera04'", 0),
         ("khepera03_0.8", "khepera03_x", "task: 'khepera03_x' is no relation of a distance task", 0),
