@@ -425,6 +425,14 @@ class Experiment(Part, frozen=True):
     ] = {}
 
     @property
+    def processes(self) -> dict[str, list[str]]:
+        """Robots of each process, by its name."""
+        groups: dict[str, list[str]] = {}
+        for name, robot in self.robots.items():
+            groups.setdefault(robot.process or name, []).append(name)
+        return groups
+
+    @property
     def phases(self) -> list[tuple[float, str]]:
         """Phases of a run: their beginnings since the common start [s], and their names."""
         legs = sorted(self.timeline, key=lambda leg: leg.at_s)

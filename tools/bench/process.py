@@ -81,7 +81,7 @@ def process() -> Iterator[Figure]:
                 senders = mine.links.by_sender(mine.robots)
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
-                    f"bare-{robot}", "tools.bench.bare_process", robot, rate, *senders, "--connect", endpoints[0]
+                    f"bare-{robot}", "tools.bench.bare_process", endpoints[0], robot, rate, *senders
                 )
                 beside[robot] = started.handle.pid
             source, hosts = folder / SOURCE, Hosts(launcher, endpoints)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Sequence
@@ -10,11 +11,10 @@ from typing import Final
 
 import msgspec
 
-from experiments.file.problems import DocumentError
+from agents.errors import ExplainedError
 from experiments.recording import playback
-from experiments.recording.playback import NotStarted
-from experiments.recording.reader import RecordingError, recover
-from experiments.report.page import Finding, Section, Table, date_of, render
+from experiments.recording.reader import recover
+from experiments.report.page import NONE, Finding, Section, Table, date_of, render
 from experiments.report.page import Row as Line
 from tools.reliability.faults import FAULT_KINDS, FAULTS, Fault
 
@@ -29,7 +29,6 @@ class FaultResult(msgspec.Struct, frozen=True):
     recovered: bool  # in time
     at_s: float  # from the common start [s]
     begin_s: float  # from its begin to the recovery [s]
-    end_s: float  # from its end to the recovery [s]; 0 if that came earlier
     ended: bool  # robots came down instead of going on, dead ones not counted
     violations: list[str]  # of the invariants
 
@@ -61,7 +60,7 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
             recover(recording, mended)
             recording = mended
         read = playback.read(recording)
-    except (RecordingError, NotStarted, DocumentError, OSError) as error:
+    except (ExplainedError, OSError) as error:
         return [f"the recording does not open: {error}"]
     if disk_full:
         return []
@@ -90,52 +89,45 @@ class ChaosResult(msgspec.Struct, frozen=True):
     outcomes: list[FaultResult]
     rounds: list[RoundResult]
 
-    @property
-    def violations(self) -> int:
-        return sum(len(each.violations) for each in self.outcomes) + sum(len(each.violations) for each in self.rounds)
-
 
 def table(result: ChaosResult) -> Table:
     """A row for each kind of fault."""
     lines = []
     for kind in FAULTS:
         mine = [each for each in result.outcomes if each.fault.kind == kind]
-        if mine:
-            well = [each.begin_s for each in mine if each.recovered]
-            lines.append(
-                (
-                    kind,
-                    *map(str, (len(mine), len(well), sum(each.ended for each in mine))),
-                    *(f"{what(well):.1f} s" if well else "–" for what in (statistics.median, max)),
-                    str(sum(len(each.violations) for each in mine)),
-                )
-            )
+        well = [each.begin_s for each in mine if each.recovered]
+        counts = len(mine), len(well), sum(each.ended for each in mine)
+        times = (f"{what(well):.1f} s" if well else NONE for what in (statistics.median, max))
+        wrong = sum(len(each.violations) for each in mine)
+        lines += [Line((kind, *map(str, counts), *times, str(wrong)))] if mine else []
     head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations")
-    return Table(head, tuple(map(Line, lines)), note="Times count from the begin of the fault.")
+    return Table(head, tuple(lines), note="Times count from the begin of the fault.")
 
 
 def findings(result: ChaosResult) -> list[Finding]:
-    done, rounds = len(result.outcomes), result.rounds
-    wanted = len(result.script)
-    found = [Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds")]
-    nearest = min((each.nearest_m for each in rounds), default=float("inf"))
-    found.append(Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"))
+    """The verdict; bad findings are violations, or faults that could not be done."""
+    done, wanted, rounds = len(result.outcomes), len(result.script), result.rounds
+    nearest = min((each.nearest_m for each in rounds), default=math.inf)
     late = max((each.gone_s for each in rounds), default=0.0)
-    found.append(Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"))
-    found += [
-        Finding("fair", f"round {each.round}: the machine was too busy, {100 * each.missed:.0f} % of ticks were missed")
-        for each in rounds
-        if each.missed > BUSY
+    found = [
+        Finding("good" if done == wanted else "bad", f"{done} of {wanted} faults in {len(rounds)} rounds"),
+        Finding("plain", f"robots came as near as {nearest:.3f} m to each other, surface to surface"),
+        Finding("plain", f"after the end of a round all of its processes were gone within {late:.1f} s"),
     ]
+    for each in rounds:
+        if each.missed > BUSY:
+            text = f"the machine was too busy, {100 * each.missed:.0f} % of ticks were missed"
+            found.append(Finding("fair", f"round {each.round}: {text}"))
     wrong = [line(each) for each in result.outcomes if each.violations]
     wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
-    return [*found, *(Finding("bad", text) for text in wrong)] if wrong else [*found, Finding("good", "0 violations")]
+    return found + ([Finding("bad", text) for text in wrong] or [Finding("good", "0 violations")])
 
 
 def write(folder: Path, result: ChaosResult, command: str) -> Path:
     """Write `chaos.json` and `chaos.html` into a folder."""
     (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
     rows = tuple(Line((line(each),)) for each in result.outcomes)
+    folded = "Show the list" if len(rows) > SMALL else ""
     return render(
         folder / PAGE,
         title=f"Faults: {result.experiment}",
@@ -145,11 +137,7 @@ def write(folder: Path, result: ChaosResult, command: str) -> Path:
         verdict=findings(result),
         sections=[
             Section("By kind", tables=(table(result),)),
-            Section(
-                "Every fault",
-                tables=(Table(("What",), rows, words=True),),
-                folded="Show the list" if len(rows) > SMALL else "",
-            ),
+            Section("Every fault", tables=(Table(("What",), rows, words=True),), folded=folded),
             Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in FAULT_KINDS.items())),
         ],
     )

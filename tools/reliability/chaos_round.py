@@ -171,7 +171,7 @@ class ChaosRound:
         left = set() if self._begun["conductor"] or run.over else active.there - run.dead.keys()
         down = sorted(filter(observer.is_down, left))
         note = "; ".join(filter(None, (active.note, *(f"{name}: {observer.status[name].reason}" for name in down))))
-        times = round(at_s, 2), round(well - active.begun, 3), round(max(0.0, well - active.lifted), 3)
+        times = round(at_s, 2), round(well - active.begun, 3)
         outcome = FaultResult(self._number, fault, victim, note, not why, *times, bool(down), active.violations)
         self.outcomes.append(outcome)
         self._active = None

@@ -63,8 +63,7 @@ class ActiveFault:
 
     def __post_init__(self) -> None:
         self._utc, self._events = time.time(), len(self.observer.events)
-        statuses = self.observer.status
-        self._incidents = {name: each.incidents[-1].seq for name, each in statuses.items() if each.incidents}
+        self._before = dict(self.observer.status)
         self._held_at: Array | None = None
         self.observer.orders.clear()
 
@@ -150,9 +149,8 @@ class ActiveFault:
 
     def incidents(self, name: str, what: str) -> list[messages.Incident]:
         """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
-        last = self._incidents.get(name, 0)
-        new = [each for each in self.observer.status[name].incidents if each.seq > last and what in each.text]
-        return [each for each in new if each.text.startswith(("hold", "land", "cut"))]
+        new = self.observer.status[name].incidents_since(self._before.get(name))
+        return [each for each in new if what in each.text and each.text.startswith(("hold", "land", "cut"))]
 
 
 # ---------------------------------------------------------------------- the faults

@@ -33,8 +33,7 @@ class Invariants:
     def __init__(self, experiment: Experiment) -> None:
         """No position is known yet."""
         self.names = tuple(experiment.robots)
-        row = {name: number for number, name in enumerate(self.names)}
-        self._row = row
+        self._row = {name: number for number, name in enumerate(self.names)}
         kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
         self._kinds = dict(zip(self.names, kinds, strict=True))
         self._radius = np.array([kind.radius for kind in kinds])
@@ -43,7 +42,7 @@ class Invariants:
         x, y, z = experiment.arena.size
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
-        self.position: Array = np.full((len(row), 3), np.nan)
+        self.position: Array = np.full((len(kinds), 3), np.nan)
         plan = Plan(experiment)
         self._law, formation = plan.law, plan.formation
         if formation.presence is not None:  # links by range may end at any time
@@ -66,27 +65,23 @@ class Invariants:
 
     def violations(self) -> list[str]:
         """Violations that have begun since the last call."""
-        wrong = {*self._robots_outside(), *self._overlaps()}
-        new = sorted(wrong - self._wrong)
-        self._wrong = wrong
+        p = self.position
+        outside = ((p < self._low) | (p > self._high)).any(axis=1)
+        wrong = {f"{self.names[row]} is outside the arena" for row in np.flatnonzero(outside)}
+        wrong |= {f"{self.names[i]} and {self.names[j]} overlap" for i, j in self._overlaps(p)}
+        new, self._wrong = sorted(wrong - self._wrong), wrong
         return new
 
-    def _robots_outside(self) -> list[str]:
-        p = self.position
-        out = ((p < self._low) | (p > self._high)).any(axis=1)
-        return [f"{self.names[row]} is outside the arena" for row in np.flatnonzero(out).tolist()]
-
-    def _overlaps(self) -> list[str]:
-        p = self.position
+    def _overlaps(self, p: Array) -> list[tuple[int, int]]:
+        """Pairs of robots that overlap at positions (N, 3); keeps the least distance of any two."""
         first, second = np.triu_indices(len(p), 1)
         level = norm(p[first, :2] - p[second, :2]) - (self._radius[first] + self._radius[second])
         bottom, top = p[:, 2], p[:, 2] + self._height
         upright = np.maximum(bottom[first] - top[second], bottom[second] - top[first])
-        outside = np.hypot(np.maximum(level, 0.0), np.maximum(upright, 0.0))
-        if len(outside) and np.isfinite(outside).any():
-            self.nearest = min(self.nearest, float(np.nanmin(outside)))
+        gap = np.hypot(np.maximum(level, 0.0), np.maximum(upright, 0.0))
+        self.nearest = min(self.nearest, float(np.nan_to_num(gap, nan=np.inf).min(initial=np.inf)))
         both = (level < -TOUCH_M) & (upright < -TOUCH_M)
-        return [f"{self.names[first[k]]} and {self.names[second[k]]} overlap" for k in np.flatnonzero(both).tolist()]
+        return list(zip(first[both].tolist(), second[both].tolist(), strict=True))
 
     def formation_error(self, live: Collection[str], t: float) -> float:
         """The largest error [m] of links between robots that live, as their law measures it; 0 without any.

@@ -91,9 +91,6 @@ class Sampler(ExitStack):
     def __init__(self, experiment: Experiment, folder: Path, case: str) -> None:
         super().__init__()
         self._experiment, self._recording, self._table = experiment, folder / f"{case}.mcap", folder / TABLE
-        self._groups: dict[str, list[str]] = {}
-        for name, robot in experiment.robots.items():
-            self._groups.setdefault(robot.process or name, []).append(name)
         self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
         self._died: dict[str, float] = {}
         self._news = News()
@@ -131,7 +128,7 @@ class Sampler(ExitStack):
             known = [{name: text for name, text in row.items() if text} for row in csv.DictReader(file)]
         return Soaked(
             self._experiment.title,
-            tuple(map("+".join, self._groups.values())),
+            tuple(map("+".join, self._experiment.processes.values())),
             self._experiment.duration_s,
             msgspec.convert(known, list[Row], strict=False),
             self._died,

@@ -115,10 +115,7 @@ class SpoiltRun:
         self.answer = messages.RunReply()
         self._keys = Keys(experiment.network.realm)
         self._stopped: list[int] = []
-        groups: dict[str, list[str]] = {}
-        for name, robot in experiment.robots.items():
-            groups.setdefault(robot.process or name, []).append(name)
-        self._process_of = {name: "+".join(names) for names in groups.values() for name in names}
+        self._process_of = {name: "+".join(names) for names in experiment.processes.values() for name in names}
         self.switch("lease").write(LEASE_S if stage == "patient router" else 0.0)
         changes = [*setting.changes, f"network.listen={json.dumps(self.routers)}"]
         changes.append(f"network.routers={len(self.routers)}")

@@ -45,9 +45,7 @@ class CaseProcesses:
         """Start nothing yet."""
         self._context = context
         self._launcher = context.launcher
-        self._groups: dict[str, list[str]] = {}  # by process, without the case
-        for name, robot in context.experiment.robots.items():
-            self._groups.setdefault(robot.process or name, []).append(name)
+        self._groups = context.experiment.processes  # by process, without the case
         self._servants = Servants(context)
         self.adopted: set[str] = set()  # robots that others have started, or will
         # hosts without address, by the robots that are started there
