@@ -56,13 +56,14 @@ class ActiveFault:
     observer: Observer
     there: set[str]  # robots under way before
     begun: float = field(default_factory=time.monotonic)
+    utc: float = field(default_factory=time.time)  # the same by the wall clock [s]
     live: set[str] = field(default_factory=set)  # robots under way now
     lifted: float = 0.0
     note: str = ""  # for the report
     violations: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._utc, self._events = time.time(), len(self.observer.events)
+        self._events = len(self.observer.events)
         self._before = dict(self.observer.status)
         self._held_at: Array | None = None
         self.observer.orders.clear()
@@ -132,7 +133,7 @@ class ActiveFault:
         limit = self.run.experiment.safety.link_silence_s + NOTICED_S
         free = []
         for name in sorted(self.live - self.run.shifted):
-            since = [each.stamp - self._utc for each in self.incidents(name, "router")]
+            since = [each.stamp - self.utc for each in self.incidents(name, "router")]
             if not since:
                 free.append(name)
             elif min(since) > limit:

@@ -1,0 +1,89 @@
+"""A check that cannot fail checks nothing: each is shown a run that is not well."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from agents.network.messages import Event, Incident
+from experiments.file.document import load
+from tools.reliability.faults import ActiveFault, Fault
+from tools.reliability.observer import Invariants
+
+
+def status(phase="running", *, missing=(), incidents=()):
+    new = list(incidents)
+    return SimpleNamespace(phase=phase, missing=list(missing), incidents=new, incidents_since=lambda _: new)
+
+
+@pytest.fixture
+def it():
+    experiment = load("triangle").cases()["event"]
+    observer = SimpleNamespace(
+        invariants=Invariants(experiment), events=[], orders=[], alive=set(), connected=True,
+        status={name: status() for name in experiment.robots}, status_at=dict.fromkeys(experiment.robots, 1e12),
+        receivers={"CF01": {"KH01", "KH02"}}, is_down=lambda name: observer.status[name].phase in ("landing", "done"),
+    )  # fmt: skip
+    run = SimpleNamespace(experiment=experiment, dead={}, shifted=set())
+    active = ActiveFault(Fault("kill", 1.0, victim="CF01"), "CF01", run, observer, set(experiment.robots))
+    active.live = {"KH01", "KH02"}
+    return active
+
+
+def test_the_end_of_a_process_is_reported_since_the_fault(it):
+    it.observer.events.append(Event(0.0, "router2", "", "ended with exit code 1"))
+    assert it.reported("router")() == ""
+    assert it.reported("recorder")() == "the end of the recorder is not reported"
+    again = ActiveFault(it.fault, "", it.run, it.observer, set())
+    assert again.reported("router")() == "the end of the router is not reported", "the one before does not count"
+
+
+def test_a_loss_is_noticed_by_all_who_receive(it):
+    it.observer.alive.add("CF01")
+    assert "its token still stands" in it.loss_noticed()
+    it.observer.alive.clear()
+    it.observer.status["KH01"] = status(missing=["CF01"])
+    assert it.loss_noticed() == "KH02: not noticed that CF01 is lost"
+    it.observer.status["KH02"] = status(missing=["CF01"])
+    assert it.loss_noticed() == ""
+
+
+def test_a_victim_is_back_or_down(it):
+    assert it.back() == "CF01 is not back"
+    it.observer.invariants.place("CF01", (0.0, 0.0, 0.5))
+    it.observer.status["CF01"] = status("landing")
+    assert it.back() == "CF01 has not come down yet"
+    it.observer.invariants.place("CF01", (0.0, 0.0, 0.0))
+    assert it.back() == ""
+    it.observer.status_at["CF01"] = -1.0
+    assert it.back() == "no status of CF01 yet"
+
+
+def test_all_hold_for_a_silent_router_in_time(it):
+    limit = it.run.experiment.safety.link_silence_s
+    it.observer.status["KH01"] = status(incidents=[Incident(1, it.utc + limit, "hold: no connection to a router")])
+    assert it.all_held() == "KH02: never held while the router was frozen"
+    assert it.violations == []
+    it.observer.status["KH02"] = status(incidents=[Incident(1, it.utc + limit + 9, "hold: no connection to a router")])
+    assert it.all_held() == ""
+    assert it.violations == [f"KH02 held only {limit + 9:.1f} s after the router had frozen"]
+
+
+def test_a_lost_position_is_a_violation_once(it):
+    it.observer.status["KH01"] = status(incidents=[Incident(1, 0.0, "over: its own position is lost"),
+                                                   Incident(2, 0.0, "hold: its own position is lost")])  # fmt: skip
+    assert (it.positions_kept(), it.positions_kept()) == ("", "")
+    assert it.violations == ["KH01: hold: its own position is lost"]
+
+
+def test_all_land_without_a_conductor(it):
+    it.observer.invariants.place("CF01", (0.0, 0.0, 0.5))
+    it.observer.status = {name: status("done") for name in it.observer.status}
+    it.observer.status["KH02"] = status("landing")
+    assert it.all_landed() == "in the air ['CF01'], not done ['KH02']"
+
+
+def test_a_body_that_nothing_steers_stops(it):
+    it.begun -= 2.0
+    it.observer.moved = lambda _, before: 0.3
+    it.check_held()
+    assert it.violations == ["CF01 moved although no process steered it"]
