@@ -1,1 +1,5 @@
-"""The experiment: its file, its check, its two clocks, its recording and its report."""
+"""The experiment: its file, its check, its two clocks, its recording and its report.
+
+May import: agents, twins, experiments.definition, experiments.file, experiments.recording, experiments.metrics,
+experiments.virtual_time, experiments.report.
+"""

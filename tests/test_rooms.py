@@ -141,10 +141,19 @@ def plugged_in() -> set[str]:
     return set(re.findall(r'= "((?:agents|bridges|twins|experiments|tools)[\w.]*):', text))
 
 
-def test_every_folder_says_what_lives_there():
-    silent = []
-    for folder in {file.parent for file in modules().values()}:
+def test_every_folder_says_what_lives_there_and_imports_no_more_than_it_says():
+    silent, beyond = [], []
+    for folder in sorted({file.parent for file in modules().values()}):
         tree = ast.parse((folder / "__init__.py").read_text("utf-8"))
-        if ast.get_docstring(tree) is None or len(tree.body) > 1:
+        says = re.search(r"\n\n(?:.*\n)?May import: ([\w., \n]+)\.$", ast.get_docstring(tree) or "")
+        if says is None or len(tree.body) > 1:
             silent.append(str(folder.relative_to(ROOT)))
-    assert not silent, "each __init__.py holds two or three lines of docstring, and nothing else"
+            continue
+        named = [name for name in re.split(r",\s+", says[1]) if name != "nothing"]
+        assert not [name for name in named if not any(f"{each}.".startswith(f"{name}.") for each in modules())]
+        may = tuple(f"{name}." for name in named)
+        inside = {name for name, file in modules().items() if file.parent == folder}
+        others = {(name, to) for name in inside for to in imports()[name] - inside}
+        beyond += [f"{name} imports {to}" for name, to in sorted(others) if not f"{to}.".startswith(may)]
+    assert not silent, "each __init__.py is a docstring: what lives there, and its last lines 'May import: ...'"
+    assert not beyond, "the folder's __init__.py does not name that"

@@ -1,1 +1,4 @@
-"""The command line and what it offers beyond running an experiment."""
+"""The command line and what it offers beyond running an experiment.
+
+May import: agents, twins, bridges, experiments, tools.commands, tools.bench, tools.reliability.
+"""

@@ -1,4 +1,4 @@
 """Levels of one tick, pure and row-wise: neighbours, goals, position control, transmission.
 
-Imports body, plugins, formation.
+May import: agents.body, agents.network, agents.plugins, agents.formation, agents.arrays.
 """

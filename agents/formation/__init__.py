@@ -1,1 +1,4 @@
-"""Formation graph and its theory: links, rigidity, anchors, changes of shape. Imports arrays only."""
+"""Formation graph and its theory: links, rigidity, anchors, changes of shape.
+
+May import: agents.arrays.
+"""

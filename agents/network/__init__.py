@@ -1,3 +1,4 @@
 """Zenoh: keys, messages, their validation, sessions, publishers and subscribers, access control, the modelled channel.
-Imports arrays only.
+
+May import: agents.arrays, agents.clock, agents.errors.
 """

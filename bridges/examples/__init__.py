@@ -1,1 +1,4 @@
-"""Templates: external simulators as bodies of robots."""
+"""Templates: external simulators as bodies of robots.
+
+May import: nothing.
+"""

@@ -1,1 +1,4 @@
-"""Khepera IV over TCP or a serial line: the body, one link per robot, odometry."""
+"""Khepera IV over TCP or a serial line: the body, one link per robot, odometry.
+
+May import: agents.
+"""

@@ -1,1 +1,4 @@
-"""DJI Tello through djitellopy: the body, one pilot per drone."""
+"""DJI Tello through djitellopy: the body, one pilot per drone.
+
+May import: agents.
+"""

@@ -1,1 +1,4 @@
-"""TurtleBot3 over Zenoh (zenoh-bridge-ros2dds or rmw_zenoh): the body, and one robot with its topics."""
+"""TurtleBot3 over Zenoh (zenoh-bridge-ros2dds or rmw_zenoh): the body, and one robot with its topics.
+
+May import: agents.
+"""

@@ -1,1 +1,4 @@
-"""Vicon motion capture: a DataStream client, and the process that publishes poses."""
+"""Vicon motion capture: a DataStream client, and the process that publishes poses.
+
+May import: agents.
+"""

@@ -1,1 +1,4 @@
-"""Sources of experiment files: generated formations, and the files of Robotic Park."""
+"""Sources of experiment files: generated formations, and the files of Robotic Park.
+
+May import: agents, twins, experiments.catalogue, experiments.file, experiments.check.
+"""

@@ -1,1 +1,4 @@
-"""The experiment files that come with zenpark, and where they lie. Imports nothing."""
+"""The experiment files that come with zenpark, and where they lie.
+
+May import: nothing.
+"""

@@ -1,1 +1,4 @@
-"""From text to a definition: reading, overrides, cases, and every error with file:line:column. Imports definition."""
+"""From text to a definition: reading, overrides, cases, and every error with file:line:column.
+
+May import: agents, twins, experiments.definition, experiments.catalogue.
+"""

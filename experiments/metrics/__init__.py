@@ -1,1 +1,4 @@
-"""From a trace to numbers. Imports recording, definition."""
+"""From a trace to numbers.
+
+May import: agents, twins, experiments.definition, experiments.recording.
+"""

@@ -1,1 +1,4 @@
-"""The real clock: conductor, hosts, and the processes that they start."""
+"""The real clock: conductor, hosts, and the processes that they start.
+
+May import: nothing.
+"""

@@ -1,4 +1,5 @@
 """The view in a browser (`./zenpark view`): a live run as an observer sees it, a recording, or a paced virtual run.
 
-Imports all of experiments but sweeps.
+May import: agents, twins, experiments.definition, experiments.file, experiments.recording, experiments.scene,
+experiments.virtual_time, experiments.real_time.
 """

@@ -1,1 +1,4 @@
-"""Speed, measured beside a baseline."""
+"""Speed, measured beside a baseline.
+
+May import: agents, twins, experiments, tools.commands, tools.reliability.
+"""

@@ -1,1 +1,4 @@
-"""Commands, one file per subject: signatures and what they do. Imports everything below tools when a command runs."""
+"""Commands, one file per subject: signatures and what they do.
+
+May import: agents, twins, experiments, tools.completion, tools.live_table, tools.progress.
+"""

@@ -1,1 +1,4 @@
-"""Protocol twins: simulated devices with the real wire protocol, to which the unmodified vendor library connects."""
+"""Protocol twins: simulated devices with the real wire protocol, to which the unmodified vendor library connects.
+
+May import: agents, twins.body, twins.models.
+"""

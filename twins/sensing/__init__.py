@@ -1,1 +1,4 @@
-"""Range sensors of twins, and ray casting."""
+"""Range sensors of twins, and ray casting.
+
+May import: agents, twins.models, twins.scene, twins.engines.
+"""

@@ -1,1 +1,4 @@
-"""Starting processes here and, over ssh, on other machines; their clocks and certificates."""
+"""Starting processes here and, over ssh, on other machines; their clocks and certificates.
+
+May import: agents, twins, bridges, experiments.definition, experiments.recording.
+"""

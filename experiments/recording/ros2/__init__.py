@@ -1,1 +1,4 @@
-"""Messages of a recording as ROS 2 messages: our own structs, and the standard types that viewers draw."""
+"""Messages of a recording as ROS 2 messages: our own structs, and the standard types that viewers draw.
+
+May import: agents.
+"""

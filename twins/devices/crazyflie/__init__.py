@@ -1,1 +1,4 @@
-"""Protocol twin of the Crazyflie 2.x: CRTP over UDP, for an unmodified cflib."""
+"""Protocol twin of the Crazyflie 2.x: CRTP over UDP, for an unmodified cflib.
+
+May import: agents, twins.body, twins.models, twins.devices.
+"""
