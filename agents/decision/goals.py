@@ -1,4 +1,4 @@
-"""Goals of rows: law, plans and links of a formation, from own positions and received poses.
+"""Goals of rows: formation law, plans, links and station keeping, from own positions and received poses.
 
 Pure and row-wise. A robot computes its own goal from its measured position; the central controller computes the goals
 of all robots that it guides from their last received poses.

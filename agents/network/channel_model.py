@@ -1,4 +1,4 @@
-"""A modelled network: delay, jitter, loss in bursts or alone, limited bandwidth and outages, on each link by itself.
+"""Channel model: delay, jitter, loss in bursts or alone, limited bandwidth and outages, on each link by itself.
 
 The virtual clock sends through it, and so does the receiver of a real network: samples that have arrived wait here
 until the model lets them through. The fate of a sample follows from the seed, the names at the two ends of its link and

@@ -11,13 +11,14 @@ import numpy as np
 
 from agents.arrays import Array, Mask, norm
 from agents.decision.position_control import REACHED
-from agents.formation.graph import BY_DISTANCE
+from agents.formation.graph import BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Finding
 from experiments.check.ideal_run import approaches, fly_repeatedly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, GAIN, OFF, strength
+from experiments.definition.links import gain_key
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up
@@ -192,11 +193,12 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
     if not len(stopped) or np.setdiff1d(ends, np.union1d(stopped, analysis.without_neighbours)).size:
         return None
     near = f"{1e3 * REACHED:g} mm"
+    by_distance = links.wants is None or (links.wants[off] == BY_DISTANCE).any()
+    name = gain_key(analysis.assignment.law, BY_DISTANCE if by_distance else BY_RELATIVE)
     message = (
         f"the formation is not acquired, because robots on wheels stop {near} before their goals: links may stay "
-        f"e = {near}/(μ d²) off; {left}"
+        f"e = {near}/{'(μ d²)' if name == 'gain' else 'k'} off; {left}"
     )
-    name = "gain" if links.wants is None or (links.wants[off] == BY_DISTANCE).any() else "stiffness"
     enough = 1.1 * getattr(experiment.formation, name) * float(analysis.error[at].max()) / experiment.tolerance
     remedy, path = f"raise {name} to {enough:.2g} or more, or allow a larger tolerance", ("formation", name)
     if (own := strength(analysis)) not in GAIN.values():

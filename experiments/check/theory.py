@@ -15,6 +15,7 @@ from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
+from experiments.definition.links import gain_key
 from experiments.file.problems import Path
 
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
@@ -276,7 +277,7 @@ def stability(analysis: Analysis) -> Iterator[Finding]:
         remedy = "look for a length of 0 and for fields of `links` that are NaN (docs/plugins.md)"
         yield Finding("error", "not-finite", message, remedy, ("formation", "law"))
         return
-    name = "gain" if _measured(analysis).any() or not analysis.standing.any() else "stiffness"
+    name = gain_key(law, BY_DISTANCE if _measured(analysis).any() or not analysis.standing.any() else BY_RELATIVE)
     path, gain = ("formation", name), float(getattr(formation, name))
     took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
     calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"

@@ -204,9 +204,10 @@ class Formation(Part, frozen=True):
     gain: Annotated[
         Positive, Meta(description="μ of links that ask for a distance [1/(m²·decision)] (paper, eq. (6))")
     ] = 3.0
-    stiffness: Annotated[Positive, Meta(description="k of links that ask for an offset or a bearing [1/decision]")] = (
-        0.5
-    )
+    stiffness: Annotated[
+        Positive,
+        Meta(description="k of links that ask for an offset or a bearing, or of all if the law says so [1/decision]"),
+    ] = 0.5
     clamp: Annotated[Positive, Meta(description="largest step of the goal per axis and decision [m]")] = 0.1
     tracking_gain: Annotated[NotNegative, Meta(description="k [1/(m²·decision)] (paper, eq. (7))")] = 3.0
     leader: Annotated[Name | None, Meta(description="left out: every robot without neighbours")] = None

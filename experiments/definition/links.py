@@ -116,13 +116,16 @@ def held_height(experiment: Experiment, name: str) -> float:
     return experiment.robots[name].hover or 0.0
 
 
-def _gain(experiment: Experiment, law: Law, wants: int) -> float:
-    """The formation's gain for a kind of target, as the law takes it."""
-    formation = experiment.formation
+def gain_key(law: Law, wants: int) -> str:
+    """Key of `[formation]`, `gain` or `stiffness`, that is the gain of links with a kind of target, as the law says."""
     by = getattr(law, "PULLS_BY", "gain")
     if by == "by link":
         by = "gain" if wants == BY_DISTANCE else "stiffness"
-    return formation.stiffness if by == "stiffness" else formation.gain
+    return str(by)
+
+
+def _gain(experiment: Experiment, law: Law, wants: int) -> float:
+    return float(getattr(experiment.formation, gain_key(law, wants)))
 
 
 def _remedy(text: str) -> str:

@@ -17,8 +17,7 @@ from experiments.definition.links import FORM, held_height, link_pairs
 from experiments.file import consistency_network
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 from twins import scene as outlines
-from twins.models.differential import DRIVES as DRIVEN
-from twins.models.quadrotor import RESPONSES
+from twins.engines.point_mass import TWINLESS, has_model
 from twins.scene import Scene
 from twins.sensing.range_sensors import SENSORS
 
@@ -173,9 +172,8 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
         hint = f"write kind = '{driven}', or a body of a {robot.kind}: twin, world, {own}"
         yield Fault((*path, "body"), f"'{body}' drives a {driven}, and {name} is a {robot.kind}", hint)
-    elif body in ("twin", WORLD) and robot.kind in KINDS.keys() - DRIVEN.keys() - RESPONSES.keys():
-        hint = "add it to DRIVES or RESPONSES in twins/models (docs/plugins.md), or name another body"
-        yield Fault((*path, "kind"), f"no twin of '{robot.kind}'", hint)
+    elif body in ("twin", WORLD) and robot.kind in KINDS and not has_model(KINDS[robot.kind]):
+        yield Fault((*path, "kind"), f"no twin of '{robot.kind}'", TWINLESS)
     if robot.kind in KINDS:
         yield from _hover(experiment, path, robot)
     else:

@@ -279,7 +279,7 @@ def test_every_kind_has_a_twin_and_a_stranger_has_none():
         assert body(kind).read(0.0).position.shape == (1, 3)
     whole = request({"R": Robot(kind="khepera4", start=[0.0, 0.0])})
     submarine = replace(KINDS["khepera4"], name="submarine")
-    with pytest.raises(BodyError, match="no twin of 'submarine'; add it to DRIVES"):
+    with pytest.raises(BodyError, match="no twin of 'submarine'; add it to RESPONSES"):
         TwinBody(replace(whole, kinds=(submarine,)))
 
 

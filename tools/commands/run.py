@@ -44,6 +44,7 @@ app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
 FAILED: Final = 1  # and of one in which a robot did not do its part
+FEW: Final = 6  # hazards of runs in virtual time that are printed
 
 
 @app.command(epilog=example("run robotic-park --virtual --seed 1", "run triangle --case event --tag paper"))
@@ -289,13 +290,13 @@ def _refuse(options: RunOptions, show: _Shown, *, virtual: bool, seeds: int) -> 
 
     if seeds > 1 and not virtual:
         hint = "in real time, run once per --seed; `./zenpark report RUN RUN --pool` makes one of them"
-        raise refusal("--seeds", "needs --virtual", hint)
+        raise refusal("--seeds", "only for --virtual", hint)
     check_bodies(options.bodies)
     for option, given in (("--bodies", options.bodies), ("--lab", options.lab)):
         if given is not None and virtual:
-            raise refusal(option, "is for real time", "leave out --virtual")
+            raise refusal(option, "only for real time", "leave out --virtual")
     if show.pace is not None and not (virtual and show.view):
-        raise refusal("--pace", "is for --virtual --view", "add both, or leave it out")
+        raise refusal("--pace", "only for --virtual --view", "add both, or leave it out")
     if show.view:
         viewing.require_viser()
         if seeds > 1:
@@ -348,6 +349,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
 
     cases = [case for each in runs for case in each.metrics.values()]
     yield from (finding.text for finding in verdict.interruptions(cases))
+    yield from _hazards(runs)
     yield from (_case_line(name, runs, found) for name in found["cases"])
     if any(case.leaders for case in cases):
         yield verdict.left_out(cases)
@@ -359,6 +361,20 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
     if page is not None:
         yield f"report: {page}"
     yield f"replay in the browser: ./zenpark view {runs[0].folder}"
+
+
+def _hazards(runs: Sequence[Run]) -> Iterator[str]:
+    """The first hazards of runs in virtual time, in the words of a run in real time, which prints each as it comes."""
+    found = [
+        f"{case}: hazard {event.source}: {event.text} (at {event.stamp:.1f} s)"
+        for run in runs
+        for case, trace in run.traces.items()
+        for event in trace.events
+        if event.kind == "hazard" and run.metrics[case].clock == "virtual"
+    ]
+    yield from found[:FEW]
+    if (more := len(found) - FEW) > 0:
+        yield f"and {more} more, in the recording and the report"
 
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:

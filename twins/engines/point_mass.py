@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final
 
 import msgspec
 import numpy as np
@@ -12,6 +12,7 @@ from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask, span
 from agents.body.interface import BodyError
+from agents.body.kinds import Kind
 from twins.engines.engine import Stage, Touch
 from twins.models.differential import DRIVES, Differential
 from twins.models.onboard_flight import OnboardFlight
@@ -34,16 +35,25 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
 
 
+TWINLESS: Final = (  # remedy for a kind of which `has_model` is false
+    "add it to RESPONSES if it flies, to DRIVES if it takes a twist; another motion needs a model of its own in "
+    "twins/models (docs/plugins.md); or name another body"
+)
+
+
+def has_model(kind: Kind) -> bool:
+    """Whether a model moves as the kind: a quadrotor flies, a differential drive takes a twist on the floor."""
+    return kind.name in (RESPONSES if kind.flies else DRIVES) and kind.flies == (kind.takes != "twist")
+
+
 class Models:
     """Motion models of rows of any kinds: quadrotors for flying rows (`air`), differential drives for the `floor`."""
 
     def __init__(self, stage: Stage, flights: Callable[..., OnboardFlight] = Quadrotor) -> None:
         """`flights` makes the model of flying rows, with the arguments of `Quadrotor`."""
         kinds = stage.kinds
-        unknown = sorted({kind.name for kind in kinds} - DRIVES.keys() - RESPONSES.keys())
-        if unknown:
-            remedy = "add it to DRIVES or RESPONSES in twins/models (docs/plugins.md), or name another body"
-            raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {remedy}")
+        if unknown := sorted({kind.name for kind in kinds if not has_model(kind)}):
+            raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
         flies = np.array([kind.flies for kind in kinds])
         air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
         self.in_air, self.on_floor = air, floor

@@ -157,7 +157,7 @@ def test_what_is_not_known_gives_no_number_and_no_warning(kind, missing):
     if kind.takes == "position" and missing != "goal":
         np.testing.assert_array_equal(setpoint, [[1.0, 1.0, 1.0, 0.3]])
     elif kind.takes == "velocity" and missing == "yaw":
-        np.testing.assert_array_equal(setpoint[0, :3], [1.0, 1.0, 1.0])
+        np.testing.assert_array_equal(setpoint[0, :3], [min(kind.response, kind.speed)] * 3)
     else:
         assert np.isnan(setpoint).any()
 

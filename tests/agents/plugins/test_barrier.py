@@ -201,11 +201,12 @@ def test_a_row_gets_the_same_bits_alone_and_among_others(given_):
 
 
 def test_without_things_nearby_nothing_is_touched():
-    setpoint, goal = np.full((4, 4), 0.3), np.full((4, 3), 0.3)
-    here = own(ALL, np.zeros((4, 3)))
+    rows = len(ALL)
+    setpoint, goal = np.full((rows, 4), 0.3), np.full((rows, 3), 0.3)
+    here = own(ALL, np.zeros((rows, 3)))
     assert BARRIER.restrain(setpoint, here, NOTHING) is setpoint
     assert BARRIER.deviate(goal, here, NOTHING, 0.01) is goal
-    far = near([0, 1, 2, 3], np.full((4, 2), 2.0))
+    far = near(list(range(rows)), np.full((rows, 2), 2.0))
     assert BARRIER.restrain(setpoint, here, far) is setpoint
 
 

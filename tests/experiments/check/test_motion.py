@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
+from agents.plugins.laws import Distance
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
@@ -53,6 +54,18 @@ def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in
     assert 0.05 < gain < 0.15
     strong = robots_on_wheels(gain)
     assert "acquired" in {each.code for each in check(of(strong))}
+
+
+def test_the_remedy_for_weak_links_names_the_key_that_the_law_goes_by(monkeypatch):
+    monkeypatch.setattr(Distance, "PULLS_BY", "stiffness")
+    weak = robots_on_wheels(9.0)
+    weak = msgspec.structs.replace(
+        weak, formation=msgspec.structs.replace(weak.formation, stiffness=0.05), duration_s=40.0
+    )
+    found = {each.code: each for each in check(of(weak))}
+    assert "links may stay e = 5 mm/k off" in found["wheels-stop"].message
+    assert found["wheels-stop"].remedy.startswith("raise stiffness to 0.0")
+    assert "(h·k·λ)" in found["stable"].message
 
 
 def test_what_is_expected_is_a_flight_on_the_virtual_clock_without_noise():

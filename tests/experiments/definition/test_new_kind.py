@@ -35,7 +35,18 @@ def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
         loads(ROVERS)
     first = caught.value.problems[0]
     assert (first.line, first.message) == (6, f"no twin of '{KIND}'")
-    assert "DRIVES or RESPONSES" in first.hint
+    assert "to DRIVES if it takes a twist" in first.hint
+
+
+def test_a_kind_whose_motion_no_model_has_is_refused_too(monkeypatch):
+    """On the floor with velocities, not with a twist: an omnidirectional robot."""
+    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    assert loads(ROVERS)
+    monkeypatch.setitem(KINDS, KIND, replace(KINDS[KIND], takes="velocity"))
+    with pytest.raises(DocumentError) as caught:
+        loads(ROVERS)
+    assert caught.value.problems[0].message == f"no twin of '{KIND}'"
+    assert "another motion needs a model of its own" in caught.value.problems[0].hint
 
 
 def test_a_kind_without_a_protocol_twin_is_refused_by_name(monkeypatch):

@@ -113,6 +113,16 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
     assert (known["folder"], known["cells"], known["seeds"]) == (str(folder), 3, [1, 2])
 
 
+def test_hazards_of_a_virtual_run_are_printed(three: tuple[Path, str], tmp_path: Path) -> None:
+    file, near = str(three[0].parent / "short.toml"), "safety.separation=1.5"
+    printed = zenpark("run", file, "--virtual", "--no-report", "--out", str(tmp_path / "x"), "--set", near)
+    lines = [line for line in printed.splitlines() if ": hazard " in line]
+    assert len(lines) == 6
+    assert all("minimum separation" in line for line in lines)
+    assert "more, in the recording and the report" in printed
+    assert "hazard" not in three[1]
+
+
 def test_runs_of_several_seeds_are_pooled_to_one(three: tuple[Path, str], tmp_path: Path) -> None:
     file = three[0].parent / "short.toml"
     runs = [str(tmp_path / f"seed{seed}") for seed in (1, 2, 3)]

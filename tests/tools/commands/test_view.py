@@ -12,7 +12,7 @@ from tools.main import main
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("run", "triangle", "--pace", "2"), "--pace: is for --virtual --view"),
+        (("run", "triangle", "--pace", "2"), "--pace: only for --virtual --view"),
         (("run", "triangle", "--virtual", "--pace", "2"), "add both, or leave it out"),
         (("run", "triangle", "--virtual", "--view", "--seeds", "3"), "leave out --view or --seeds"),
         (("view", "nowhere"), "nowhere: holds no recording"),
