@@ -1,4 +1,7 @@
-"""Ticks of a loop at a fixed rate: when the next one is due, and which are skipped by a loop that comes late."""
+"""Ticks of a loop at a fixed rate: when the next one is due, and which are skipped by a loop that comes late.
+
+Loops that only look for news now and then (recorder, conductor, viewers, watchdogs) have no deadlines: they pause.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ class Ticks:
     def __init__(self, hz: float, *, catch_up: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.period = 1.0 / hz  # [s]
         self._catch_up, self._clock = catch_up, clock
-        self._late = 0  # ticks to skip
+        self._skips = 0  # ticks that are over before the next one begins
         self.late_s = 0.0  # [s] from the time of the last tick to its begin
         self.start()
 
@@ -36,17 +39,17 @@ class Ticks:
         """Time until the next tick [s]; 0 if it is due."""
         ahead = self.zero + self.next - self._clock()
         if ahead > 0.0:
-            self._late = 0
+            self._skips = 0
             return ahead
-        self._late = max(0, int(-ahead / self.period) - self._catch_up)
+        self._skips = max(0, int(-ahead / self.period) - self._catch_up)
         return 0.0
 
     def begin(self) -> int:
         """Begin the next tick, at `t`; returns the number of ticks that were skipped before it."""
-        self.t = self.next + self._late * self.period
+        self.t = self.next + self._skips * self.period
         self.next = self.t + self.period
         self.late_s = self._clock() - self.zero - self.t
-        return self._late
+        return self._skips
 
     def align(self, at: float) -> None:
         """Shift the ticks so that one falls on `at` [s]; the next is at most a period after the last."""
