@@ -1,0 +1,57 @@
+"""Decisions of the central controller on a simulated clock: half a tick after their time, at the robots' instants."""
+
+import numpy as np
+import pytest
+
+from agents.decision.centralised import CentreGoals
+from agents.network.keys import Keys
+from agents.network.name_ownership import OwnershipCheck
+from agents.ticks import Ticks
+from experiments.real_time.processes.centre import CentreProcess
+from experiments.real_time.processes.joining import Network
+from tests.agents.few import pair
+from tests.fuzz.loopnet import Net
+
+KEYS = Keys("park")
+BEGIN = 1000.0
+
+
+class Over:
+    """Event whose waits advance a simulated clock; set after so many."""
+
+    def __init__(self, waits):
+        self.now, self._left = BEGIN, waits
+
+    def is_set(self):
+        return self._left < 0
+
+    def wait(self, seconds):
+        self._left -= 1
+        self.now += seconds
+        return self.is_set()
+
+
+def test_decisions_follow_the_common_start_and_those_of_a_standstill_are_skipped(monkeypatch):
+    over, decided = Over(12), []
+    with Net().worn() as net:
+        experiment = pair(architecture="centralised")
+        process = CentreProcess(experiment, Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive])))
+        hz = experiment.rates.coordination_hz
+        process._ticks = ticks = Ticks(hz, clock=lambda: over.now)
+
+        def decide(t, _phase, start):
+            decided.append((round(t * hz, 6), round((over.now - BEGIN) * hz, 6)))
+            if len(decided) == 3:
+                start[process._guided] = 4.25 / hz  # robots began there
+            over.now += (3.9 if len(decided) == 8 else 0.1) / hz
+            return CentreGoals(np.zeros(0, dtype=np.intp), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+        monkeypatch.setattr(process.centre, "decide", decide)
+        process.run(over)
+    late = 0.5 * hz / experiment.rates.body_hz
+    times = [0, 1, 2, 3, 3.25, 4.25, 5.25, 6.25, 9.25, 10.25, 11.25, 12.25]
+    assert [t for t, _ in decided] == pytest.approx(times)
+    delays = [at - t for t, at in decided]
+    assert delays == pytest.approx([late if t != 9.25 else 6.25 + late + 3.9 - 9.25 for t in times])
+    assert process._missed == 2
+    assert ticks.next == pytest.approx(13.25 / hz)
