@@ -74,7 +74,7 @@ def parse(flag: str, document: Mapping[str, Any]) -> Override:
 
 
 def assign(document: dict[str, Any], override: Override, *, part: bool = False) -> list[str] | None:
-    """Puts the value in its place.
+    """Puts the value in its place; raises DocumentError if the path leads nowhere.
 
     A parameter of a trigger, law or plan is left alone where the kind that is chosen has no such parameter: `--set
     trigger.threshold=0.02` is for the cases that have a threshold.
@@ -84,9 +84,6 @@ def assign(document: dict[str, Any], override: Override, *, part: bool = False) 
 
     Returns:
         None, or the parameters that the kind has if this is none of them.
-
-    Raises:
-        DocumentError: If the path leads nowhere.
     """
     at: Any = document
     *way, last = override.path

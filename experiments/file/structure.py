@@ -294,13 +294,10 @@ OBJECT: Final = "write an object, '{\"name\": value}'"
 
 
 def parse_object(flag: str, text: str, struct: type[msgspec.Struct] | None = None) -> dict[str, Any]:
-    """JSON object of a command-line flag.
+    """JSON object of a command-line flag; raises DocumentError if it is no JSON, no object, or not what it must be.
 
     Args:
         struct: Its type; None: any object.
-
-    Raises:
-        DocumentError: If it is no JSON, no object, or not what it must be.
     """
     place = f"{flag} {text}"
     try:

@@ -89,13 +89,10 @@ def is_bundle(file: str) -> bool:
 
 
 def unpack(bundle: Path, into: Path) -> RunOrigin:
-    """Unpack a bundle into an empty folder.
+    """Unpack a bundle into an empty folder; raises RecordingError if it is no bundle, or a damaged one.
 
     Returns:
         Its origin, in which `file` is the experiment file in that folder, under its former name.
-
-    Raises:
-        RecordingError: If it is no bundle, or a damaged one.
     """
     try:
         with zipfile.ZipFile(bundle) as archive:

@@ -120,16 +120,13 @@ class Recording:
         draw: Draw | None = None,
         utc: Callable[[], float] | None = None,
     ) -> None:
-        """Creates the file.
+        """Creates the file; raises RecordingError if the file exists or cannot be written.
 
         Args:
             path: A file that does not exist yet.
             started: UTC time of the common start [s], if it is known already; the event `start` says it as well.
             draw: Draws the scene for viewers.
             utc: Clock of the recorder [s]: nothing is logged later than it came. Without one, messages come in order.
-
-        Raises:
-            RecordingError: If the file exists or cannot be written.
         """
         self.path = path
         self.refused = 0  # messages left out, because they hold what their type excludes

@@ -68,15 +68,12 @@ class ViconTwin:
         host: str = "127.0.0.1",
         port: int = 0,
     ) -> None:
-        """Start to listen.
+        """Start to listen; raises OSError if listening fails.
 
         Args:
             subjects: Names of the bodies, as clients see them.
             sigma: White noise of the positions, per axis [m].
             port: 0 for any free port.
-
-        Raises:
-            OSError: If listening fails.
         """
         self._subjects = list(subjects)
         self._rate, self._sigma, self._rng = rate_hz, sigma, rng or np.random.default_rng(0)
