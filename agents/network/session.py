@@ -146,8 +146,8 @@ def open_session(
     """A session on the network of some endpoints; use it in a `with`.
 
     It is a client of the first router that answers. In a mesh (`agents.network.endpoints`) it is linked with all
-    members, also with later ones. Raises EndpointError if an endpoint is malformed, or its lab has no such identity, or
-    it cannot listen there, and Unreachable without an answer in time, or when `stop` is set before.
+    members, also with later ones. Raises EndpointError if an endpoint is malformed, or it cannot listen there, LabError
+    if its lab has no such identity, and Unreachable without an answer in time, or when `stop` is set before.
     """
     ends = topology.ends(endpoints, name)
     chosen = config(

@@ -54,7 +54,7 @@ def settings(
 
     With a lab (`agents.network.lab`) both ends show certificates, and listening beyond loopback is allowed. Raises
     EndpointError if an endpoint is malformed, or one to listen on can be reached from outside this machine although
-    there is no lab, or the lab has no such identity, or its router no rights to enforce.
+    there is no lab, or the lab's router has no rights to enforce, and LabError if the lab has no such identity.
     """
     for endpoint in (*connect, *listen):
         protocol, slash, address = endpoint.partition("/")

@@ -251,7 +251,7 @@ class SceneDrawing:
     def _draw_links(self, moment: Moment) -> None:
         if not len(self.stage.links):
             return
-        ends = appearance.segments(self.stage, moment)
+        ends = appearance.segments(self.stage, moment.position)
         colours = appearance.link_colours(moment.error)
         both = np.repeat(colours[:, None], 2, axis=1)
         there = np.isfinite(moment.error) & self.shown.links

@@ -10,7 +10,7 @@ import numpy as np
 from agents.network.messages import Vector
 from experiments.definition.experiment import Experiment
 from experiments.recording.ros2.viewers import CYLINDER, LINE_LIST, LINE_STRIP, TEXT, Draw, Marker
-from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, Stage, link_colours
+from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, Stage, link_colours, segments
 from twins.scene import corners
 
 EDGE: Final = (90, 94, 102)
@@ -81,8 +81,7 @@ def _links(stage: Stage, tracker: LinkTracker, since: float, position: np.ndarra
     if not len(net):
         return []
     error = tracker.errors(since, position)
-    middle = position + 0.5 * np.array([[0.0, 0.0, kind.height] for kind in stage.kinds])
-    ends = np.stack([middle[net.sender], middle[net.receiver]], axis=1)
+    ends = segments(stage, position)
     there = np.isfinite(ends).all(axis=(1, 2)) & (np.isfinite(error) | (stage.plan is None))
     points = [tuple(point) for pair in ends[there].tolist() for point in pair] or [NOWHERE, NOWHERE]
     colours = [tuple(c) for c in link_colours(error[there]).tolist() for _ in range(2)] or [UNKNOWN, UNKNOWN]

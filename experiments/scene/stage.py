@@ -325,9 +325,9 @@ def link_colours(error: Array) -> Colours:
     return np.array([GOOD, FAIR, BAD, UNKNOWN], dtype=np.uint8)[level]
 
 
-def segments(stage: Stage, moment: Moment) -> Array:
-    """Both ends (E, 2, 3) of each link, NaN where one is unknown [m]: the middles of the bodies."""
-    middle = moment.position + 0.5 * np.array([[0.0, 0.0, kind.height] for kind in stage.kinds]).reshape(-1, 3)
+def segments(stage: Stage, position: Array) -> Array:
+    """Both ends (E, 2, 3) of each link, NaN where one is unknown [m]: middles of bodies at `position` (N, 3) [m]."""
+    middle = position + 0.5 * np.array([[0.0, 0.0, kind.height] for kind in stage.kinds]).reshape(-1, 3)
     return np.stack([middle[stage.links.sender], middle[stage.links.receiver]], axis=1)
 
 

@@ -312,6 +312,8 @@ def _stop_all(stops: Sequence[EmergencyStop], *, as_json: bool) -> int:
         thread.start()
     for thread in threads:
         thread.join()
+    missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
+    seen = any(stop.seen for stop in stops)
     if as_json:
         routers_asked = [
             {
@@ -322,25 +324,19 @@ def _stop_all(stops: Sequence[EmergencyStop], *, as_json: bool) -> int:
             }
             for stop in stops
         ]
-        missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
-        ok = not missed and any(stop.seen for stop in stops)
-        print_json({"ok": ok, "routers": routers_asked})
-        return int(not ok)
-    bad = False
-    seen = [stop for stop in stops if stop.seen]
+        print_json({"ok": seen and not missed, "routers": routers_asked})
+        return int(missed or not seen)
     for stop in stops:
         known = "" if stop.run is None else f" ({stop.where})"
         if stop.moving:
             print(f"NOT known to have stopped: {', '.join(sorted(stop.moving))}{known}", file=sys.stderr)
-            bad = True
         elif stop.seen:
             print(f"stopped: {', '.join(sorted(stop.seen))}{known}", flush=True)
         elif stop.expected:
             why = "no robot is there" if stop.failure is None else str(stop.failure)
             print(f"NOT known to have stopped: {stop.where}: {why}", file=sys.stderr)
-            bad = True
-    if seen or bad:
-        return int(bad)
+    if seen or missed:
+        return int(missed)
     failures = [stop.failure for stop in stops if stop.failure is not None]
     if len(failures) == len(stops):
         raise failures[-1]

@@ -107,7 +107,7 @@ def test_a_link_is_lit_while_its_sender_has_just_transmitted(park):
 def test_unknown_robots_are_out_of_sight(park):
     moment = moments.unknown(park)
     assert (stage.shown(moment.position)[:, 2] < -100.0).all()
-    ends = stage.segments(park, moment)
+    ends = stage.segments(park, moment.position)
     assert (stage.visible(ends, np.ones(len(ends), dtype=bool))[..., 2] < -100.0).all()
     assert len(stage.dashes(ends)) == 0
 
