@@ -71,7 +71,7 @@ class PacedView:
                 self._draw(instant, now)
             if instant.now <= clock.t:
                 return
-            time.sleep(min(POLL_S, FRAME_S))
+            time.sleep(POLL_S)
 
     def _count(self, instant: Instant) -> None:
         """Transmissions and incidents since the last call."""

@@ -15,6 +15,7 @@ import numpy as np
 from agents.protocols import crtp
 from agents.protocols.crazyflie import chosen
 from agents.protocols.crtp import HighLevel, Log, Port
+from agents.ticks import Ticks
 from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.link import BUSY_S
@@ -137,16 +138,18 @@ class Drone:
 
     def _control(self):
         """Loop of the pilot's thread."""
-        fleet, due = self._fleet, self._fleet.now
+        fleet = self._fleet
+        ticks = Ticks(max(fleet.settings.stream_hz, LOOP_HZ), clock=lambda: fleet.now)
         while True:
-            if fleet.now >= due:
-                due = max(due + 1.0 / max(fleet.settings.stream_hz, LOOP_HZ), fleet.now)
+            if fleet.now >= ticks.zero + ticks.next:
+                ticks.begin()
             order, self.order = self.order, None
             if order is not None:
                 order(self.flight)
             self.flight.update_phase(fleet.now)
             self.flight.send_due(fleet.now)
-            self.thread.pause(due)
+            ticks.until_next()
+            self.thread.pause(ticks.zero + ticks.next)
 
 
 class Fleet:
