@@ -158,7 +158,7 @@ class ChaosRound:
         active = self._active = ActiveFault(fault, victim, run, observer, running)
         check = fault.properties.begin(active)
         self._begun[fault.kind] += 1
-        while time.monotonic() < active.begun + fault.lasts_s:
+        while time.monotonic() < active.begun + fault.properties.lasts_s:
             t = self._poll()
             if fault.properties.unsteered:
                 active.check_held()

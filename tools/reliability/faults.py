@@ -37,7 +37,6 @@ class Fault(msgspec.Struct, frozen=True):
 
     kind: str
     after_s: float  # so long after all was well again (or, of the first, after the formation had come together) [s]
-    lasts_s: float = 0.0  # until it is lifted [s]; 0: it cannot be
     victim: str = ""  # a robot; if it has ended by then, the next that is alive. Empty: the whole run
     size: float = 0.0  # clock step [s]
 
@@ -368,4 +367,4 @@ def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.G
     nature = FAULT_KINDS[kind]
     victim = str(random.choice(list(robots))) if nature.victim else ""
     size = round(float(random.uniform(*nature.size) * random.choice([-1.0, 1.0] if nature.signed else [1.0])), 3)
-    return Fault(kind, after_s, nature.lasts_s, victim, size)
+    return Fault(kind, after_s, victim, size)

@@ -28,7 +28,7 @@ def flown(waiting, duration_s=90.0):
     while (fault := next_fault(waiting, stage, begun, duration_s - t)) is not None:
         waiting.remove(fault)
         begun[fault.kind] += 1
-        t += fault.after_s + fault.lasts_s + fault.properties.heals_s
+        t += fault.after_s + fault.properties.lasts_s + fault.properties.heals_s
         yield fault
         if fault.kind == "conductor":
             return
