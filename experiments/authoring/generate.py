@@ -1,8 +1,4 @@
-"""`./zenpark new --hemisphere 40` and its like: experiment files of formations of any size.
-
-generated = layouts.hemisphere(40, spacing=0.6, apart=0.3)
-text = experiment_file(generated, Wanted())
-"""
+"""`./zenpark new --hemisphere 40` and its like: experiment files of formations of any size."""
 
 from __future__ import annotations
 

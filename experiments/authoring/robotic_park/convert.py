@@ -164,6 +164,9 @@ def _notes_on_robots(park: Park) -> Iterator[str]:
         " these robots have no neighbours": idle,
     }
     yield from (note.format(join_names([robot.name for robot in those])) for note, those in rows.items() if those)
+    triggers = [robot.communication for robot in robots] + [task.controller for _, task in park.tasks]
+    if types := sorted({each.threshold.type for each in triggers if each.event} - {"Constant"}):
+        yield f"threshold.type: {', '.join(types)}; taken as a constant one with what ai adds"
     if roles := dict.fromkeys(task.role for _, task in park.tasks if task.role != "consensus"):
         yield f"task.role: {', '.join(roles)}; leaders are the robots without neighbours"
 

@@ -61,6 +61,7 @@ class Relation(NamedTuple):
 class _Threshold(Struct, frozen=True):
     type: str = "Constant"
     co: Number = 0.01
+    threshold: Number | None = None  # for `co`, in 2023
     ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
 
@@ -75,9 +76,10 @@ class Trigger(Struct, frozen=True):
         """c0 and a of a threshold c0 + a·|·|; None if no event is waited for."""
         if self.protocol == "Continuous":
             return None
-        if self.threshold.co <= 0.0:
+        constant = self.threshold.threshold or self.threshold.co
+        if constant <= 0.0:
             raise ValueError("a threshold of 0 or less is crossed always: give metres, such as 0.01")
-        return self.threshold.co, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
+        return constant, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
 
 
 class _Communication(Trigger, frozen=True):
@@ -255,8 +257,7 @@ class Entry(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
-    """PyYAML's safe loader: a key that stands twice is refused, one that holds nothing dropped, the numbers of a pose
-    are listed, and keys are text."""
+    """PyYAML's safe loader that refuses keys that stand twice, drops those that hold nothing, and splits poses."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
         keys = set()

@@ -187,10 +187,19 @@ def test_everything_that_is_left_behind_is_told(tmp_path):
     robots[1] = robot(2, "khepera02", (0.9, 0, 0.3), TRIANGLE[1], place="physical", threshold=0.02)
     robots[1] = robots[1].replace("agent_ip: 192.168.0.22", "agent_ip: ''").replace("role: consensus", "role: leader")
     text = file(robots, "hybrid", "centralized", "True").replace("period: 0.1\n", "period: 0.15\n")
+    text = text.replace("type: Constant", "type: Adaptive", 2)
     read, notes = converted(tmp_path, text)
     assert read.experiment.architecture == "centralised"
     told = " | ".join(notes)
-    for word in ("simulator", "Data_Logging", "khepera02: real", "leader", "commonest", "6.66667 Hz become"):
+    for word in (
+        "threshold.type: Adaptive",
+        "simulator",
+        "Data_Logging",
+        "khepera02: real",
+        "leader",
+        "commonest",
+        "6.66667 Hz become",
+    ):
         assert word in told
     assert read.experiment.robots["khepera02"].start == [0.9, 0.0, 0.3]  # the third number of robots on wheels: yaw
 
