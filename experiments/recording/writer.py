@@ -14,8 +14,7 @@ import msgspec
 from mcap._chunk_builder import ChunkBuilder
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, MessageIndex
-from mcap.records import Message as Record
+from mcap.records import ChunkIndex, MessageIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
 from agents.network.messages import Event, State, Vector
@@ -29,7 +28,7 @@ from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPI
 
 BLOCK_BYTES: Final = 1024 * 1024
 INDICES: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
-CHUNK: Final = "_Writer__chunk_builder"  # nor for this
+CHUNK, STATISTICS = "_Writer__chunk_builder", "_Writer__statistics"  # nor for these
 
 
 class ChunkIndices:
@@ -64,26 +63,44 @@ class ChunkIndices:
 
 
 class Chunk(ChunkBuilder):
-    """Chunk in progress of mcap's writer, to which a message is added in a third of the library's time."""
+    """Chunk in progress, in place of the writer's own: adds a message in a fifth of the library's time."""
 
     HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
 
-    def add_message(self, message: Record) -> None:
-        """Add a message and the entry of its index."""
-        logged, data, out = message.log_time, message.data, self.record_writer
+    def __init__(self, writer: Writer) -> None:
+        """Takes the place of a new writer's chunk."""
+        super().__init__()
+        self.full = False
+        self._statistics: Statistics = getattr(writer, STATISTICS)
+        setattr(writer, CHUNK, self)
+
+    def add(self, channel: int, logged: int, data: bytes, stamp: int, number: int) -> None:
+        """Adds a message with its log time and stamp [ns], and its entry in the index."""
         if not self.num_messages or logged < self.message_start_time:
             self.message_start_time = logged
         self.message_end_time = max(self.message_end_time, logged)
-        index = self.message_indices.get(message.channel_id)
+        index = self.message_indices.get(channel)
         if index is None:
-            index = self.message_indices[message.channel_id] = _MessageIndex(message.channel_id, [])
-        index.records.append((logged, out.count))
+            index = self.message_indices[channel] = _MessageIndex(channel, [])
+        offset, length = self.count, len(data) + self.HEAD.size
+        index.records.append((logged, offset))
         self.num_messages += 1
-        length = len(data) + self.HEAD.size - 9  # an opcode and the length itself stand before what is counted
-        out.write(
-            self.HEAD.pack(Opcode.MESSAGE, length, message.channel_id, message.sequence, logged, message.publish_time)
-        )
-        out.write(data)
+        # its opcode and the length itself, 9 bytes, are not in the length
+        self.record_writer.write(self.HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp) + data)
+        self.full = offset + length > CHUNK_BYTES
+
+    def reset(self) -> None:
+        """Counts the messages of a chunk that was taken by `end` and written, and begins the next."""
+        counted = self._statistics
+        first = min(counted.message_start_time, self.message_start_time)
+        counted.message_start_time = first if counted.message_count else self.message_start_time
+        counted.message_end_time = max(counted.message_end_time, self.message_end_time)
+        counted.message_count += self.num_messages
+        for channel, index in self.message_indices.items():
+            counted.channel_message_counts[channel] += len(index.records)
+        self.message_start_time = self.message_end_time = self.num_messages = 0
+        self.message_indices.clear()
+        self.full = False
 
 
 class _MessageIndex(MessageIndex):
@@ -155,7 +172,7 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        setattr(self._writer, CHUNK, Chunk())
+        self._chunk = Chunk(self._writer)
         self._index = ChunkIndices(path.parent, self._writer)
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
@@ -252,7 +269,9 @@ class Recording:
         # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
         times = max(self._index.end, self._nanoseconds(logged)), self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
-        self._write_or_fail(self._writer.add_message, channel, times[0], data, times[1], number)
+        self._write_or_fail(self._chunk.add, channel, times[0], data, times[1], number)
+        if self._chunk.full:
+            self.flush()
         return True
 
     def _register(self, topic: _Written, name: str) -> int:

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import chain
 from typing import Final
 
 from agents.network.messages import Setpoint, State, Vector
@@ -100,15 +101,14 @@ class Marker:
         out.numbers("i", number, self.type, 0)
         w, *turned = self.attitude
         out.numbers("d", *self.position, *turned, w, *self.scale)
-        out.colour(self.colour, self.opacity)
+        out.colours([self.colour], self.opacity)
         out.numbers("i", 0, 0)  # stays until it is replaced
         out.numbers("B", self.frame != FRAME)
         out.numbers("I", len(self.points))
-        for point in self.points:
-            out.numbers("d", *point)
+        if self.points:
+            out.numbers("d", *chain.from_iterable(self.points))
         out.numbers("I", len(self.colours))
-        for colour in self.colours:
-            out.colour(colour, self.opacity)
+        out.colours(self.colours, self.opacity)
         out.text("")  # texture
         out.header(0, 0, "")
         out.text("")
@@ -140,8 +140,8 @@ class _Cdr:
         self.numbers("I", seconds, nanoseconds)
         self.text(frame)
 
-    def colour(self, colour: Colour, opacity: float) -> None:
-        self.numbers("f", *(part / 255.0 for part in colour), opacity)
+    def colours(self, colours: Sequence[Colour], opacity: float) -> None:
+        self.numbers("f", *(part for r, g, b in colours for part in (r / 255.0, g / 255.0, b / 255.0, opacity)))
 
 
 def _moment(stamp: float) -> tuple[int, int]:

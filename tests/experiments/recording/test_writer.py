@@ -1,5 +1,6 @@
 """Others read a recording; nothing is written over, and a full disk or a mistake leaves a file that can be read."""
 
+import io
 import itertools
 import math
 import resource
@@ -7,9 +8,8 @@ import resource
 import msgspec
 import numpy as np
 import pytest
-from mcap._chunk_builder import ChunkBuilder
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
@@ -20,6 +20,7 @@ from experiments.recording import writer
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, recover
 from experiments.recording.ros2 import viewers
+from experiments.recording.topics import CHUNK_BYTES
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 from tests.experiments.recordings import (
@@ -154,16 +155,27 @@ def test_after_an_interrupt_inside_a_write_nothing_more_is_written(path, monkeyp
     recording.close()
 
 
-def test_a_chunk_is_the_librarys_own():
-    theirs, ours = ChunkBuilder(), writer.Chunk()
-    for channel, time, data in ((1, 20, b"a"), (2, 10, b""), (1, 30, bytes(300))):
-        for chunk in (theirs, ours):
-            chunk.add_message(Message(channel, time, data, time - 5, 7))
-    assert (ours.message_start_time, ours.message_end_time, ours.num_messages) == (10, 30, 3)
-    for chunk in (theirs, ours):
-        for index in chunk.message_indices.values():
-            index.write(chunk.record_writer)
-    assert ours.end() == theirs.end()
+def test_a_file_is_the_same_as_the_librarys_own():
+    files = []
+    for chunk_of in (writer.Chunk, lambda _: None):
+        file = io.BytesIO()
+        library = Writer(file, chunk_size=CHUNK_BYTES)
+        chunk = chunk_of(library)
+        library.start("ros2", "zenpark")
+        schema = library.register_schema("a", "ros2msg", b"int32 a")
+        channels = [library.register_channel(name, "cdr", schema) for name in "ab"]
+        for number in range(3000):
+            message = (channels[number % 7 > 2], 1000 + (number ^ 5), bytes(number % 50), 900 + number, number)
+            if chunk is None:
+                library.add_message(*message)
+            else:
+                chunk.add(*message)
+                if chunk.full:
+                    library.flush()
+        library.finish()
+        files.append(file.getvalue())
+    assert len(files[0]) > 3 * 2000
+    assert files[0] == files[1]
 
 
 @pytest.mark.usefixtures("small_disk")
