@@ -5,12 +5,11 @@ Machines are noisy and differ: a figure alone says little. CPU times are medians
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, example, print_json
+from tools.commands.options import AsJson, example, known_words, print_json
 
 app: Final = typer.Typer()
 
@@ -35,11 +34,8 @@ def bench(
     """Measure what this machine can do, each figure beside a baseline."""
     from importlib import import_module
 
-    if unknown := [name for name in names or () if name not in BENCHMARKS]:
-        print(f"zenpark: no benchmark '{unknown[0]}'; there are: {', '.join(BENCHMARKS)}", file=sys.stderr)
-        return 2
     figures = []
-    for name in names or BENCHMARKS:
+    for name in known_words("bench", names or [], BENCHMARKS) or BENCHMARKS:
         for figure in getattr(import_module(f"tools.bench.{BENCHMARKS[name]}"), name)():
             figures.append(figure)
             if not as_json:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from tools.commands.lab import SOON_DAYS
-from tools.commands.options import AsJson, File, Lab, Settings, example, group, print_json
+from tools.commands.options import AsJson, File, Lab, Settings, example, group, known_words, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment, Host
@@ -167,15 +167,11 @@ def choose(hosts: Mapping[str, Host], only: Sequence[str]) -> dict[str, Host]:
     """Hosts by name or tag, all if none is named."""
     from experiments.file.problems import refusal
 
-    known = {*hosts, *(tag for host in hosts.values() for tag in host.tags)}
-    for name in only:
-        if name not in known:
-            hint = f"there are: {', '.join(sorted(known))}"
-            raise refusal(f"--on {name}", "is neither a host nor a tag", hint)
+    wanted = known_words("--on", only, sorted({*hosts, *(tag for host in hosts.values() for tag in host.tags)}))
     if not hosts:
         hint = 'add one: [hosts.lab1] with address = "user@machine" and robots = ["..."]'
         raise refusal("[hosts]", "the experiment has no hosts: all robots run here", hint)
-    return {name: host for name, host in hosts.items() if not only or {name, *host.tags} & set(only)}
+    return {name: host for name, host in hosts.items() if not wanted or {name, *host.tags} & {*wanted}}
 
 
 def _has_certificates(there: Station, folder: Path, robots: Sequence[str]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
@@ -187,6 +187,17 @@ def session(
     endpoints = routers(connect, lab) or [DEFAULT_ENDPOINT]
     with open_session(endpoints, name=f"zenpark {name}", wait_s=wait_s, identity=identity) as opened:
         yield opened
+
+
+def known_words(option: str, given: Sequence[str], known: Collection[str]) -> list[str]:
+    """Words behind an option, also with commas between them; raises DocumentError for one that is not `known`."""
+    from experiments.file.problems import refusal
+
+    words = [word.strip() for part in given for word in part.split(",") if word.strip()]
+    for word in words:
+        if word not in known:
+            raise refusal(f"{option} {word}", "is not known", f"there are: {', '.join(known)}")
+    return words
 
 
 def check_bodies(bodies: str | None) -> None:

@@ -13,7 +13,7 @@ import typer
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.commands.options import AsJson, example, print_json, print_result
+from tools.commands.options import AsJson, example, known_words, print_json, print_result
 
 if TYPE_CHECKING:
     from experiments.recording.run_folder import PastRun
@@ -82,7 +82,7 @@ def report(
     if as_latex or as_markdown:
         cases = pages.labelled(named) if len(read) > 1 else named[0][1]
         names = {name.removesuffix("_hz"): name for name, _ in SUMMARY}
-        tables = pages.result_tables(cases, [names[name] for name in _chosen(metrics, [*names])])
+        tables = pages.result_tables(cases, [names[name] for name in known_words("--metrics", [metrics or ""], names)])
         _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
         return 0
     target = Path(out or "comparison.html") if len(read) > 1 else Path(out or own)
@@ -100,16 +100,6 @@ def report(
     found = [{"folder": seeds[0].folder, **summary(seeds)} for seeds in read] if as_json else []
     print_result({"report": page, "runs": found}, str(page), as_json=as_json)
     return 0
-
-
-def _chosen(metrics: str | None, known: Sequence[str]) -> list[str]:
-    """Names of numbers behind `--metrics`, each of them `known`."""
-    from experiments.file.problems import refusal
-
-    given = [name.strip() for name in (metrics or "").split(",") if name.strip()]
-    if wrong := [name for name in given if name not in known]:
-        raise refusal("--metrics", f"no {wrong[0]!r} among the metrics", f"known: {', '.join(known)}")
-    return given
 
 
 def _put(text: str, out: str | None) -> None:
@@ -151,7 +141,7 @@ def _report_sweep(
     except ValueError as error:
         raise RecordingError(f"{folder / SWEEP}: cannot be read: {error}; make the sweep again") from None
     if form is not None:
-        chosen = _chosen(metrics, [*table.NUMBERS])
+        chosen = known_words("--metrics", [metrics or ""], table.NUMBERS)
         _put(form([pages.table(rows, str(document.get("experiment", folder.name)), chosen)]), out)
         return 0
     searched = "tuning" in document  # its figures show all that was tried

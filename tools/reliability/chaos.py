@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, File, Out, Settings, example, print_result
+from tools.commands.options import AsJson, File, Out, Settings, example, known_words, print_result
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Experiment
@@ -53,14 +52,14 @@ def chaos(
     from tools.reliability import chaos_report
     from tools.reliability.chaos_report import ChaosResult
     from tools.reliability.chaos_round import ChaosRound
-    from tools.reliability.faults import script
+    from tools.reliability.faults import FAULTS, script
     from tools.reliability.spoilt_run import Setting
 
     changes = [*defaults(load(file).experiment), *(settings or [])]
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
     experiment = chosen(read, [name])[name]
-    planned = script(list(experiment.robots), faults, seed, _kinds(kinds or []))
+    planned = script(list(experiment.robots), faults, seed, known_words("--kinds", kinds or [], FAULTS) or FAULTS)
     folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
     read.keep(folder / SOURCE)
     (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(planned), indent=1))
@@ -99,17 +98,3 @@ def defaults(experiment: Experiment) -> list[str]:
     ):
         made.append(f"rates.body_hz={BODY_HZ:g}")
     return made
-
-
-def _kinds(given: Sequence[str]) -> list[str]:
-    """The kinds that were asked for, all without any."""
-    from agents.plugins.registry import did_you_mean
-    from experiments.file.problems import refusal
-    from tools.reliability.faults import FAULTS
-
-    words = [word for part in given for word in part.split(",") if word]
-    for word in words:
-        if word not in FAULTS:
-            hint = f"{did_you_mean(word, FAULTS)} there are: {', '.join(FAULTS)}"
-            raise refusal(f"--kinds {word}", "no such fault", hint)
-    return words or list(FAULTS)
