@@ -36,7 +36,7 @@ from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
-from experiments.metrics.signals import after_last
+from experiments.metrics.signals import after_last, moving_mean
 from twins.scene import Scene
 
 MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power
@@ -123,10 +123,7 @@ class Analysis:
     def mean_error(self) -> Array:
         """(T, E) of each link over the last `WINDOW_S` [m]."""
         window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
-        total = np.cumsum(np.concatenate([np.zeros((1, self.error.shape[1])), self.error]), axis=0)
-        end = np.arange(1, len(total))
-        before = np.maximum(end - window, 0)  # the window fills up at the start, as in `experiments.metrics.signals`
-        return np.asarray((total[end] - total[before]) / (end - before)[:, None])
+        return moving_mean(self.error, window)
 
     def acquired(self, until: float) -> float | None:
         """Time from which on the mean of every link over `WINDOW_S` is within the tolerance, up to `until` [s]."""

@@ -79,9 +79,9 @@ def isolated(experiment: Experiment) -> Experiment:
 def predict(experiment: Experiment) -> Prediction:
     """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
     bare = isolated(experiment)
-    without, *noisy = _fly(bare, [bare.seed] * (1 + has_noise(bare)), quiet=1)
+    without, *noisy = fly(bare, [bare.seed] * (1 + has_noise(bare)), quiet=1)
     if without.stuck and noisy:  # only the noise may hold the robots back
-        return _fly(bare, [bare.seed], quiet=1)[0]
+        return fly(bare, [bare.seed], quiet=1)[0]
     counted = (*noisy, without)[0]
     return replace(without, messages_hz=counted.transmissions / bare.duration_s)
 
@@ -91,13 +91,8 @@ def repetitions(bare: Experiment) -> int:
     return max(1, min(REPETITIONS, int(TICK_COST) // len(bare.robots)))
 
 
-def fly_repeatedly(bare: Experiment, count: int) -> list[Prediction]:
-    """`count` flights of what `isolated` made, the first with the seed of the experiment, each other with the next."""
-    return _fly(bare, [bare.seed + k for k in range(count)])
-
-
-def _fly(bare: Experiment, seeds: Sequence[int], *, quiet: int = 0) -> list[Prediction]:
-    """Flights with these seeds side by side, the first `quiet` of them without noise."""
+def fly(bare: Experiment, seeds: Sequence[int], *, quiet: int = 0) -> list[Prediction]:
+    """Flights of what `isolated` made with these seeds side by side, the first `quiet` of them without noise."""
     names = tuple(bare.robots)
     try:
         log = simulation.simulate(bare, seeds, quiet=quiet, lean=True, landing=False)

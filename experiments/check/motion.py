@@ -16,7 +16,7 @@ from agents.plugins import registry
 from agents.plugins.planners import Planner
 from experiments.check.analysis import Analysis, link_errors
 from experiments.check.findings import FORGIVEN, Finding
-from experiments.check.ideal_run import approaches, fly_repeatedly, has_noise, isolated, repetitions
+from experiments.check.ideal_run import approaches, fly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, GAIN, OFF, strength
 from experiments.definition.links import gain_key
 
@@ -158,7 +158,7 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
         spans.append((formed, until))
     count = repetitions(bare)
     lost, worst, worst_link = 0, experiment.tolerance + FORGIVEN, ""
-    for flight in fly_repeatedly(bare, count):
+    for flight in fly(bare, range(bare.seed, bare.seed + count)):
         if flight.stuck:
             continue
         error, time = link_errors(analysis.assignment.law, analysis.pattern, flight), flight.time

@@ -92,7 +92,7 @@ class LinkErrors:
         Seconds since the first sample; None if the last sample is still outside. A neighbour that died does not count.
         While nothing is known of a robot that comes back, it is where it was before: outside, if never seen inside.
         """
-        total, count = self._over_window(window)
+        total, count = sums_over_window(self.error, window)
         outside = (total > tolerance * count + 1e-12).astype(float) @ self.own > 0.0
         known = (np.isfinite(self.error) @ self.own > 0.0) & self.alive
         last = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, None], -1), axis=0)
@@ -109,20 +109,6 @@ class LinkErrors:
                 if end < len(self.time):
                     found.append((row, float(self.time[begin]), float(self.time[end])))
         return found
-
-    def moving_mean(self, window: int) -> Array:
-        """Mean of each link over the last `window` samples (T, E) [m], as `acquired` judges it; NaN without any."""
-        total, count = self._over_window(window)
-        return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
-
-    def _over_window(self, window: int) -> tuple[Array, Array]:
-        """Sum and number (T, E) of the known errors over the last samples; the window fills up at the start."""
-        known = np.isfinite(self.error)
-        edge = np.zeros((1, len(self.net)))
-        total = np.concatenate([edge, np.cumsum(np.where(known, self.error, 0.0), axis=0)])
-        count = np.concatenate([edge, np.cumsum(known, axis=0)])
-        before = np.maximum(np.arange(1, len(total)) - window, 0)
-        return total[1:] - total[before], count[1:] - count[before]
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
         """Per robot the mean error of its worst link [m], and the robot at its other end."""
@@ -150,6 +136,22 @@ def without_position(trace: Trace) -> Mask:
         begins = not (lost or event.text.startswith((OVER, UNRESOLVED)))
         blind[trace.time >= since, trace.robots.index(event.source)] = begins
     return blind
+
+
+def sums_over_window(error: Array, window: int) -> tuple[Array, Array]:
+    """Sum and number (T, E) of the known of errors (T, E) over the last samples; the window fills up at the start."""
+    known = np.isfinite(error)
+    edge = np.zeros((1, error.shape[1]))
+    total = np.concatenate([edge, np.cumsum(np.where(known, error, 0.0), axis=0)])
+    count = np.concatenate([edge, np.cumsum(known, axis=0)])
+    before = np.maximum(np.arange(1, len(total)) - window, 0)
+    return total[1:] - total[before], count[1:] - count[before]
+
+
+def moving_mean(error: Array, window: int) -> Array:
+    """Mean of each link over the last `window` samples (T, E) [m], as `acquired` judges it; NaN without any."""
+    total, count = sums_over_window(error, window)
+    return np.asarray(np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0))
 
 
 def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:

@@ -24,7 +24,7 @@ from agents.arrays import Array
 from experiments.metrics.measure import WINDOW_S, bounds_of
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
-from experiments.metrics.signals import LinkErrors, leaders, transmission_gaps
+from experiments.metrics.signals import LinkErrors, leaders, moving_mean, transmission_gaps
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.metrics_files import Band
@@ -256,7 +256,7 @@ def _worst_links(trace: Trace) -> Array:
     """Error of the worst link of each follower (T, N) [m], moving mean over one second; NaN where none is known."""
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0]))) if len(trace.time) > 1 else 1
     known = LinkErrors.of_trace(trace)
-    mean = np.concatenate([known.part(begin, end).moving_mean(window) for _, begin, end in bounds_of(trace)])
+    mean = np.concatenate([moving_mean(known.error[begin:end], window) for _, begin, end in bounds_of(trace)])
     followers = [row for row, name in enumerate(trace.robots) if name not in leaders(trace)]
     return np.stack([_largest(mean[:, known.own[:, row] > 0.0]) for row in followers], axis=1)
 

@@ -9,7 +9,7 @@ import pytest
 from agents.body.interface import Disturbance, Jitter
 from agents.plugins.laws import Distance
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import REPETITIONS, fly_repeatedly, isolated, predict, repetitions
+from experiments.check.ideal_run import REPETITIONS, fly, isolated, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import document
 from experiments.sweep.runs import figures_of
@@ -131,7 +131,7 @@ def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
 
 
 def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
-    monkeypatch.setattr("experiments.check.motion.fly_repeatedly", lambda *_: pytest.fail("flown again"))
+    monkeypatch.setattr("experiments.check.motion.fly", lambda *_: pytest.fail("flown again"))
     codes = {each.code for each in check(of(document.read(PARK).cases()["event"]))}
     assert "acquired" in codes
 
@@ -139,8 +139,8 @@ def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(mon
 def test_flights_with_noise_are_those_of_their_seeds():
     bare = isolated(msgspec.structs.replace(flat_strip(0.3), duration_s=5.0, seed=7))
     assert repetitions(bare) == REPETITIONS
-    first, second = fly_repeatedly(bare, 2)
-    (alone,) = fly_repeatedly(msgspec.structs.replace(bare, seed=8), 1)
+    first, second = fly(bare, [7, 8])
+    (alone,) = fly(bare, [8])
     np.testing.assert_array_equal(second.position, alone.position)
     assert np.abs(first.position - second.position).max() > 1e-3
     assert repetitions(msgspec.structs.replace(bare, robots={f"R{k}": bare.robots["CF0"] for k in range(1000)})) == 1
