@@ -7,7 +7,6 @@ its liveliness token does.
 from __future__ import annotations
 
 import re
-import sys
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -22,6 +21,7 @@ from msgspec import Meta
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
+from agents.network.shutdown import end, held
 from agents.protocols import ros2
 from agents.protocols.ros2 import Distro, Message, Types
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
@@ -219,12 +219,14 @@ def serve(launch: Ros2Launch) -> int:
         Lifeline(stop).start()
     types = ros2.types(launch.distro)
     with on_termination(stop.set), ExitStack() as stack:
-        session = outside = stack.enter_context(
-            network.open_session(launch.endpoints(), name="ros2", stop=stop, identity=launch.identity or "ros2")
-        )
+        identity = launch.identity or "ros2"
+        opened = held(network.open_session(launch.endpoints(), name="ros2", stop=stop, identity=identity))
+        session, declared = stack.enter_context(opened)
+        outside = session
         if launch.ros:
-            outside = stack.enter_context(network.open_session(launch.ros, name="ros2", stop=stop))
+            outside, _ = stack.enter_context(held(network.open_session(launch.ros, name="ros2", stop=stop)))
         graph = Graph(session, Participant(outside, types, style="rmw", domain=launch.domain), Keys(launch.realm))
+        declared.append(graph)
         print(f"ros2 ready: node /{NODE}, domain {launch.domain}, {launch.distro}", flush=True)
         known: tuple[str, ...] = ()
         while not stop.wait(POLL_S):
@@ -241,4 +243,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

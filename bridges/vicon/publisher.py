@@ -22,7 +22,7 @@ from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import Farewell
+from agents.network.shutdown import Farewell, end, held
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Malformed, Segment
 from agents.runtime import command_line
@@ -209,11 +209,15 @@ def serve(launch: ViconLaunch) -> int:
     identity = launch.identity or "positioning"
     with (
         on_termination(stop.set),
-        network.open_session(launch.endpoints(), name="vicon", stop=stop, identity=identity) as session,
+        held(network.open_session(launch.endpoints(), name="vicon", stop=stop, identity=identity)) as (
+            session,
+            declared,
+        ),
     ):
         keys, robots = Keys(launch.realm), list(subjects)
         farewell = Farewell(session, keys, robots, lost)
         made = Bridge(host, port, PoseFilter(subjects, print_line), Positions(session, keys, robots), print_line)
+        declared += [farewell, made]
         if made.run(lambda: stop.is_set() or farewell.over()):
             return 0
     print_line(
@@ -253,4 +257,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import socket
-import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.network.shutdown import Farewell
+from agents.network.shutdown import Farewell, end, held
 from agents.protocols import vicon_datastream
 from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
 from agents.runtime import command_line
@@ -250,8 +249,9 @@ def run(launch: TwinLaunch) -> int:
     identity = launch.identity or "twin"
     with (
         on_termination(stop.set),
-        network.open_session(launch.endpoints(), name="vicon-twin", stop=stop, identity=identity) as session,
+        held(network.open_session(launch.endpoints(), name="vicon-twin", stop=stop, identity=identity)) as opened,
     ):
+        session, declared = opened
         rng = np.random.default_rng(launch.seed)
         try:
             vicon = ViconTwin(
@@ -270,6 +270,7 @@ def run(launch: TwinLaunch) -> int:
             keys = Keys(launch.realm)
             farewell = Farewell(session, keys, launch.robots, lost)
             truth = TruthSubscription(session, keys, launch.robots)
+            declared += [farewell, truth]
             ticks, clock = Ticks(launch.rate), Clock()
             while not (stop.is_set() or farewell.over()):
                 t = serve_until_next(vicon, ticks)
@@ -286,4 +287,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end(main())
