@@ -1,5 +1,7 @@
 """The verdict of a soak finds what was planted."""
 
+from dataclasses import replace
+
 import pytest
 
 from tools.reliability.soak_sampler import Row, Soaked
@@ -36,6 +38,11 @@ def test_nothing_is_wrong():
 
 def test_memory_that_is_taken_before_the_warm_up_does_not_count():
     assert passed(judge(soaked(lambda name, t: {"rss_mb": 60.0 + min(t, 250.0) / 10.0})))
+
+
+def test_pools_that_fill_in_the_first_minutes_of_a_short_run_do_not_count():
+    made = soaked(lambda name, t: {"rss_mb": 60.0 + min(t, 150.0) / 15.0}, until=420.0)
+    assert passed(judge(replace(made, duration_s=420.0)))
 
 
 @pytest.mark.parametrize(
