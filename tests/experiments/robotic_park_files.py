@@ -156,3 +156,47 @@ def column(count, drones=0, *, real=(), **more):
         where = "digital_twin" if k in real else "virtual"
         robots.append(robot(k + 1, name, start, relations, place=where, kind="pose", law="pid", **more))
     return file(robots, "hybrid" if real else "virtual")
+
+
+FLAT = """{name}:
+  {naming}: {name}
+  {address}
+  controller_type: PID_Continuous
+  communication:
+    type: {speaks}
+    threshold:
+      type: Constant
+      co: 0.02
+      ai: Null
+  task:
+    enable: True
+    T: 200
+    Onboard: False
+    role: consensus
+    type: distance
+    relationship: '{relations}'
+"""
+OTHERS = {
+    "dron01": ("khepera01", "khepera02"),
+    "khepera01": ("dron01", "khepera02"),
+    "khepera02": ("dron01", "khepera01"),
+}
+
+
+def flat(name, speaks="EvenBased", **changed):
+    """One robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
+    wheels = name.startswith("khepera")
+    address = (
+        f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
+        if wheels
+        else "control_mode: HighLevel"
+    )
+    relations = ", ".join(f"{other}_{0.8 if wheels and other[0] == 'k' else 0.9}" for other in OTHERS[name])
+    given = {
+        "name": name,
+        "naming": "id" if wheels else "name",
+        "address": address,
+        "speaks": speaks,
+        "relations": relations,
+    }
+    return FLAT.format(**(given | changed))

@@ -128,7 +128,8 @@ def park_yaml() -> Iterator[Target]:
     from experiments.file.text import decoded  # noqa: PLC0415
     from tests.experiments import robotic_park_files as theirs  # noqa: PLC0415
 
-    examples = [theirs.dome(4).encode(), theirs.column(3, 1).encode(), theirs.dome(5, origin=True, real=(0,)).encode()]
+    texts = [theirs.dome(4), theirs.column(3, 1), theirs.dome(5, origin=True, real=(0,))]
+    examples = [text.encode() for text in (*texts, "".join(map(theirs.flat, theirs.OTHERS)))]
     with place_for("some.toml") as file:
 
         def take(data: bytes) -> None:

@@ -10,7 +10,7 @@ from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.virtual_time import simulation
-from tests.experiments.robotic_park_files import column, dome, file, robot
+from tests.experiments.robotic_park_files import OTHERS, column, dome, file, flat, robot
 
 FILES = {
     5: lambda: dome(5, speaks="Continuous", pose_ms=50),
@@ -357,50 +357,6 @@ def test_the_command(tmp_path):
     source.write_bytes(b"\0\0")
     with pytest.raises(DocumentError, match="binary"):
         convert(str(source), None, 20.0)
-
-
-FLAT = """{name}:
-  {naming}: {name}
-  {address}
-  controller_type: PID_Continuous
-  communication:
-    type: {speaks}
-    threshold:
-      type: Constant
-      co: 0.02
-      ai: Null
-  task:
-    enable: True
-    T: 200
-    Onboard: False
-    role: consensus
-    type: distance
-    relationship: '{relations}'
-"""
-OTHERS = {
-    "dron01": ("khepera01", "khepera02"),
-    "khepera01": ("dron01", "khepera02"),
-    "khepera02": ("dron01", "khepera01"),
-}
-
-
-def flat(name, speaks="EvenBased", **changed):
-    """One robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
-    wheels = name.startswith("khepera")
-    address = (
-        f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
-        if wheels
-        else "control_mode: HighLevel"
-    )
-    relations = ", ".join(f"{other}_{0.8 if wheels and other[0] == 'k' else 0.9}" for other in OTHERS[name])
-    given = {
-        "name": name,
-        "naming": "id" if wheels else "name",
-        "address": address,
-        "speaks": speaks,
-        "relations": relations,
-    }
-    return FLAT.format(**(given | changed))
 
 
 def test_a_flat_file_of_2023_with_starts_from_an_index(tmp_path):
