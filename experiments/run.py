@@ -38,31 +38,12 @@ if TYPE_CHECKING:
 CHECKOUT: Final = Path(__file__).resolve().parents[1]
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure that shows itself below a cell; `files` are where it is kept, SVG and PDF."""
-
-    figure: Figure
-    files: tuple[Path, ...] = ()
-
-    def _repr_svg_(self) -> str:
-        """SVG for notebooks; figures are drawn without pyplot, by which notebooks would find them."""
-        from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
-
-        return style.svg(self.figure)
-
-
-def show(figure: Figure, file: str | Path | None = None) -> Picture:
-    """A figure for the end of a cell.
-
-    Args:
-        file: Where to keep it, as SVG and PDF; without a suffix.
-    """
+def show(figure: Figure, file: str | Path) -> Figure:
+    """A figure for the end of a cell, which shows it if it is a `style.Drawing`; kept as `file`.svg and .pdf."""
     from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-    if file is None:
-        return Picture(figure)
-    return Picture(figure, style.save(figure, Path(file).parent, Path(file).name))
+    style.save(figure, Path(file).parent, Path(file).name)
+    return figure
 
 
 def folder(default: str) -> Path:

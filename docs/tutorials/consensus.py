@@ -21,7 +21,7 @@ from experiments.check.ideal_run import closed_shares
 from experiments.check.realisation import algebraic_connectivity
 from experiments.file.document import Document, loads
 from experiments.recording.trace import Trace
-from experiments.report.style import CASES, MAGENTA, WIDTH, styled
+from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
 from experiments.run import folder, show, simulate
 
 OUT = folder("docs/tutorials/out")
@@ -85,7 +85,7 @@ assert (np.abs(eigenvalues) < 1e-12).sum() == 2
 @styled
 def spectra() -> Figure:
     """Each graph on a circle, and its eigenvalues below."""
-    figure = Figure(figsize=(2.0 * WIDTH, 2.7), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 2.7), layout="constrained")
     panels = figure.subplots(2, len(GRAPHS), height_ratios=(2.0, 1.0))
     angle = 2.0 * np.pi * np.arange(N) / N
     x, y = np.cos(angle), np.sin(angle)
@@ -167,7 +167,7 @@ runs = {name: simulate(document).traces["default"] for name, document in experim
 @styled
 def motions() -> Figure:
     """x of all robots, for each graph."""
-    figure = Figure(figsize=(2.0 * WIDTH, 1.7), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 1.7), layout="constrained")
     for k, (axes, (name, trace)) in enumerate(
         zip(figure.subplots(1, len(runs), sharex=True, sharey=True), runs.items(), strict=True)
     ):
@@ -285,7 +285,7 @@ assert np.all(np.abs(measured / lagging - 1.0) < 0.005)
 @styled
 def rates() -> Figure:
     """Measured rates over the eigenvalue, and how far the predictions are off."""
-    figure = Figure(figsize=(2.0 * WIDTH, 2.2), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 2.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     line = np.linspace(0.0, 6.2, 100)
     left.plot(line, CRAZYFLIE.response * GAIN * line, color=MAGENTA, label=r"$c\,k\,\lambda$", zorder=1)
@@ -352,7 +352,7 @@ assert left_over[:6] == sorted(left_over[:6])
 @styled
 def step_sizes() -> Figure:
     """The approach below and beyond the limit, and what is left."""
-    figure = Figure(figsize=(2.0 * WIDTH, 2.0), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 2.0), layout="constrained")
     panels = figure.subplots(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.3))
     for axes, loop, colour in zip(panels, (0.4, 1.8, 2.5), CASES, strict=False):
         axes.plot(steps[loop].time, steps[loop].true_position[..., 0], color=colour, linewidth=0.6)

@@ -20,7 +20,7 @@ from agents.formation.rigidity import rigid_motions, rigidity, rigidity_matrix
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import closed_shares
 from experiments.file.document import Document, load, loads
-from experiments.report.style import CASES, MAGENTA, WIDTH, styled
+from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
 from experiments.run import folder, show, simulate
 
 OUT = folder("docs/tutorials/out")
@@ -97,7 +97,7 @@ assert abs(across[0]) > 0.5  # a diagonal forbids it
 @styled
 def frameworks() -> Figure:
     """The square with its flex, and the braced one."""
-    figure = Figure(figsize=(WIDTH, 1.8), layout="constrained")
+    figure = Drawing(figsize=(WIDTH, 1.8), layout="constrained")
     for axes, pairs, title in zip(figure.subplots(1, 2), (sides, braced), ("rank 4 of 5", "rank 5 of 5"), strict=True):
         for i, j in pairs:
             axes.plot(square[[i, j], 0], square[[i, j], 1], color=CASES[0] if (i, j) in sides else MAGENTA)
@@ -179,7 +179,7 @@ assert "in space 5 of 6, not needed while heights are held" in said["rigid"]
 @styled
 def squares() -> Figure:
     """How the four runs end, seen from above."""
-    figure = Figure(figsize=(2.0 * WIDTH, 1.9), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 1.9), layout="constrained")
     for axes, (what, name) in zip(figure.subplots(1, 4), ends, strict=True):
         place = ends[what, name] - ends[what, name].mean(axis=0)
         for i, j in sides if what == "sides" else braced:
@@ -367,7 +367,7 @@ assert patience[0.8] > 3.0 * patience[0.75]
 @styled
 def heights() -> Figure:
     """Errors beyond the limit, slackness below it, and the reference experiment."""
-    figure = Figure(figsize=(2.0 * WIDTH, 2.1), layout="constrained")
+    figure = Drawing(figsize=(2.0 * WIDTH, 2.1), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     line = np.linspace(0.5, 0.96, 300)
     hand = 1e3 * np.array([compromise(float(rise)) for rise in line])

@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from agents.arrays import Array
-from experiments.report.style import CASES, INK, PAPER, WIDTH, fitting, legend_above, plain, styled
+from experiments.report.style import CASES, INK, PAPER, WIDTH, Drawing, fitting, legend_above, plain, styled
 from experiments.sweep.table import CellRow, short, words_of
 
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
@@ -41,7 +41,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     """
     known = [row for row in rows if not row.reference and _point_of(row, index) is not None]
     best = {id(row) for row in front(known, index)}
-    figure = Figure(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
+    figure = Drawing(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
     _draw_front(axes, [row for row in known if id(row) in best], index)
     cases = list(dict.fromkeys(row.case for row in known))

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.metrics.measure import measure
 from experiments.recording.reader import RecordingError
-from experiments.run import CHECKOUT, Figures, Run, reopen
+from experiments.run import CHECKOUT, Figures, Run, reopen, show
 from tests.experiments.traces import crowd
 
 
@@ -25,6 +25,13 @@ def test_a_run_shows_its_verdict_and_table(run):
     assert "✓ No pose was lost" in html
     assert html.count("<table>") == 1
     assert len(repr(run)) < 200
+
+
+@pytest.mark.slow
+def test_a_figure_is_shown_and_kept(run, tmp_path):
+    shown = show(run.figures()["errors"], tmp_path / "figures" / "errors")
+    assert "<svg" in shown._repr_svg_()
+    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["errors.pdf", "errors.svg"]
 
 
 @pytest.mark.slow
