@@ -107,6 +107,7 @@ def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     drawing, page = folder / f"{name}.svg", folder / f"{name}.pdf"
     drawing.write_text(svg(figure), encoding="utf-8")
+    figure.set_layout_engine("none")  # the drawing has laid it out
     with mpl.rc_context(dict(STYLE)):
         figure.savefig(page, metadata={"CreationDate": None})
     return drawing, page
