@@ -113,7 +113,7 @@ class Obedience:
         here = np.concatenate([position, yaw[:, None]], axis=1)
         watched = watched & np.isfinite(setpoint).all(axis=1) & np.isfinite(here).all(axis=1)
         anew = np.isnan(self._begin[:, 0]) | ~watched
-        if missed or anew.all():
+        if missed or every(anew):
             self._forget(np.ones(len(watched), dtype=bool), here)
             return
         if some(anew):
@@ -129,7 +129,8 @@ class Obedience:
 
     def _told_motion(self, setpoint: Array, position: Array, yaw: Array) -> tuple[Array, Array]:
         """Told velocity (N, 3) [m/s] and yaw rate on wheels (N,) [rad/s]."""
-        ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1) * setpoint[:, :1]
+        ahead = np.zeros((len(yaw), 3))  # `stack` takes three times as long
+        ahead[:, 0], ahead[:, 1] = np.cos(yaw) * setpoint[:, 0], np.sin(yaw) * setpoint[:, 0]
         toward = self._response[:, None] * (setpoint[:, :3] - position)
         toward *= np.minimum(1.0, self._speed / np.maximum(norm(toward), 1e-9))[:, None]
         velocity = np.where(self._twist[:, None], ahead, np.where(self._position[:, None], toward, setpoint[:, :3]))
