@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from agents.safety.hazards import failed
 from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor.run_view import News, Progress, RobotView
 from experiments.real_time.hosts.launcher import RUN, tagged
@@ -81,7 +82,7 @@ class Soaked:
     robots: tuple[str, ...]  # by process
     duration_s: float  # planned, from the common start [s]
     rows: Sequence[Row]  # in order of time
-    died: Mapping[str, float] = field(default_factory=dict)  # processes that ended too early, and when [s]
+    failed: Mapping[str, str] = field(default_factory=dict)  # what processes and robots failed in, and when
     interrupted: bool = False  # by the user
 
 
@@ -92,7 +93,7 @@ class Sampler(ExitStack):
         super().__init__()
         self._experiment, self._recording, self._table = experiment, folder / f"{case}.mcap", folder / TABLE
         self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
-        self._died: dict[str, float] = {}
+        self._failed: dict[str, str] = {}
         self._news = News()
         self._every = min(SAMPLE_S, experiment.duration_s / SAMPLES)
         self._due, self._print_due = self._every, PRINT_S
@@ -105,8 +106,9 @@ class Sampler(ExitStack):
         """Take in the last update of the run, and sample its processes if it is time."""
         t = progress.elapsed
         for event in self._news.new_events(progress):
-            if event.kind == "lost":
-                self._died.setdefault(event.source, round(t or 0.0, 1))
+            if event.kind == "lost" or (event.kind == "hazard" and failed(event.text)):
+                what = "ended" if event.kind == "lost" else f"did not do its part ({event.text})"
+                self._failed.setdefault(event.source, f"{what} after {t or 0.0:.0f} s")
         for state in progress.states:
             if state.phase == "running":
                 self._delays[state.robot] += [pose.arrived - pose.stamp for pose in state.received]
@@ -131,7 +133,7 @@ class Sampler(ExitStack):
             tuple(map("+".join, self._experiment.processes.values())),
             self._experiment.duration_s,
             msgspec.convert(known, list[Row], strict=False),
-            self._died,
+            self._failed,
             interrupted,
         )
 

@@ -101,8 +101,8 @@ def passed(findings: Sequence[Finding]) -> bool:
 
 def _alive(soaked: Soaked) -> list[Finding]:
     lasted, sampled = max((row.time_s for row in soaked.rows), default=0.0), {row.process for row in soaked.rows}
-    bad = [f"{name} ended after {at:.0f} s" for name, at in soaked.died.items()]
-    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled | soaked.died.keys()]
+    bad = [f"{name} {what}" for name, what in soaked.failed.items()]
+    bad += [f"{name} never had a process" for name in soaked.robots if name not in sampled | soaked.failed.keys()]
     if soaked.interrupted:
         bad.append(f"it was interrupted after {lasted:.0f} s of {soaked.duration_s:g} s")
     good = f"all {len(soaked.robots)} robots lived through {lasted / 60.0:.1f} minutes"

@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from tools.reliability.soak_sampler import Row, Soaked
+from agents.network import messages
+from experiments.file.document import load
+from experiments.real_time.conductor.run_view import Progress
+from tools.reliability.soak_sampler import Row, Sampler, Soaked
 from tools.reliability.soak_verdict import judge, passed, table
 
 ROBOTS = ("TB01", "CF02")
@@ -67,8 +70,24 @@ def test_what_was_planted_is_found(change, said):
 
 
 def test_the_dead_are_named():
-    found = bad(judge(soaked(died={"CF02": 12.0})))
+    found = bad(judge(soaked(failed={"CF02": "ended after 12 s"})))
     assert found == ["CF02 ended after 12 s"]
+
+
+def test_a_robot_that_landed_early_fails_a_soak_although_its_process_lives(tmp_path):
+    with Sampler(load("triangle").experiment, tmp_path, "event") as sampler:
+        events = [
+            ("hazard", "CF01", "hold: silent neighbour KH01"),
+            ("hazard", "CF01", "land: battery low: 9 % (limit 10 %)"),
+            ("hazard", "CF01", "over: battery low"),
+            ("lost", "KH02", "its process has ended"),
+        ]
+        made = [messages.Event(stamp=0.0, kind=kind, source=source, text=text) for kind, source, text in events]
+        sampler(Progress("event", "landing", 3.2, 15.0, {}, made))
+        assert bad(judge(sampler.result(interrupted=False)))[:2] == [
+            "CF01 did not do its part (land: battery low: 9 % (limit 10 %)) after 3 s",
+            "KH02 ended after 3 s",
+        ]
 
 
 def test_memory_of_a_short_run_is_not_judged():
