@@ -88,10 +88,10 @@ class Goals:
         """
         assert receipts.extra is not None
         acted, row, pose = receipts.arrival, receipts.link, receipts.extra[:, 0]
-        reached, first = _in_run(acted, duration), _first_of_pose(acted, row, pose)
+        reached, first = in_run(acted, duration), _first_of_pose(acted, row, pose)
         first &= reached
         return cls(
-            sent=sent.take(_in_run(sent.stamp, duration)),
+            sent=sent.take(in_run(sent.stamp, duration)),
             reached=np.bincount(row[reached], minlength=len(received)),
             acted=acted[first],
             follower=row[first],
@@ -113,21 +113,21 @@ def _first_of_pose(time: Array, row: Index, pose: Array) -> Mask:
     return first
 
 
-def _in_run(time: Array, duration: float) -> Mask:
+def in_run(time: Array, duration: float) -> Mask:
     """The end belongs to the landing: 50 Hz for 45 s are 2250 messages."""
     return np.asarray((time >= -ROUNDING_S) & (time < duration - ROUNDING_S))
 
 
 def sent_in_run(table: PoseTable, duration: float) -> PoseTable:
     """Poses that were sent in a run of `duration` [s], in order of time."""
-    kept = table.take(_in_run(table.stamp, duration))
+    kept = table.take(in_run(table.stamp, duration))
     kept = msgspec.structs.replace(kept, stamp=np.maximum(kept.stamp, 0.0))
     return kept.take(np.argsort(kept.stamp, kind="stable"))
 
 
 def received_in_run(table: PoseTable, duration: float) -> PoseTable:
     """Poses that were received in a run of `duration` [s], in order of arrival."""
-    kept = table.take(_in_run(table.arrival, duration))
+    kept = table.take(in_run(table.arrival, duration))
     kept = msgspec.structs.replace(kept, arrival=np.maximum(kept.arrival, 0.0))
     return kept.take(np.argsort(kept.arrival, kind="stable"))
 

@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index
+from agents.arrays import Array, Index, PoseTable
 from agents.decision.lifecycle import FINISHED, Phase
 from agents.formation.graph import Links
 from agents.network import messages
@@ -32,6 +32,7 @@ from experiments.recording.trace import (
     Trace,
     contacts_watched,
     finds_contacts,
+    in_run,
     messages_in_run,
     received_in_run,
     sent_in_run,
@@ -59,9 +60,6 @@ class Logbook:
         self._scene = bodies.scene(experiment)
         self._links: Links = Plan(experiment).pose_links
         self._sent = log.sent.between(copy * rows, (copy + 1) * rows)
-        if not log.lean:
-            sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses()]
-            self._sent = replace(self._sent, bytes=np.array(sizes, dtype=np.intp))
         per_copy = len(self._links)
         self._received = log.received.between(copy * per_copy, (copy + 1) * per_copy)
         self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
@@ -87,7 +85,10 @@ class Logbook:
         """The run from the common start on, as arrays."""
         log, mine, duration = self._log, self._mine, self._experiment.duration_s
         run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
-        rows = len(log.names)
+        rows, sent = len(log.names), self._sent.take(in_run(self._sent.stamp, duration))
+        if not log.lean:
+            sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)]
+            sent = replace(sent, bytes=np.array(sizes, dtype=np.intp))
         contacts = messages_in_run(self._contacts(), EPOCH, duration)
         world = messages_in_run(self._world(), EPOCH, duration)
         columns: dict[str, Any] = {what: getattr(log, what) for what in (*SAMPLED, *OPTIONAL)}
@@ -99,7 +100,7 @@ class Logbook:
             robots=log.names,
             clock="virtual",
             time=np.round(log.time[run], 9),
-            sent=sent_in_run(self._sent, duration),
+            sent=sent_in_run(sent, duration),
             received=received_in_run(self._received, duration),
             lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),
@@ -137,9 +138,8 @@ class Logbook:
 
     def _messages(self) -> Iterator[Iterable[tuple[float, Message, int | None]]]:
         """All messages, those of a kind in order of time: when each is logged [s, UTC], and its size if it was sent."""
-        assert self._sent.bytes is not None
         yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
-        yield ((pose.stamp, pose, size) for pose, size in zip(self._poses(), self._sent.bytes.tolist(), strict=True))
+        yield ((pose.stamp, pose, len(messages.encode(pose, self._encoding))) for pose in self._poses(self._sent))
         yield ((state.stamp, state, None) for _, states in self._states() for state in states)
         if self._log.centre is not None and self.goals is not None:
             goals = self._goal_messages(self._log.centre)
@@ -152,8 +152,8 @@ class Logbook:
     def _encoding(self) -> messages.Encoding:
         return self._experiment.network.encoding
 
-    def _poses(self) -> Iterator[messages.Pose]:
-        names, sent = self._log.names, self._sent
+    def _poses(self, sent: PoseTable) -> Iterator[messages.Pose]:
+        names = self._log.names
         assert sent.yaw is not None
         columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
         for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
