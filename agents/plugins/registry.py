@@ -93,14 +93,13 @@ def unusable(use: Callable[[str, str], object]) -> list[str]:
 
 def struct(group: str, name: str) -> type[msgspec.Struct]:
     """The struct of parameters registered under a name; raises as `load`, and PluginError if it is no frozen struct."""
-    plugin = load(group, name)
-    origin = _origin(_registered(group)[name][0])
+    plugin, entry = load(group, name), _registered(group)[name][0]
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
-        raise PluginError(f"{origin} is no msgspec.Struct; its parameters must be its fields")
+        raise PluginError(f"{_origin(entry)} is no msgspec.Struct; its parameters must be its fields")
     if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
-            f"{origin} can be changed, and would mix what it keeps of different robots and runs; declare it with "
-            "frozen=True and keep nothing in it (triggers: memory(rows))"
+            f"{_origin(entry)} can be changed, and would mix what it keeps of different robots and runs; declare it "
+            "with frozen=True and keep nothing in it (triggers: memory(rows))"
         )
     return plugin
 
@@ -128,7 +127,7 @@ def split(choice: str | Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
 
 def culprit(error: BaseException) -> str | None:
     """The line of another distribution's plug-in in which an error came about; None if there is none."""
-    owners = {entry.module: dist.name for entry, dist in _foreign()}
+    owners = {entry.module: _name(dist) for entry, dist in _foreign()}
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         if (module := frame.f_globals.get("__name__")) in owners:
             return f"plug-in {module} of {owners[module]} failed at {frame.f_code.co_filename}:{line}"
@@ -143,14 +142,20 @@ def body_name(address: str) -> str:
 def distributions(text: str | None = None) -> dict[str, str]:
     """Installed distributions with plug-ins, and their versions, but for our own; those that a text names, if given."""
     words = None if text is None else {*re.findall(r"[\w.-]+", text)}
-    owners = {dist.name: dist.version for entry, dist in _foreign() if words is None or entry.name in words}
+    owners = {_name(dist): dist.version for entry, dist in _foreign() if words is None or entry.name in words}
     return dict(sorted(owners.items()))
 
 
 def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
     entries = (entry for group in (BODIES, DEVICES, *STRUCTS) for entry in _installed().select(group=group))
-    return [(entry, entry.dist) for entry in entries if entry.dist is not None and entry.dist.name != "zenpark"]
+    return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
+
+
+@cache
+def _name(distribution: Distribution) -> str:
+    """Cached: a distribution parses its whole metadata for it."""
+    return distribution.name
 
 
 @cache
@@ -171,7 +176,7 @@ def _registered(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def _origin(entry: EntryPoint) -> str:
-    distribution = entry.dist.name if entry.dist is not None else "an unnamed distribution"
+    distribution = _name(entry.dist) if entry.dist is not None else "an unnamed distribution"
     return f"plug-in {entry.name!r} ({entry.value}) of {distribution}"
 
 

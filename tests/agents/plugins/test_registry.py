@@ -1,3 +1,4 @@
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from types import SimpleNamespace
 
@@ -158,17 +159,27 @@ def test_plugins_that_cannot_be_used_are_named_with_reason_and_remedy(foreign, m
     assert all(line.endswith("; mend or uninstall it (docs/plugins.md)") for line in lines)
 
 
+@dataclass(frozen=True)
+class Named:
+    name: str
+
+
 def failing():
     raise LookupError("of the plug-in")
 
 
 def test_an_error_in_a_plugin_of_another_distribution_has_its_line(monkeypatch):
-    entry = SimpleNamespace(module=__name__, dist=SimpleNamespace(name="theirs"))
+    entry = SimpleNamespace(module=__name__, dist=Named("theirs"))
     monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: [entry]))
     with pytest.raises(LookupError) as caught:
         failing()
     place = registry.culprit(caught.value)
     assert place is not None
     assert place.startswith(f"plug-in {__name__} of theirs failed at {__file__}:")
-    entry.dist.name = "zenpark"
+    entry.dist = Named("zenpark")
     assert registry.culprit(caught.value) is None
+
+
+def test_a_struct_without_faults_reads_no_metadata(monkeypatch):
+    monkeypatch.setattr(registry, "_name", lambda _: pytest.fail("the metadata of a distribution were read"))
+    assert registry.struct(registry.TRIGGERS, "periodic").__name__ == "Periodic"
