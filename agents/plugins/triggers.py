@@ -100,13 +100,14 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of all triggers, with the parameters that every one has.
 
     Class attributes of a kind of trigger: `places` where it makes sense, the `prediction` that it needs (the default of
-    an experiment that names none), and `judges_errors`: it uses errors of the formation, which are 0 for robots that
-    the central controller guides.
+    an experiment that names none), `judges_errors`: it uses errors of the formation, which are 0 for robots that the
+    central controller guides, and `timed`: it fires by time alone, whatever is measured.
     """
 
     places: ClassVar[tuple[Place, ...]] = ("communication", "control")
     prediction: ClassVar[str] = "hold"
     judges_errors: ClassVar[bool] = False
+    timed: ClassVar[bool] = False
 
     minimum_interval_s: Annotated[NotNegative, Meta(description="shortest time between two events [s]")] = 0.0
     maximum_silence_s: Annotated[
@@ -165,6 +166,8 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 class Periodic(Trigger, frozen=True):
     """t − t_k ≥ T."""
+
+    timed: ClassVar[bool] = True
 
     period_s: Annotated[Positive, Meta(description="T [s]")] = 0.02
 

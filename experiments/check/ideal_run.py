@@ -20,6 +20,7 @@ from agents.body.kinds import Kind
 from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, World
+from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
 
@@ -79,7 +80,8 @@ def isolated(experiment: Experiment) -> Experiment:
 def predict(experiment: Experiment) -> Prediction:
     """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
     bare = isolated(experiment)
-    without, *noisy = fly(bare, [bare.seed] * (1 + has_noise(bare)), quiet=1)
+    shaken = has_noise(bare) and not getattr(Plan(bare).trigger, "timed", False)
+    without, *noisy = fly(bare, [bare.seed] * (1 + shaken), quiet=1)
     if without.stuck and noisy:  # only the noise may hold the robots back
         return fly(bare, [bare.seed], quiet=1)[0]
     counted = (*noisy, without)[0]
