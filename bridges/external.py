@@ -304,8 +304,3 @@ class ExternalBody:
             publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
             self._positions.trouble[row] = f"commands cannot be sent: {error}"
-
-
-def open_external(request: BodyRequest) -> ExternalBody:
-    """Entry point `external` of the group `zenpark.bodies`."""
-    return ExternalBody(request)

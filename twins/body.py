@@ -185,7 +185,3 @@ class TwinBody:
             velocity = velocity_after(self._velocity, measured - self._measured, since)
             self._velocity = np.where(np.isfinite(velocity), velocity, 0.0) if self._absent else velocity
         self._measured_at, self._measured = self._t, measured
-
-
-def open_twin(request: BodyRequest) -> TwinBody:
-    return TwinBody(request)

@@ -242,9 +242,6 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             call_all(left)
 
 
-BodyFactory = Callable[[BodyRequest], Body]
-
-
 SettingsT = TypeVar("SettingsT", bound=msgspec.Struct)
 
 

@@ -1,7 +1,7 @@
 """Registry of plug-ins: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
 
-A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a function, a
-`agents.body.interface.BodyFactory`. Any distribution may add one, for example under
+A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a class, made
+with a `agents.body.interface.BodyRequest`. Any distribution may add one, for example under
 `[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
 """
 

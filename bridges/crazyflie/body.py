@@ -37,7 +37,7 @@ MEASURING_S: Final = (
 
 
 class CrazyflieBody:
-    """Crazyflies; implements `agents.body.interface.Body`."""
+    """Crazyflies; implements `agents.body.interface.Body`. Raises BodyError for an invalid address or setting."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names
@@ -210,8 +210,3 @@ class CrazyflieBody:
         if not isfinite(one.ranges_time):
             return None
         return RangeScan(one.ranges_time - self._zero, BEARING, ELEVATION, one.ranges)
-
-
-def open_crazyflie(request: BodyRequest) -> CrazyflieBody:
-    """Entry points `radio`, `usb` and `udp`; raises BodyError for an invalid address or setting."""
-    return CrazyflieBody(request)

@@ -134,7 +134,3 @@ class KheperaBody:
             return None
         stamp, bearing, distance = link.scan
         return RangeScan(stamp - now + t, bearing, np.zeros(len(bearing)), distance)
-
-
-def open_khepera4(request: BodyRequest) -> KheperaBody:
-    return KheperaBody(request)

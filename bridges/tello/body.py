@@ -199,7 +199,3 @@ def _check_free(port: int) -> None:
                 f"UDP port {port} of this computer is taken ({error.strerror}): another program flies Tellos; end it, "
                 "or give all Tellos the same `process`"
             ) from error
-
-
-def open_tello(request: BodyRequest) -> TelloBody:
-    return TelloBody(request)

@@ -14,7 +14,7 @@ import zenoh
 from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import Body, BodyError, BodyRequest, BodyState, Rays, call_all
+from agents.body.interface import BodyError, BodyRequest, BodyState, Rays, call_all
 from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import session as network
@@ -198,8 +198,3 @@ class TurtleBot3:
             leave(session, self)
         self._sessions.clear()
         self._claims.release()
-
-
-def open_turtlebot3(request: BodyRequest) -> Body:
-    """Entry points `ros2dds` and `rmw` of the group `zenpark.bodies`."""
-    return TurtleBot3(request)

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from bridges.crazyflie.body import open_crazyflie
+from bridges.crazyflie.body import CrazyflieBody
 from tests.twins.loopback import Served, request
-from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import State
 
 NOTHING = (np.nan,) * 4
@@ -79,9 +79,9 @@ class Process:
 def flown(rows=1, *, device=None, external=False, start=None, serve=None, **faults):
     """Twins of Crazyflies, and a process that is connected to them; `serve`: settings of the twins, if others."""
     asked = request("crazyflie", ["crazyflie-twin"] * rows, device=serve or device, external=external, start=start)
-    with Served(open_device, asked, **faults) as twin:
+    with Served(CrazyflieTwin, asked, **faults) as twin:
         body = request("crazyflie", twin.addresses, device=device, external=external, start=start)
-        process = Process(open_crazyflie(body))
+        process = Process(CrazyflieBody(body))
         try:
             yield twin, process
         finally:

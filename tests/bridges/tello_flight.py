@@ -16,10 +16,10 @@ import numpy as np
 from agents.body.interface import BodyError
 from agents.decision.position_control import PositionController
 from bridges.tello import body as bridge
-from bridges.tello.body import open_tello
+from bridges.tello.body import TelloBody
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import PATIENCE_S
-from twins.devices.tello import open_device
+from twins.devices.tello import TelloDevice
 
 TICK = 0.01
 NOBODY = np.full(4, np.nan)
@@ -71,8 +71,8 @@ class Flight:
 def formation():
     """Two drones take off to different heights, fly to two places with another yaw, hold, and land."""
     rows = request("tello", ["tello-twin"] * 2, external=True, yaw=0.5)
-    with Served(open_device, rows) as served:
-        body = open_tello(reached(rows, served.addresses))
+    with Served(TelloDevice, rows) as served:
+        body = TelloBody(reached(rows, served.addresses))
         body.open()
         flight = Flight(body, [(served, 0), (served, 1)], rows)
         everybody = np.arange(2)
@@ -103,16 +103,16 @@ def formation():
 def faults():
     """Six drones: a good one, one that falls silent, is killed, drains, is empty, is absent; the good one flies on."""
     one = request("tello", ["tello-twin"], external=True)
-    good = Served(open_device, one)
-    silent = Served(open_device, one, silent_from_s=4.0)
-    killed = Served(open_device, one)
-    weak = Served(open_device, one, battery=0.15, drain=12.0)
-    empty = Served(open_device, one, battery=0.08)
+    good = Served(TelloDevice, one)
+    silent = Served(TelloDevice, one, silent_from_s=4.0)
+    killed = Served(TelloDevice, one)
+    weak = Served(TelloDevice, one, battery=0.15, drain=12.0)
+    empty = Served(TelloDevice, one, battery=0.08)
     twins = [good, silent, killed, weak, empty]
     addresses = [served.addresses[0] for served in twins] + ["tello://127.0.0.99:18889"]
     rows = request("tello", addresses, external=True)
     bridge.OPEN_S = 1.0  # so long it waits for the absent one; `refusals` waits as long as the bridge wants to
-    body = open_tello(rows)
+    body = TelloBody(rows)
     begin = time.monotonic()
     body.open()
     opened = time.monotonic() - begin
@@ -155,19 +155,19 @@ def refusals():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # another program that flies Tellos
         other.bind(("", 8889))
         try:
-            open_tello(request("tello", ["tello://127.0.0.77:18889"], external=True)).open()
+            TelloBody(request("tello", ["tello://127.0.0.77:18889"], external=True)).open()
         except BodyError as error:
             said["second"] = str(error)
     begin = time.monotonic()
-    nobody = open_tello(request("tello", ["tello://127.0.0.77:18889"], external=True))
+    nobody = TelloBody(request("tello", ["tello://127.0.0.77:18889"], external=True))
     try:
         nobody.open()
     except BodyError as error:
         said["absent"] = str(error)
     seconds = time.monotonic() - begin
     rows = request("tello", ["tello-twin"], external=True)
-    with Served(open_device, rows) as served:
-        body = open_tello(reached(rows, served.addresses))
+    with Served(TelloDevice, rows) as served:
+        body = TelloBody(reached(rows, served.addresses))
         body.open()
         flight = Flight(body, [(served, 0)], rows)
         flight.located[:] = False
@@ -194,7 +194,7 @@ def vendor():
     Tello, TelloException = library.Tello, library.TelloException
     Tello.LOGGER.setLevel("CRITICAL")
     rows = request("tello", ["tello-twin"] * 2, external=True)
-    with Served(open_device, rows) as served:
+    with Served(TelloDevice, rows) as served:
         drones = []
         for address in served.addresses:
             host, port = address.removeprefix("tello://").split(":")

@@ -19,7 +19,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.safety.detection import SLOWEST
 from bridges import external
-from bridges.external import ExternalBody, open_external
+from bridges.external import ExternalBody
 from tests.conftest import RouterProcess
 from tests.waiting import until
 
@@ -109,7 +109,7 @@ def far(router: RouterProcess) -> Iterator[FarEnd]:
 def body(router: RouterProcess, far: FarEnd) -> Iterator[ExternalBody]:
     """Open, at the other end of `far`, which talks."""
     far.talk(*ROWS)
-    made = open_external(request(router.endpoint))
+    made = ExternalBody(request(router.endpoint))
     made.open()
     yield made
     made.close()
@@ -142,7 +142,7 @@ def test_it_says_whose_position_is_missing_and_why(
     monkeypatch.setattr(external, "OPEN_S", 0.5)
 
     def refusal(rows: dict[str, str]) -> str:
-        body = open_external(request(router.endpoint, rows))
+        body = ExternalBody(request(router.endpoint, rows))
         with pytest.raises(BodyError) as caught:
             body.open()
         return str(caught.value)
@@ -179,7 +179,7 @@ def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
     router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(external, "OPEN_S", 0.5)
-    body = open_external(request(router.endpoint, {"CF01": "crazyflie"}))
+    body = ExternalBody(request(router.endpoint, {"CF01": "crazyflie"}))
     stop = threading.Event()
 
     def run() -> None:
@@ -195,9 +195,9 @@ def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
         stop.set()
         thread.join()
     with pytest.raises(BodyError, match=r"CF01: device: .*`rate`.*has no settings"):
-        open_external(request(router.endpoint, {"CF01": "crazyflie"}, rate=5))
+        ExternalBody(request(router.endpoint, {"CF01": "crazyflie"}, rate=5))
     with pytest.raises(BodyError, match="CF01: no router answers at"):
-        open_external(request(free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
+        ExternalBody(request(free_endpoint(preferred_port=0), {"CF01": "crazyflie"})).open()
 
 
 # ---------------------------------------------------------------------- what it believes
@@ -297,7 +297,7 @@ def test_without_a_world_it_says_what_to_start(router: RouterProcess, monkeypatc
     monkeypatch.setattr(external, "OPEN_S", 0.3)
     asked = replace(request(router.endpoint, {"CF01": "crazyflie"}), addresses=("world",))
     with pytest.raises(BodyError) as caught:
-        open_external(asked).open()
+        ExternalBody(asked).open()
     assert str(caught.value) == (
         "CF01: nothing is published on park/CF01/position: is `./zenpark world serve` with this experiment running and "
         f"connected to {router.endpoint}?"

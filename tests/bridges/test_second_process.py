@@ -8,11 +8,11 @@ import pytest
 from agents.body.device_locks import Claims
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import device_of
-from bridges.crazyflie.body import open_crazyflie
-from bridges.khepera4.body import open_khepera4
+from bridges.crazyflie.body import CrazyflieBody
+from bridges.khepera4.body import KheperaBody
 from bridges.khepera4.link import Address
-from bridges.tello.body import open_tello
-from bridges.turtlebot3.body import open_turtlebot3
+from bridges.tello.body import TelloBody
+from bridges.turtlebot3.body import TurtleBot3
 from tests.bridges import turtlebots
 from tests.twins.loopback import request
 
@@ -24,22 +24,22 @@ def folder(tmp_path, monkeypatch):
 
 def crazyflie(port):
     address = f"udp://127.0.0.1:{port}"
-    return open_crazyflie(request("crazyflie", [address])), device_of(f"udp://localhost:{port}")
+    return CrazyflieBody(request("crazyflie", [address])), device_of(f"udp://localhost:{port}")
 
 
 def khepera(port):
     address = Address.parse("R0", f"kteam://localhost:{port}")
-    return open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), address.device
+    return KheperaBody(request("khepera4", [f"khepera4://127.0.0.1:{port}"])), address.device
 
 
 def tello(port):
-    return open_tello(request("tello", [f"tello://127.0.0.1:{port}"], external=True)), "tello://127.0.0.1"
+    return TelloBody(request("tello", [f"tello://127.0.0.1:{port}"], external=True)), "tello://127.0.0.1"
 
 
 def turtlebot(port):
     endpoint = f"tcp/127.0.0.1:{port}"
     wanted = replace(turtlebots.request(endpoint), addresses=("ros2dds://tb3_0?distro=humble",))
-    return open_turtlebot3(wanted), f"ros2dds://tb3_0 by {endpoint}"
+    return TurtleBot3(wanted), f"ros2dds://tb3_0 by {endpoint}"
 
 
 @pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])

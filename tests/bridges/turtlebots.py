@@ -10,9 +10,9 @@ from agents.body.interface import BodyRequest, Disturbance
 from agents.body.kinds import TURTLEBOT3
 from agents.decision.position_control import drive
 from agents.network.keys import Keys
-from bridges.turtlebot3.body import open_turtlebot3
+from bridges.turtlebot3.body import TurtleBot3
 from twins.devices.device import DeviceRequest, Faults
-from twins.devices.turtlebot3 import open_device
+from twins.devices.turtlebot3 import TurtleBot3Twin
 
 FAST = 4.0
 DT = 0.01
@@ -44,11 +44,9 @@ class Stage:
     """Twins that live on a thread, and what a robot process would do with their bridge."""
 
     def __init__(self, twins_request, *, faults=None, body_request=None):
-        self.twin = open_device(DeviceRequest(twins_request, faults or Faults()))
+        self.twin = TurtleBot3Twin(DeviceRequest(twins_request, faults or Faults()))
         wanted = body_request or twins_request
-        self.body = open_turtlebot3(
-            replace(wanted, addresses=wanted.addresses if body_request else self.twin.addresses)
-        )
+        self.body = TurtleBot3(replace(wanted, addresses=wanted.addresses if body_request else self.twin.addresses))
         self.body._clock = clock
         self.rows = len(twins_request.names)
         self._end = threading.Event()

@@ -36,7 +36,7 @@ def khepera_twin() -> Iterator[Target]:
         devices = {}
         for letter, server in letters.items():
             made = twin_request("khepera4", ["khepera4-twin"], device={"server": server})
-            devices[letter] = khepera4.open_device(DeviceRequest(made, Faults()))
+            devices[letter] = khepera4.KheperaDevice(DeviceRequest(made, Faults()))
         t = 0.0
 
         def take(data: bytes) -> None:

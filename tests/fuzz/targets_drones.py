@@ -23,7 +23,7 @@ from twins.devices.device import DeviceRequest, Faults
 
 def crazyflie_twin() -> Iterator[Target]:
     """CRTP packets, one or more behind each other (length, bytes), in the air and on the ground."""
-    from twins.devices.crazyflie.device import open_device  # noqa: PLC0415
+    from twins.devices.crazyflie.device import CrazyflieTwin  # noqa: PLC0415
 
     def packet(port: Port, channel: int, data: bytes) -> bytes:
         return bytes((1 + len(data), crtp.header(port, channel))) + data
@@ -73,7 +73,7 @@ def crazyflie_twin() -> Iterator[Target]:
         nonlocal device
         if device is not None:
             device.close()
-        device = open_device(DeviceRequest(twin_request("crazyflie", ["crazyflie-twin"]), Faults()))
+        device = CrazyflieTwin(DeviceRequest(twin_request("crazyflie", ["crazyflie-twin"]), Faults()))
         line, wire = device.lines[0], Wire()
         own = line.socket
         line.socket.close()
@@ -106,7 +106,7 @@ def crazyflie_twin() -> Iterator[Target]:
 
 def tello_twin() -> Iterator[Target]:
     """Words over UDP, datagrams apart by zero bytes."""
-    from twins.devices.tello import open_device  # noqa: PLC0415
+    from twins.devices.tello import TelloDevice  # noqa: PLC0415
 
     words = [
         "command", "takeoff", "land", "emergency", "stop", "rc 10 -20 30 40", "rc 100 100 100 100", "up 50", "back 100",
@@ -120,7 +120,7 @@ def tello_twin() -> Iterator[Target]:
         nonlocal device
         if device is not None:
             device.close()
-        device = open_device(DeviceRequest(twin_request("tello", ["tello-twin"]), Faults()))
+        device = TelloDevice(DeviceRequest(twin_request("tello", ["tello-twin"]), Faults()))
         wire = Wire()
         device._drones[0].wire.close()
         device._drones[0].wire = wire

@@ -113,13 +113,13 @@ def turtlebot_bridge() -> Iterator[Target]:
 
 def turtlebot_twin() -> Iterator[Target]:
     """Commands to the twin of a robot."""
-    from twins.devices.turtlebot3 import open_device  # noqa: PLC0415
+    from twins.devices.turtlebot3 import TurtleBot3Twin  # noqa: PLC0415
 
     good = ros_messages()
 
     def make():
         net.forget()
-        device = open_device(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
+        device = TurtleBot3Twin(DeviceRequest(request("turtlebot3", "turtlebot3-twin"), Faults()))
         t = 0.0
 
         def take(data: bytes) -> None:

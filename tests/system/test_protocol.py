@@ -98,7 +98,7 @@ def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) ->
 
 def test_a_robot_that_does_not_move_is_said_on_the_console_and_fails_the_run(tmp_path: Path) -> None:
     """A Khepera whose server ignores `d`, and answers as one that obeys it."""
-    twin = Served(khepera4.open_device, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
+    twin = Served(khepera4.KheperaDevice, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
     file = tmp_path / "pair.toml"
     with twin:
         body = f"{twin.addresses[0]}?server=fork"

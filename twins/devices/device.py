@@ -9,7 +9,7 @@ from __future__ import annotations
 import select
 import socket
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Generic, Protocol, TypeVar
@@ -108,7 +108,7 @@ class Server(Protocol):
 
 
 class Device(Server, Protocol):
-    """Simulated device for some robots of one kind."""
+    """Simulated device for some robots of one kind, made with a `DeviceRequest`."""
 
     addresses: tuple[str, ...]  # one per row: the body's address for the bridge, such as "udp://127.0.0.1:19850"
 
@@ -136,6 +136,3 @@ class DeviceRequest:
     body: BodyRequest
     faults: Faults
     by_hand: bool = False  # without an experiment: addresses at which vendor libraries scan, where they are free
-
-
-DeviceFactory = Callable[[DeviceRequest], Device]  # entry-point group `zenpark.devices`, by the word in `body`

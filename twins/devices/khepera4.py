@@ -388,7 +388,3 @@ def _listen(name: str, address: str) -> socket.socket:
         raise BodyError(f"{name}: no Khepera twin at {host}:{port}: {error}; name another address") from error
     listener.setblocking(False)
     return listener
-
-
-def open_device(request: DeviceRequest) -> KheperaDevice:
-    return KheperaDevice(request)

@@ -449,7 +449,3 @@ def _listen(name: str, address: str) -> socket.socket:
         wire.setblocking(False)
         return wire
     raise BodyError(f"{name}: {address}: in use; end the twin that holds {hosts[0]}:{port}, or name another address")
-
-
-def open_device(request: DeviceRequest) -> TelloDevice:
-    return TelloDevice(request)

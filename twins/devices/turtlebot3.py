@@ -25,7 +25,7 @@ from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
 from twins.body import instants
-from twins.devices.device import Device, DeviceRequest, FaultyLink
+from twins.devices.device import DeviceRequest, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
 from twins.models.noise import Noise
@@ -260,8 +260,3 @@ def _row(
         start=start,
         watchdog=chosen.watchdog_s or inf,
     )
-
-
-def open_device(request: DeviceRequest) -> Device:
-    """Entry point `turtlebot3-twin` of the group `zenpark.devices`."""
-    return TurtleBot3Twin(request)

@@ -10,7 +10,7 @@ import pytest
 
 from agents.body.interface import BodyError
 from agents.protocols.crtp import Memory
-from bridges.crazyflie.body import open_crazyflie
+from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import request
 from twins.devices.crazyflie.supervisor import State
@@ -64,7 +64,7 @@ def test_flight_and_next_session():
         process.body.stop(np.array([0]))
         process.close()
         assert supervised(twin) != State.LOCKED  # an emergency stop of one that stands would lock it
-        again = Process(open_crazyflie(request("crazyflie", twin.addresses)))
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
         try:
             again.takeoff()
             assert truth(twin)[2] == pytest.approx(0.5, abs=0.06)
@@ -171,11 +171,11 @@ def test_lighthouse(tmp_path):
         process.until(lambda: process.state.notes[0] == "", "nothing to say")
         process.close()
         memories.stored = (0, 0)
-        again = Process(open_crazyflie(request("crazyflie", twin.addresses, device=device)))
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device=device)))
         again.close()
         assert memories.stored == (0, 0), "the same geometry is not written again: that wears the flash memory"
         other = device["positioning"] | {"file": lighthouse_file(tmp_path, 0, 1, 2)}
-        again = Process(open_crazyflie(request("crazyflie", twin.addresses, device={"positioning": other})))
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device={"positioning": other})))
         again.close()
         assert memories.stored == (0b1111, 0b1111)
 

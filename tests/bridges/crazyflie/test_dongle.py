@@ -9,10 +9,10 @@ from cflib.drivers import crazyradio
 
 from agents.protocols.crtp import Port
 from bridges.crazyflie import body, link, pilot
-from bridges.crazyflie.body import open_crazyflie
+from bridges.crazyflie.body import CrazyflieBody
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
-from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import State
 
 pytestmark = pytest.mark.system
@@ -28,7 +28,7 @@ def toc_cache(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
     if link._KNOWN_TABLES:
         return
-    with Served(open_device, request("crazyflie", ["x"])) as twin:  # over UDP a thousand entries are read in no time
+    with Served(CrazyflieTwin, request("crazyflie", ["x"])) as twin:  # over UDP a thousand entries are read in no time
         link.prepare(twin.addresses)
         reader = link.CrazyflieLink(twin.addresses[0])
         reader.open(time.monotonic() + 30.0, threading.Event())
@@ -242,7 +242,7 @@ def test_a_session_that_begins_while_safelink_is_on():
         process.close()
         assert twin.device.lines[0].safelink
         twin.device.lines[0].silence(0.5)
-        again = Process(open_crazyflie(request("crazyflie", twin.addresses)))
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
         try:
             again.takeoff(HEIGHT)
             again.cut()
@@ -298,7 +298,7 @@ def test_recovery_from_a_crash_is_asked_for():
         process.until(lambda: "no take-off: crashed" in process.state.notes[0] and not process.state.flying[0], "no")
         assert supervised(twin) == State.CRASHED
         process.close()
-        again = Process(open_crazyflie(request("crazyflie", twin.addresses, device={"recover": True})))
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device={"recover": True})))
         try:
             again.takeoff(HEIGHT)
             again.cut()

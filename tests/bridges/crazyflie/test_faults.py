@@ -13,12 +13,12 @@ import pytest
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside, capacity, overload
 from agents.protocols.crtp import Info
-from bridges.crazyflie.body import open_crazyflie
+from bridges.crazyflie.body import CrazyflieBody
 from bridges.crazyflie.telemetry import Telemetry
 from tests.bridges.crazyflie_flight import Process, flown, supervised, truth
 from tests.twins.loopback import Served, request
 from tests.waiting import until
-from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import State
 from twins.devices.device import Faults
 
@@ -37,10 +37,10 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
     battery runs empty, and one is killed: these four end on the ground with their motors off.
     """
     well, lossy, mute, blinking, empty, killed = range(6)
-    twin = Served(open_device, request("crazyflie", ["crazyflie-twin"] * 5))
-    other = Served(open_device, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]]))
+    twin = Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"] * 5))
+    other = Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"], start=[[0.0, 5.0, 0.0]]))
     lines = twin.device.lines
-    process = Process(open_crazyflie(request("crazyflie", [*twin.addresses, *other.addresses])))
+    process = Process(CrazyflieBody(request("crazyflie", [*twin.addresses, *other.addresses])))
     try:
         process.until(lambda: np.isfinite(process.state.position).all(), "all are connected")
         lines[lossy].faults = Faults(loss=0.05)  # not before: 402 parameters take long without repetitions
@@ -108,9 +108,9 @@ import sys
 import numpy as np
 from tests.bridges.crazyflie_flight import Process
 from tests.twins.loopback import request
-from bridges.crazyflie.body import open_crazyflie
+from bridges.crazyflie.body import CrazyflieBody
 
-process = Process(open_crazyflie(request("crazyflie", sys.argv[1:])))
+process = Process(CrazyflieBody(request("crazyflie", sys.argv[1:])))
 process.takeoff(0.4)
 process.setpoint = [(0.3, 0.0, 0.4, 0.0)]
 while True:
@@ -123,7 +123,7 @@ while True:
 def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):
     """Suspension until the drone has come down: then the loop commands as before, and the drone stays down."""
     asked = request("crazyflie", ["crazyflie-twin"], device={"link": link})
-    with Served(open_device, asked) as twin:
+    with Served(CrazyflieTwin, asked) as twin:
         child = subprocess.Popen([sys.executable, "-c", FLYING, *twin.addresses])
         try:
             until(lambda: abs(truth(twin)[0] - 0.3) < 0.05, "it follows setpoints")
@@ -163,19 +163,19 @@ def test_absent():
         address = f"udp://127.0.0.1:{mute.getsockname()[1]}"
         begin = time.monotonic()
         with pytest.raises(BodyError, match=f"R0: no answer at {address}: is the simulation running there"):
-            open_crazyflie(request("crazyflie", [address])).open()
+            CrazyflieBody(request("crazyflie", [address])).open()
         assert time.monotonic() - begin < 6.0
     begin = time.monotonic()
     with pytest.raises(BodyError, match="is the simulation running there"):
-        open_crazyflie(request("crazyflie", [address])).open()
+        CrazyflieBody(request("crazyflie", [address])).open()
     assert time.monotonic() - begin < 6.0
 
 
 @pytest.mark.system
 def test_one_of_two_is_absent():
     """The other one is ready; the absent one's note says what is the matter."""
-    twin = Served(open_device, request("crazyflie", ["crazyflie-twin"]))
-    process = Process(open_crazyflie(request("crazyflie", [twin.addresses[0], "udp://127.0.0.1:1"])))
+    twin = Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"]))
+    process = Process(CrazyflieBody(request("crazyflie", [twin.addresses[0], "udp://127.0.0.1:1"])))
     try:
         process.tick()
         assert process.state.notes[0] == ""
@@ -191,7 +191,7 @@ def test_one_of_two_is_absent():
 def test_nothing_plugged_in(address, said):
     """No dongle and no robot is plugged in here; no traceback either."""
     with pytest.raises(BodyError, match=said):
-        open_crazyflie(request("crazyflie", [address])).open()
+        CrazyflieBody(request("crazyflie", [address])).open()
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_nothing_plugged_in(address, said):
 )
 def test_wrong_address(address):
     with pytest.raises(BodyError, match=r"R0: .* is no Crazyflie's address; write radio://0/80/2M/E7E7E7E701"):
-        open_crazyflie(request("crazyflie", [address]))
+        CrazyflieBody(request("crazyflie", [address]))
 
 
 @pytest.mark.parametrize(
@@ -214,14 +214,14 @@ def test_wrong_address(address):
 )
 def test_wrong_settings(device, said):
     with pytest.raises(BodyError, match=said):
-        open_crazyflie(request("crazyflie", [RADIO.format(1)], device=device))
+        CrazyflieBody(request("crazyflie", [RADIO.format(1)], device=device))
 
 
 def test_library_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "cflib", None)
     monkeypatch.delitem(sys.modules, "cflib.crtp", raising=False)
     with pytest.raises(BodyError, match=r"pip install -e '\.\[crazyflie\]'"):
-        open_crazyflie(request("crazyflie", [RADIO.format(1)])).open()
+        CrazyflieBody(request("crazyflie", [RADIO.format(1)])).open()
 
 
 def test_firmware_without_supervisor():
@@ -243,12 +243,12 @@ def test_firmware_without_supervisor():
 
 def test_two_at_one_address():
     with pytest.raises(BodyError, match="several robots have the address"):
-        open_crazyflie(request("crazyflie", [RADIO.format(1)] * 2))
+        CrazyflieBody(request("crazyflie", [RADIO.format(1)] * 2))
 
 
 def test_other_robots():
     with pytest.raises(BodyError, match="R0 is a tello"):
-        open_crazyflie(request("tello", [RADIO.format(1)]))
+        CrazyflieBody(request("tello", [RADIO.format(1)]))
 
 
 @pytest.mark.parametrize(("exchanges", "carried"), [(100.0, 70.0), (300.0, 210.0), (600.0, 420.0)])

@@ -11,7 +11,7 @@ from bridges.khepera4 import drivers
 from bridges.khepera4.odometry import Odometer
 from tests.twins.loopback import request
 from twins.devices.device import DeviceRequest, Faults
-from twins.devices.khepera4 import open_device
+from twins.devices.khepera4 import KheperaDevice
 
 DT = 0.01
 
@@ -20,7 +20,7 @@ class Lab:
     """One robot, its twin, and the wire between the driver and it; also the clock of the driver."""
 
     def __init__(self, server, monkeypatch, *, named=True, **settings):
-        self.device = open_device(
+        self.device = KheperaDevice(
             DeviceRequest(request("khepera4", ["khepera4-twin"], device={"server": server}), Faults())
         )
         self.program = self.device._servers[0]._program

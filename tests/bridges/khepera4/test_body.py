@@ -23,14 +23,14 @@ from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
-from bridges.khepera4.body import OPEN_S, open_khepera4
+from bridges.khepera4.body import OPEN_S, KheperaBody
 from bridges.khepera4.link import Address, Khepera4Link, Odometry
 from bridges.khepera4.odometry import Odometer
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import until
 from twins.devices import khepera4 as twin
 from twins.devices.device import Faults
-from twins.devices.khepera4 import open_device
+from twins.devices.khepera4 import KheperaDevice
 
 TICK = 0.01
 PARK, KTEAM = {"server": "2025-05"}, {"server": "kteam"}
@@ -73,7 +73,7 @@ class Drive:
 @pytest.fixture
 def served():
     with ExitStack() as stack:
-        yield lambda rows, **faults: stack.enter_context(Served(open_device, rows, **faults))
+        yield lambda rows, **faults: stack.enter_context(Served(KheperaDevice, rows, **faults))
 
 
 @pytest.fixture
@@ -164,18 +164,18 @@ def test_addresses(address, expected):
 )  # fmt: skip
 def test_wrong_addresses_are_named(address):
     with pytest.raises(BodyError, match=f"^R0: {re.escape(address)}: "):
-        open_khepera4(request("khepera4", [address]))
+        KheperaBody(request("khepera4", [address]))
 
 
 def test_wrong_settings_are_named():
     with pytest.raises(BodyError, match=r"^R0: device: .*poll_hz must be 2 to 30"):
-        open_khepera4(request("khepera4", ["khepera4://h"], device={"poll_hz": 100.0}))
+        KheperaBody(request("khepera4", ["khepera4://h"], device={"poll_hz": 100.0}))
     with pytest.raises(BodyError, match=r"^R0: device: .*`servre`; its fields are server, poll_hz"):
-        open_khepera4(request("khepera4", ["khepera4://h"], device={"servre": "fork"}))
+        KheperaBody(request("khepera4", ["khepera4://h"], device={"servre": "fork"}))
     with pytest.raises(BodyError, match=r"^R0: device: .*ranges: the server of 2023-04-10 has no range poll"):
-        open_khepera4(request("khepera4", ["khepera4://h"], device={"server": "2023-04-10", "ranges": True}))
+        KheperaBody(request("khepera4", ["khepera4://h"], device={"server": "2023-04-10", "ranges": True}))
     with pytest.raises(BodyError, match=r"^R0: device: .*poll_hz must be 22 to 30 with server = 'fork'"):
-        open_khepera4(request("khepera4", ["khepera4://h"], device={"server": "fork", "poll_hz": 10}))
+        KheperaBody(request("khepera4", ["khepera4://h"], device={"server": "fork", "poll_hz": 10}))
 
 
 @pytest.mark.system
@@ -185,7 +185,7 @@ def test_nobody_there_is_said_with_the_remedy(impatient):
         port = free.getsockname()[1]
     begin = time.monotonic()
     with pytest.raises(BodyError) as caught:
-        open_khepera4(request("khepera4", [f"khepera4://127.0.0.1:{port}", "kteam:///dev/ttyNONE"])).open()
+        KheperaBody(request("khepera4", [f"khepera4://127.0.0.1:{port}", "kteam:///dev/ttyNONE"])).open()
     assert 1.0 < time.monotonic() - begin < 2.5
     assert OPEN_S < 5.0
     assert f"R0: 127.0.0.1:{port}: Connection refused; start the server on the robot" in str(caught.value)
@@ -204,7 +204,7 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
     rows = replace(request("khepera4", ["khepera4-twin"] * 2, yaw=0.5), device=speaks)
     twins = served(rows)
     goals = np.array([[0.25, 0.1], [-0.2, 0.95]])
-    with opened(open_khepera4(reached(rows, twins.addresses))) as body:
+    with opened(KheperaBody(reached(rows, twins.addresses))) as body:
         drive = Drive(body, goals)
         drive.until(lambda: np.abs(twins.truth()[0][:, :2] - goals).max() < 0.012)
         drive.goal = None
@@ -229,7 +229,7 @@ def test_a_gap_of_the_link_ends_in_a_stop_and_the_robot_goes_on_over_the_same_co
     """A server that accepts one client in its life, silent for 0.7 s: what is sent meanwhile comes glued together."""
     rows = request("khepera4", ["khepera4-twin"], device=ONCE)
     twins = served(rows, silent_from_s=2.0, silent_for_s=0.7)
-    with opened(open_khepera4(reached(rows, twins.addresses))) as body:
+    with opened(KheperaBody(reached(rows, twins.addresses))) as body:
         drive = Drive(body)
         drive.once()
 
@@ -250,7 +250,7 @@ def test_a_position_from_outside_takes_the_place_of_odometry(served):
     rows = request("khepera4", ["khepera4-twin"], external=True, start=[[0.3, 0.0, 0.0]])
     twins = served(rows)
     lied = reached(request("khepera4", ["-"], external=True, start=[[9.0, 9.0, 0.0]], yaw=2.0), twins.addresses)
-    with opened(open_khepera4(lied)) as body:
+    with opened(KheperaBody(lied)) as body:
         drive = Drive(body, np.array([[0.5, 0.1]]))
         drive.once()
         assert np.isnan(drive.state.position).all()
@@ -270,7 +270,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
         free.bind(("127.0.0.1", 0))
         absent = f"khepera4://127.0.0.1:{free.getsockname()[1]}"
     rows = request("khepera4", [*addresses, absent], start=np.zeros((5, 3)))
-    body = open_khepera4(rows)
+    body = KheperaBody(rows)
     begin = time.monotonic()
     with opened(body):
         assert time.monotonic() - begin < 5.0
@@ -297,7 +297,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
 def test_a_link_that_was_lost_comes_back_and_goes_on(served):
     rows = request("khepera4", ["khepera4-twin"])
     first = served(rows)
-    with opened(open_khepera4(reached(rows, first.addresses))) as body:
+    with opened(KheperaBody(reached(rows, first.addresses))) as body:
         drive = Drive(body, np.array([[0.5, 0.0]]))
         drive.until(lambda: first.truth()[0][0, 0] > 0.1)
         first.kill()
@@ -317,7 +317,7 @@ def test_a_link_that_was_lost_comes_back_and_goes_on(served):
 def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
-    with opened(open_khepera4(reached(rows, twins.addresses))) as body:
+    with opened(KheperaBody(reached(rows, twins.addresses))) as body:
         drive = Drive(body)
         drive.once()
         body.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
@@ -342,10 +342,10 @@ def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
 def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient, monkeypatch, tmp_path):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
-    with opened(open_khepera4(reached(rows, twins.addresses))) as first:
+    with opened(KheperaBody(reached(rows, twins.addresses))) as first:
         monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path))  # another user's, or another computer's
         with pytest.raises(BodyError, match=r"no answer to .*another program may hold it"):
-            open_khepera4(reached(rows, twins.addresses)).open()
+            KheperaBody(reached(rows, twins.addresses)).open()
         drive = Drive(first)
         drive.once()
         assert drive.state.notes == ("",)
@@ -356,15 +356,15 @@ def test_the_wrong_protocol_is_named(served, impatient):
     park, kteam = served(request("khepera4", ["-"], device=PARK)), served(request("khepera4", ["-"], device=KTEAM))
     crossed = [park.addresses[0].replace("khepera4", "kteam"), kteam.addresses[0].replace("kteam", "khepera4")]
     with pytest.raises(BodyError) as caught:
-        open_khepera4(request("khepera4", crossed)).open()
+        KheperaBody(request("khepera4", crossed)).open()
     assert str(caught.value).count("the robot uses the other protocol") == 2
     older = served(request("khepera4", ["-"], device=ONCE))
     with pytest.raises(BodyError, match=r"answers p with .* write which of them runs there, such as device = { server"):
-        open_khepera4(request("khepera4", older.addresses)).open()
+        KheperaBody(request("khepera4", older.addresses)).open()
     with pytest.raises(
         BodyError, match=r"no answer to p; a server of 2023 serves one client in its life: start it anew"
     ):
-        open_khepera4(request("khepera4", older.addresses, device=ONCE)).open()
+        KheperaBody(request("khepera4", older.addresses, device=ONCE)).open()
 
 
 @pytest.mark.system
@@ -386,7 +386,7 @@ def test_park_never_gets_two_commands_at_once():
         server = threading.Thread(target=serve, daemon=True)
         server.start()
         place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}?server=2023-01-07"
-        with opened(open_khepera4(request("khepera4", [place], device={"ranges": True}))) as body:
+        with opened(KheperaBody(request("khepera4", [place], device={"ranges": True}))) as body:
             drive = Drive(body, np.array([[1.0, 0.0]]))
             drive.until(lambda: len(reads) > 60)
             scan = drive.state.rays.scan_of(0)
@@ -421,7 +421,7 @@ def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
         server = threading.Thread(target=serve, daemon=True)
         server.start()
         place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}"
-        with opened(open_khepera4(request("khepera4", [place]))) as body:
+        with opened(KheperaBody(request("khepera4", [place]))) as body:
             drive = Drive(body, np.array([[1.0, 0.0]]))
             drive.until(lambda: any(text[0] == "d" for text in lives[0]))
         server.join(2.0)
@@ -484,7 +484,7 @@ def test_kteam_over_a_serial_line():
     server = threading.Thread(target=serve, daemon=True)
     server.start()
     try:
-        with opened(open_khepera4(request("khepera4", [f"kteam://{os.ttyname(theirs)}"]))) as body:
+        with opened(KheperaBody(request("khepera4", [f"kteam://{os.ttyname(theirs)}"]))) as body:
             drive = Drive(body)
             drive.once()
             body.command(np.array([[0.1, 0.5, 0.0, 0.0]]))
@@ -503,10 +503,10 @@ def test_kteam_over_a_serial_line():
 DRIVING = """
 import sys, time
 import numpy as np
-from bridges.khepera4.body import open_khepera4
+from bridges.khepera4.body import KheperaBody
 from tests.twins.loopback import request
 
-body = open_khepera4(request("khepera4", [sys.argv[1]]))
+body = KheperaBody(request("khepera4", [sys.argv[1]]))
 body.open()
 zero, change = time.monotonic(), float(sys.argv[2])
 while True:

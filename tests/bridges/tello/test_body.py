@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from agents.body.interface import UNANSWERED, BodyError, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
-from bridges.tello.body import open_tello
+from bridges.tello.body import TelloBody
 from bridges.tello.pilot import Duty, TelloPilot
 from tests.twins.loopback import request
 
@@ -328,7 +328,7 @@ def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
 
 
 def test_one_that_cannot_be_driven_keeps_nobody_from_being_stopped():
-    body = open_tello(request("tello", ["tello://10.0.0.2", "tello://10.0.0.3"], external=True))
+    body = TelloBody(request("tello", ["tello://10.0.0.2", "tello://10.0.0.3"], external=True))
     lost, good = Cockpit().fly(), Cockpit().fly()
     body._pilots = [lost.pilot, good.pilot]
     lost.drone.get_own_udp_object = lambda: {}
@@ -429,16 +429,16 @@ def test_addresses(address, place):
 @pytest.mark.parametrize("address", ["tello://kitchen", "tello://1.2.3", "tello://1.2.3.256", "tello://1.2.3.4:x"])
 def test_wrong_addresses_are_named(address):
     with pytest.raises(BodyError, match=r"^R0: .*tello://192\.168\.10\.1"):
-        open_tello(request("tello", [address], external=True))
+        TelloBody(request("tello", [address], external=True))
 
 
 def test_rows_that_cannot_be_flown():
     with pytest.raises(BodyError, match='R0: a Tello does not measure its position: write position = "external"'):
-        open_tello(request("tello", ["tello"]))
+        TelloBody(request("tello", ["tello"]))
     with pytest.raises(BodyError, match=r"R1: another Tello of this process has the address 10\.0\.0\.2"):
-        open_tello(request("tello", ["tello://10.0.0.2", "tello://10.0.0.2:1"], external=True))
+        TelloBody(request("tello", ["tello://10.0.0.2", "tello://10.0.0.2:1"], external=True))
     with pytest.raises(BodyError, match=r"R0: device: .*silence_s must be 0.3 to 10 s"):
-        open_tello(request("tello", ["tello"], external=True, device={"silence_s": 0.01}))
+        TelloBody(request("tello", ["tello"], external=True, device={"silence_s": 0.01}))
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from agents.body.kinds import KHEPERA4
 from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3 import body as bridge
-from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3, open_turtlebot3
+from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
 from bridges.turtlebot3.robot import Robot, ranges
 from tests.bridges.turtlebots import Stage, clock, request
 from tests.conftest import RouterProcess
@@ -93,7 +93,7 @@ def test_charge(voltage, percentage, charge):
 )
 def test_wrong_addresses_and_settings_are_named(address, device, message):
     with pytest.raises(BodyError, match=message):
-        open_turtlebot3(request(NOWHERE, addresses=(address,), device=device))
+        TurtleBot3(request(NOWHERE, addresses=(address,), device=device))
 
 
 def test_drives_turtlebots_only():
@@ -331,7 +331,7 @@ def test_it_stands_on_its_start_pose_wherever_its_odometry_is(hub):
 def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
     asked = request(hub.endpoint, device={"style": style, "stamped": False})
     with Stage(asked) as stage:
-        stage.body = open_turtlebot3(replace(asked, addresses=stage.twin.addresses, device=({},)))
+        stage.body = TurtleBot3(replace(asked, addresses=stage.twin.addresses, device=({},)))
         stage.body.open()
         assert stage.moved(1.0, stage.constant(0.2))[0] == 0.0
         assert stage.twin.commands_received == [0]
@@ -391,7 +391,7 @@ def test_a_stop_that_is_not_answered_is_said(hub):
 
 
 def test_one_that_cannot_be_told_keeps_nobody_from_being_stopped():
-    body = open_turtlebot3(request("tcp/127.0.0.1:1", start=((0.0, 0.0), (1.0, 0.0)), addresses=("rmw://a", "rmw://b")))
+    body = TurtleBot3(request("tcp/127.0.0.1:1", start=((0.0, 0.0), (1.0, 0.0)), addresses=("rmw://a", "rmw://b")))
     told = []
 
     def fails(_now):
@@ -408,8 +408,8 @@ TWIN = """
 import select, sys, time
 from tests.bridges.turtlebots import request
 from twins.devices.device import DeviceRequest, Faults
-from twins.devices.turtlebot3 import open_device
-twin = open_device(DeviceRequest(request(sys.argv[1]), Faults()))
+from twins.devices.turtlebot3 import TurtleBot3Twin
+twin = TurtleBot3Twin(DeviceRequest(request(sys.argv[1]), Faults()))
 print(twin.addresses[0], flush=True)
 zero = time.monotonic()
 while not select.select([sys.stdin], [], [], 0.01)[0]:  # whoever started it is there
@@ -438,7 +438,7 @@ class TwinProcess:
 @pytest.mark.system
 def test_a_killed_robot_goes_stale_and_comes_back(hub, eventually):
     twin = TwinProcess(hub.endpoint)
-    body = open_turtlebot3(request(hub.endpoint, start=((1.0, 1.0),), addresses=(twin.address,)))
+    body = TurtleBot3(request(hub.endpoint, start=((1.0, 1.0),), addresses=(twin.address,)))
     body.open()
     zero = time.monotonic()
     go = np.array([[0.2, 0.0, 0.0, 0.0]])
@@ -501,11 +501,11 @@ def test_no_router_is_named_in_time(monkeypatch):
     monkeypatch.setattr(bridge, "OPEN_S", 0.5)
     begin = time.monotonic()
     with pytest.raises(BodyError, match=r"TB0: no router answers at tcp/127\.0\.0\.1:9"):
-        open_turtlebot3(request(NOWHERE, addresses=("ros2dds://tb3_0",))).open()
+        TurtleBot3(request(NOWHERE, addresses=("ros2dds://tb3_0",))).open()
     assert 0.5 < time.monotonic() - begin < 2.0
     assert OPEN_S < 5.0
     with pytest.raises(BodyError, match="TB0: 'nonsense' is not an endpoint"):
-        open_turtlebot3(request("nonsense", addresses=("ros2dds://tb3_0",))).open()
+        TurtleBot3(request("nonsense", addresses=("ros2dds://tb3_0",))).open()
 
 
 def test_a_command_from_before_a_suspension_is_sent_as_zeros() -> None:

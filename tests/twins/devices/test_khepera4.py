@@ -22,7 +22,7 @@ class Conversation:
 
     def __init__(self, server, *, faults=None, **parts):
         rows = request("khepera4", ["khepera4-twin"], device={"server": server}, **parts)
-        self.device = khepera4.open_device(DeviceRequest(rows, Faults(**(faults or {}))))
+        self.device = khepera4.KheperaDevice(DeviceRequest(rows, Faults(**(faults or {}))))
         host, port = self.device.addresses[0].partition("://")[2].split(":")
         self.place = (host, int(port))
         self.clients = []
@@ -318,9 +318,9 @@ def test_addresses_that_cannot_be_had(talk):
         ("khepera4-twin://127.0.0.1:port", "loopback"),
     ]:
         with pytest.raises(BodyError, match=why):
-            khepera4.open_device(DeviceRequest(request("khepera4", [address]), Faults()))
+            khepera4.KheperaDevice(DeviceRequest(request("khepera4", [address]), Faults()))
     with pytest.raises(BodyError, match=r"R0: device: .*server"):
-        khepera4.open_device(DeviceRequest(request("khepera4", ["k"], device={"server": "morse"}), Faults()))
+        khepera4.KheperaDevice(DeviceRequest(request("khepera4", ["k"], device={"server": "morse"}), Faults()))
 
 
 @given(st.floats(-0.27, 0.27), st.floats(-2.0, 2.0))

@@ -22,7 +22,7 @@ class Conversation:
         self.states.bind(("127.0.0.1", 0))
         monkeypatch.setattr(tello.protocol, "STATE_PORT", self.states.getsockname()[1])
         faults = Faults(**parts.pop("faults", {}))
-        self.device = tello.open_device(DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults))
+        self.device = tello.TelloDevice(DeviceRequest(request("tello", ["tello-twin"] * rows, **parts), faults))
         self.wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.wire.bind(("127.0.0.1", 0))
         self.tick = 0
@@ -341,6 +341,6 @@ def test_addresses_that_cannot_be_had(talk):
         ("tello-twin://127.0.0.200:99999", "out of range"),
     ]:
         with pytest.raises(BodyError, match=why):
-            tello.open_device(DeviceRequest(request("tello", [address]), Faults()))
+            tello.TelloDevice(DeviceRequest(request("tello", [address]), Faults()))
     with pytest.raises(BodyError, match=r"R0: device: .*silence"):
-        tello.open_device(DeviceRequest(request("tello", ["tello-twin"], device={"silence": 1}), Faults()))
+        tello.TelloDevice(DeviceRequest(request("tello", ["tello-twin"], device={"silence": 1}), Faults()))

@@ -15,7 +15,7 @@ from agents.network.session import open_session
 from tests.bridges.turtlebots import request
 from tests.conftest import RouterProcess
 from twins.devices.device import DeviceRequest, Faults
-from twins.devices.turtlebot3 import open_device
+from twins.devices.turtlebot3 import TurtleBot3Twin
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 KINDS = {
@@ -119,7 +119,7 @@ def listen(hub, eventually):
 
     def make(faults=None, style="ros2dds", distro="jazzy", ready=True, **kinds):
         device = {"style": style, "distro": distro} | kinds.pop("device", {})
-        twin = open_device(DeviceRequest(request(hub.endpoint, device=device, **kinds), faults or Faults()))
+        twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device=device, **kinds), faults or Faults()))
         session = open_session([hub.endpoint], name="listener")
         opened.extend([twin, session])
         listener = Listener(session, twin, style, distro, eventually)
@@ -312,12 +312,12 @@ def test_an_empty_battery(listen):
 @pytest.mark.system
 def test_wrong_settings_are_named(hub):
     with pytest.raises(BodyError, match=r"TB0: device: .*`colour`"):
-        open_device(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
+        TurtleBot3Twin(DeviceRequest(request(hub.endpoint, device={"colour": 1}), Faults()))
 
 
 @pytest.mark.system
 def test_the_session_is_gone_when_it_is_closed(hub, eventually):
-    twin = open_device(DeviceRequest(request(hub.endpoint), Faults()))
+    twin = TurtleBot3Twin(DeviceRequest(request(hub.endpoint), Faults()))
     with open_session([hub.endpoint], name="listener") as session:
         seen = session.liveliness().declare_subscriber("@/*/@ros2_lv/**", RingChannel(64), history=True)
         alive = set()

@@ -90,7 +90,10 @@ def _bind(wire: socket.socket, ports: Sequence[int]) -> None:
 
 
 class CrazyflieTwin:
-    """Crazyflies with CRTP over UDP or over a software radio; implements `twins.devices.device.Device`."""
+    """Crazyflies with CRTP over UDP or over a software radio; implements `twins.devices.device.Device`.
+
+    Raises BodyError if a row is no Crazyflie, or has invalid settings.
+    """
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
@@ -161,8 +164,3 @@ class CrazyflieTwin:
     def close(self) -> None:
         for used in self.sockets():
             used.close()
-
-
-def open_device(request: DeviceRequest) -> CrazyflieTwin:
-    """Entry point; raises BodyError if a row is no Crazyflie, or has invalid settings."""
-    return CrazyflieTwin(request)

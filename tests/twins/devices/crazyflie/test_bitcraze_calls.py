@@ -19,7 +19,7 @@ from cflib.utils.power_switch import PowerSwitch
 
 from tests.twins.loopback import Served, request
 from tests.waiting import until
-from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.device import DeviceRequest, Faults
 
 pytestmark = pytest.mark.system
@@ -33,7 +33,7 @@ def connected(tmp_path_factory):
 
     if not crtp.CLASSES:
         crtp.init_drivers()
-    with Served(open_device, request("crazyflie", ["crazyflie-twin"])) as twin:
+    with Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"])) as twin:
         cf = Crazyflie(rw_cache=str(tmp_path_factory.mktemp("cache")))
         cf.link_statistics.start = lambda: None  # its thread of pings may join itself at the end
         with SyncCrazyflie(twin.addresses[0], cf=cf) as scf:
@@ -258,7 +258,7 @@ def test_supervisor(cf):
 def test_scan():
     """radio/scan: twins started by hand are where cflib looks."""
     asked = DeviceRequest(request("crazyflie", ["crazyflie-twin"] * 2), Faults(), by_hand=True)
-    with Served(lambda _: open_device(asked), asked.body) as twins:
+    with Served(lambda _: CrazyflieTwin(asked), asked.body) as twins:
         assert all(address.startswith("udp://127.0.0.1:1985") for address in twins.addresses)
         scan = "from cflib.crtp.udpdriver import UdpDriver; print(*(uri for uri, _ in UdpDriver().scan_interface()))"
         # a process of its own: each port without an answer leaks a socket
@@ -269,7 +269,7 @@ def test_scan():
 def test_power_cycle():
     """As the acceptance tests restart a drone; the link of cflib itself does not notice."""
 
-    with Served(open_device, request("crazyflie", ["crazyflie-twin"])) as other:
+    with Served(CrazyflieTwin, request("crazyflie", ["crazyflie-twin"])) as other:
         switch = PowerSwitch(other.addresses[0])
         try:
             switch.stm_power_down()

@@ -15,7 +15,7 @@ from agents.protocols.crtp import NRF, Log, Memory, Misc, Port, PowerSwitch, Saf
 from tests.twins.crazyflie_wire import Wire
 from tests.twins.loopback import request
 from twins.body import TwinBody
-from twins.devices.crazyflie.device import open_device
+from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.memory import ANCHOR_PAGES, CALIBRATION, Memories
 from twins.devices.crazyflie.tables import LOG_CODES, PACKINGS, inventory
@@ -60,7 +60,7 @@ def test_tables(port, table):
 
 def test_malformed_packets_are_dropped():
     """A short packet neither kills the device nor changes anything."""
-    device = open_device(DeviceRequest(request("crazyflie", ["x"]), Faults()))
+    device = CrazyflieTwin(DeviceRequest(request("crazyflie", ["x"]), Faults()))
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
             client.connect(device.sockets()[0].getsockname())
@@ -301,7 +301,7 @@ class Client:
     """One socket, and a device that is served by hand in virtual time."""
 
     def __init__(self, **faults):
-        self.device = open_device(DeviceRequest(request("crazyflie", ["x"]), Faults(**faults)))
+        self.device = CrazyflieTwin(DeviceRequest(request("crazyflie", ["x"]), Faults(**faults)))
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.connect(self.device.sockets()[0].getsockname())
         self.socket.setblocking(False)
@@ -407,6 +407,6 @@ def test_nature_is_that_of_the_other_twin():
 
 def test_other_robots_and_wrong_settings():
     with pytest.raises(BodyError, match="is no twin of a tello"):
-        open_device(DeviceRequest(request("tello", ["x"]), Faults()))
+        CrazyflieTwin(DeviceRequest(request("tello", ["x"]), Faults()))
     with pytest.raises(BodyError, match="contrl"):
-        open_device(DeviceRequest(request("crazyflie", ["x"], device={"contrl": 1}), Faults()))
+        CrazyflieTwin(DeviceRequest(request("crazyflie", ["x"], device={"contrl": 1}), Faults()))
