@@ -16,7 +16,6 @@ from twins.scene import corners
 EDGE: Final = (90, 94, 102)
 OBSTACLE: Final = (168, 172, 180)
 LINE_M: Final = 0.01
-HIGH_M: Final = 1.2  # obstacles are drawn no higher
 
 
 def drawing(experiment: Experiment) -> Draw:
@@ -59,7 +58,7 @@ def _robots(stage: Stage) -> list[Marker]:
 def _obstacles(stage: Stage, since: float) -> list[Marker]:
     scene, made = stage.scene, []
     for number, pose in enumerate(scene.at(since)):
-        low, high = float(scene.bottom[number]), min(float(scene.top[number]), HIGH_M)
+        low, high = float(scene.bottom[number]), float(stage.tops[number])
         outline = scene.outline[number]
         if outline is None:
             wide, at = 2.0 * float(scene.radius[number]), (float(pose[0]), float(pose[1]), 0.5 * (low + high))

@@ -11,9 +11,10 @@ import pytest
 from agents.body.kinds import KINDS
 from agents.network import messages
 from experiments.file.document import load, loads
-from experiments.scene import models, stage
+from experiments.scene import markers, models, stage
 from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTracker, Moment, Place, Stage, Trail
 from tests.experiments import moments
+from twins.scene import Obstacle
 
 ALIVE = {"alive": True, "age_s": 0.1}
 
@@ -179,6 +180,16 @@ def test_obstacles_stand_where_the_file_says():
         assert mesh.vertices[:, 2].min() == pytest.approx(scene.bottom[k])
         assert mesh.vertices[:, 2].max() == pytest.approx(scene.top[k])
     assert moments.unknown(course).obstacles == pytest.approx(scene.pose)
+
+
+def test_an_obstacle_that_hangs_has_a_height_in_recordings():
+    triangle = next(iter(load("triangle").cases().values()))
+    lamp = Obstacle(radius=0.2, at=(0.5, 0.0), bottom=1.4, height=0.3)
+    arena = msgspec.structs.replace(triangle.arena, obstacles={"lamp": lamp})
+    drawn = markers.drawing(msgspec.structs.replace(triangle, arena=arena))(0.0, {})
+    (marker,) = [each for each in drawn if each.group == "obstacles"]
+    assert marker.scale[2] == pytest.approx(0.3)
+    assert marker.position[2] == pytest.approx(1.55)
 
 
 def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
