@@ -15,7 +15,7 @@ class Ticks:
 
     The loop chooses how it waits: asleep, for an event, on sockets. A loop that comes late makes up for at most
     `catch_up` ticks and skips those before; the others keep their times, so that robots which started together go on
-    together. A wait that lasts too long delays its tick and skips none: a busy machine is no reason to lose ticks.
+    together. A wait that lasts too long delays its tick and skips none, unless the loop asks `until_next` again.
     """
 
     def __init__(self, hz: float, *, catch_up: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -36,7 +36,7 @@ class Ticks:
         return self._clock() - self.zero
 
     def until_next(self) -> float:
-        """Time until the next tick [s]; 0 if it is due."""
+        """Time until the next tick [s]; 0 if it is due, and then the ticks to skip are counted."""
         ahead = self.zero + self.next - self._clock()
         if ahead > 0.0:
             self._skips = 0

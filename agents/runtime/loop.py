@@ -206,7 +206,7 @@ class Runtime:
     def _in_the_air(self, failures: list[Exception]) -> bool:
         """Whether a row flies, by the last successful reading of its body; an error is noted."""
         with _noted(failures):
-            self._airborne = some(self._body.read(self._ticks.elapsed()).flying)
+            self._airborne = some(self._body.read(max(self._ticks.t, self._ticks.elapsed())).flying)
         return self._airborne
 
     # ------------------------------------------------------------------ the network

@@ -26,6 +26,7 @@ def soak(
     as_json: AsJson = False,
 ) -> int:
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
+    from agents.errors import ExplainedError
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
@@ -40,7 +41,10 @@ def soak(
     sampler = Sampler(chosen(read, [name])[name], folder, name)
     with interrupts() as interrupted:
         user = Supervision(sampler, interrupted)
-        conduct(read, folder, RunOptions([name], bodies, here=True), user)
+        try:
+            conduct(read, folder, RunOptions([name], bodies, here=True), user)
+        except ExplainedError as error:
+            sampler.end_early(error)
         soaked = sampler.result(interrupted=interrupted() or bool(user.emergency))
     findings = soak_verdict.judge(soaked)
     well = soak_verdict.passed(findings)

@@ -124,6 +124,12 @@ class Sampler(ExitStack):
             minutes = f"{t / 60.0:6.1f} of {self._experiment.duration_s / 60.0:g} min"
             print(f"{minutes}: {len(rows)} processes, {memory:.0f} MB, {lost} poses lost", file=sys.stderr)
 
+    def end_early(self, error: Exception) -> None:
+        """Count an error that ended the run as its failure; raise it if there is no sample yet: the run never began."""
+        if self._due == self._every:
+            raise error
+        self._failed["the run"] = f"ended early: {error}"
+
     def result(self, *, interrupted: bool) -> Soaked:
         """The samples, after the run."""
         with self._table.open(newline="", encoding="utf-8") as file:

@@ -46,6 +46,7 @@ PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
 TASKS: Final = ("distance", "pose", "relative_pose")
 NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 TOOLS: Final = ("CPU_Monitoring", "Interface", "Data_Logging", "Supervisor")
+EXAMPLES: Final = {"name": "name: dron01", "type": "type: virtual", "pose": "pose: 0.5, 0.5, 0.0"}  # of keys
 OLDER: Final = {"pose", "config_path", "communication", "task", "agent_ip", "control_mode"}  # of a robot of 2023
 OLDER_LAW: Final = {"gain": 0.25, "upperLimit": 0.08, "lowerLimit": -0.08}
 WORD: Final = re.compile(r'"[^"]*"|#[^\n]*|[{}\[\]]|[^\s{}\[\]"#]+')  # of a Webots world
@@ -60,7 +61,7 @@ class Relation(NamedTuple):
 
 class _Threshold(Struct, frozen=True):
     type: str = "Constant"
-    co: Number = 0.01
+    co: Number | None = None
     threshold: Number | None = None  # for `co`, in 2023
     ai: Number | Literal["None", "none", "Null", "null"] = 0.0
 
@@ -76,7 +77,8 @@ class Trigger(Struct, frozen=True):
         """c0 and a of a threshold c0 + a·|·|; None if no event is waited for."""
         if self.protocol == "Continuous":
             return None
-        constant = self.threshold.threshold or self.threshold.co
+        given = self.threshold.co, self.threshold.threshold, 0.01
+        constant = next(each for each in given if each is not None)
         if constant <= 0.0:
             raise ValueError("a threshold of 0 or less is crossed always: give metres, such as 0.01")
         return constant, 0.0 if isinstance(self.threshold.ai, str) else self.threshold.ai
@@ -172,7 +174,7 @@ class Robot(Struct, frozen=True):
         if not self.kind:
             known = ", ".join(KINDS)
             raise ValueError(
-                f"what kind of robot is '{self.name}'? use letters, digits and _, and in it one of: {known}"
+                f"no kind of robot is in the name '{self.name}': use letters, digits and _, and in it one of {known}"
             )
         _ = self.communication.event
 
@@ -185,7 +187,8 @@ class Robot(Struct, frozen=True):
         """x, y [m], and z [m] or, on wheels, the yaw [rad]; None: not in the file."""
         if self.pose is None:
             return None
-        x, y, z = (*(self.pose.values() if isinstance(self.pose, dict) else self.pose), 0.0)[:3]
+        pose = [self.pose.get(axis, 0.0) for axis in "xyz"] if isinstance(self.pose, dict) else self.pose
+        x, y, z = (*pose, 0.0)[:3]
         return x, y, z or self.init_theta
 
     @property
@@ -245,9 +248,14 @@ class Entry(NamedTuple):
         try:
             return msgspec.convert(self.value, kind, strict=False)
         except msgspec.ValidationError as error:
-            message, _, below = str(error).partition(" - at `$")
+            words, _, below = str(error).partition(" - at `$")
             key = (self.key + below.rstrip("`")).strip(".")
-            raise refusal(self.file, f"{key or 'the file'}: {message}") from None
+            if missing := re.search(r"missing required field `(\w+)`", words):
+                words = f"{missing[1]} is missing: write {EXAMPLES.get(missing[1], missing[1])}"
+            elif words.startswith(("Expected `array` of length", "Expected `object | array | null`")):
+                words += ": give x, y and, if wanted, z or the yaw"
+            message, _, hint = words.partition(": ")
+            raise refusal(self.file, f"{key or 'the file'}: {message}", hint) from None
 
     def tables(self) -> list[Entry]:
         """The tables in it."""
@@ -320,11 +328,17 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
     central = given.architecture.mode.lower() == CENTRAL
     if central:  # their central controller reads the relations of all robots, whatever `enable` says
         for task in [each for entry in entries for each in entry.tables() if each.key.endswith(".task")]:
-            task.value["enable"] = bool(task.value.get("relationship")) or task.value.get("enable", True)
+            related = Task(enable=False, relationship=str(task.value.get("relationship", ""))).written
+            task.value["enable"] = bool(related) or task.value.get("enable", True)
     robots, problems = dict[str, Robot](), list[Problem]()
     for entry in entries:
+        _strip_idle_task(entry)
         try:
             robots[entry.key] = (entry if given.robots else _settings(entry)).typed(Robot)
+            task = entry.value.get("task", {}) if given.robots else {}
+            if task and robots[entry.key].task.enable and not {"type", "relationship"} <= task.keys():
+                hint = "write distance or pose, and name_d, name_x_y_z or none"
+                raise refusal(file, f"{entry.key}.task: type or relationship is missing", hint)
         except DocumentError as error:
             problems += error.problems
     if problems:
@@ -342,6 +356,13 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         for robot in robots.values()
     ]
     return Park(mode, placed, central, any("mars_data" in entry.value for entry in entries))
+
+
+def _strip_idle_task(entry: Entry) -> None:
+    """Leave of a task that is switched off what is counted: other values in it may be anything."""
+    task = entry.value.get("task")
+    if isinstance(task, dict) and str(task.get("enable", True)).lower() == "false":
+        entry.value["task"] = {key: task[key] for key in ("enable", "relationship") if key in task}
 
 
 def _entries(root: Entry) -> list[Entry]:
@@ -450,8 +471,9 @@ def starts_from(file: str) -> dict[str, Pose]:
         found = dict(_world(file, text))
     else:
         placed = [
-            entry._replace(value={key: entry.value[key] for key in ("name", "type", "pose") if key in entry.value})
+            entry._replace(value={"name": entry.value["name"], "type": "virtual", "pose": entry.value["pose"]})
             for entry in _entries(load(file, text))
+            if {"name", "pose"} <= entry.value.keys() and kind_of(str(entry.value["name"]))
         ]
         found = {robot.name: robot.start for entry in placed if (robot := entry.typed(Robot)).start}
     if not found:

@@ -93,8 +93,10 @@ class CentreProcess:
         while not over.wait(ticks.until_next()):
             if self._ownership.settle(self._session, over.is_set):
                 continue
-            self._missed += ticks.begin()
-            self._late_s = max(self._late_s, ticks.late_s)
+            ticks.until_next()  # a wait that lasted too long skips as well: goals for a past instant help nobody
+            missed = ticks.begin()
+            self._missed += missed
+            self._late_s = max(self._late_s, missed * ticks.period + ticks.late_s)
             t = ticks.t
             self._receive(t)
             goals = self.centre.decide(t, self._phase, self._start)

@@ -86,6 +86,7 @@ class WorldProcess:
             time.sleep(ticks.until_next())
             if self._ownership.settle(self._session, self._ended):
                 continue
+            ticks.until_next()  # a sleep that lasted too long is lost time as well
             if missed := ticks.begin():
                 exchange.slept(missed * ticks.period, ticks.t)
             began = ticks.elapsed()

@@ -1,12 +1,15 @@
 """The verdict of a soak finds what was planted."""
 
+import json
 from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
 from agents.network import messages
 from experiments.file.document import load
-from experiments.real_time.conductor.run_view import Progress
+from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
+from tools.main import app
 from tools.reliability.soak_sampler import Row, Sampler, Soaked
 from tools.reliability.soak_verdict import judge, passed, table
 
@@ -95,3 +98,23 @@ def test_memory_of_a_short_run_is_not_judged():
     short = Soaked(made.title, made.robots, 60.0, made.rows)
     assert passed(judge(short))
     assert any("not judged" in finding.text for finding in judge(short))
+
+
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_run_that_fails_on_the_way_is_judged_and_one_that_never_began_is_an_error(begun, tmp_path, monkeypatch):
+    def broken(read, folder, options, user):
+        with user.show as show:
+            if begun:
+                show(Progress("event", "running", 3.0, 6.0, {"CF01": RobotView()}))
+            raise RunFailed("the conductor stood still for 9.0 s: its robots have landed")
+
+    monkeypatch.setattr("experiments.real_time.conductor.conduct.conduct", broken)
+    out = tmp_path / "soak"
+    done = CliRunner().invoke(app, ["soak", "triangle", "--minutes", "0.1", "--json", "--out", str(out)])
+    assert (out / "soak.html").exists() == begun
+    if begun:
+        assert done.exit_code == 1
+        texts = [finding["text"] for finding in json.loads(done.stdout)["findings"]]
+        assert "the run ended early: the conductor stood still for 9.0 s: its robots have landed" in texts
+    else:
+        assert isinstance(done.exception, RunFailed)

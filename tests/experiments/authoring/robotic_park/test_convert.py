@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.authoring.robotic_park.convert import convert, convert_text
-from experiments.authoring.robotic_park.file import starts_from
+from experiments.authoring.robotic_park.file import Trigger, _Threshold, starts_from
 from experiments.check.check import check, figures
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -292,13 +292,13 @@ def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
     ("old", "new", "said", "line"),
     [
         ("mode: virtual ", "mode: virtuel ", "Operation.mode: Invalid enum value 'virtuel'", 0),
-        ("name: khepera02", "name: rover02", "Robots.Robot02: what kind of robot is 'rover02'", 0),
+        ("name: khepera02", "name: rover02", "Robots.Robot02: no kind of robot is in the name 'rover02'", 0),
         ("name: khepera02", "name: khepera01", "Robot01: two robots are called 'khepera01'", 0),
         ("type: virtual\n    name: khepera02", "type: imagined\n    name: khepera02", "type: Invalid enum value", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90; 0.00", "Robots.Robot02.pose[0]: Expected `float`", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "Robots.Robot02.pose: Expected", 0),
         ("pose: 0.90, 0.00, 0.00", "pose: {}", "Robots.Robot02.pose: Expected `object` of length >= 2", 0),
-        ("    pose: 0.90, 0.00, 0.00\n", "", "Robots.Robot02: Object missing required field `pose`", 0),
+        ("    pose: 0.90, 0.00, 0.00\n", "", "Robots.Robot02: pose is missing", 0),
         ("khepera03_0.8", "khepera04_0.8", "no other robot is called 'khepera04'", 0),
         ("khepera03_0.8", "khepera03_x", "task: 'khepera03_x' is no relation of a distance task", 0),
         ("khepera03_0.8", "khepera03_-0.8", "not positive", 0),
@@ -307,6 +307,7 @@ def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
         ("gain: 0.25", "gain: .inf", "controller.gain: Expected `float` <= ", 0),
         ("gain: 0.25", "gain: -1", "Expected `float` > 0.0", 0),
         ("enable: True\n      T: 100", "enable: perhaps\n      T: 100", "Robot01.task.enable: Expected `bool`", 0),
+        ("      type: distance\n", "", "Robots.Robot01.task: type or relationship is missing", 0),
         ("type: distance", "type: bearing", "Robot01.task: the type 'bearing' is unknown", 0),
         ("upperLimit: 0.1", "upperLimit: -0.2", "no step lies between", 0),
         ("Robots:\n", "Robots: none\nElse:\n", "Robots: Expected `object`, got `str`", 0),
@@ -487,3 +488,33 @@ def test_starts_that_cannot_be_read(tmp_path, name, text, said):
     (tmp_path / name).write_text(text)
     with pytest.raises(DocumentError, match=said):
         starts_from(str(tmp_path / name))
+
+
+def test_axes_of_a_pose_are_named_in_any_order(tmp_path):
+    made, *_ = converted(tmp_path, file(three(TRIANGLE)).replace("pose: 0.90, 0.00, 0.00", "pose: {y: 0.0, x: 0.9}"))
+    assert made.experiment.robots["khepera02"].start[:2] == [0.9, 0.0]
+
+
+def test_errors_of_a_key_have_a_remedy():
+    text = file(three(TRIANGLE))
+    for old, new, hint in (
+        ("    pose: 0.90, 0.00, 0.00\n", "", "write pose: 0.5, 0.5, 0.0"),
+        ("pose: 0.90, 0.00, 0.00", "pose: 0.90", "give x, y and, if wanted, z or the yaw"),
+        ("name: khepera02", "name: rover02", "use letters, digits and _, and in it one of"),
+    ):
+        with pytest.raises(DocumentError) as raised:
+            convert_text(text.replace(old, new), "park.yaml", 20.0)
+        assert raised.value.problems[0].hint.startswith(hint)
+
+
+def test_a_threshold_of_nothing_is_refused_and_co_goes_before_threshold():
+    assert Trigger("EventBased", _Threshold(co=0.02, threshold=0.5)).event == (0.02, 0.0)
+    assert Trigger("EventBased", _Threshold(threshold=0.5)).event == (0.5, 0.0)
+    assert Trigger("EventBased").event == (0.01, 0.0)
+    with pytest.raises(ValueError, match="crossed always"):
+        _ = Trigger("EventBased", _Threshold(threshold=0)).event
+
+
+def test_a_task_that_is_switched_off_may_hold_anything(tmp_path):
+    text = file(three(TRIANGLE)).replace("enable: True\n      T: 100", "enable: False\n      T: -5", 1)
+    assert converted(tmp_path, text)[0].experiment.robots

@@ -17,17 +17,17 @@ BEGIN = 1000.0
 
 
 class Over:
-    """Event whose waits advance a simulated clock; set after so many."""
+    """Event whose waits advance a simulated clock, the sixth by `more` [s] than asked; set after so many."""
 
-    def __init__(self, waits):
-        self.now, self._left = BEGIN, waits
+    def __init__(self, waits, more=0.0):
+        self.now, self._left, self._sixth, self._more = BEGIN, waits, waits - 6, more
 
     def is_set(self):
         return self._left < 0
 
     def wait(self, seconds):
         self._left -= 1
-        self.now += seconds
+        self.now += seconds + (self._more if self._left == self._sixth else 0.0)
         return self.is_set()
 
 
@@ -55,3 +55,24 @@ def test_decisions_follow_the_common_start_and_those_of_a_standstill_are_skipped
     assert delays == pytest.approx([late if t != 9.25 else 6.25 + late + 3.9 - 9.25 for t in times])
     assert process._missed == 2
     assert ticks.next == pytest.approx(13.25 / hz)
+
+
+def test_a_wait_that_lasts_too_long_leads_to_no_decision_for_a_past_instant(monkeypatch):
+    over, decided, late = Over(12, more=0.73), [], []
+    with Net().worn() as net:
+        experiment = pair(architecture="centralised")
+        process = CentreProcess(experiment, Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive])))
+        hz = experiment.rates.coordination_hz
+        process._ticks = Ticks(hz, clock=lambda: over.now)
+
+        def decide(t, *_):
+            decided.append(over.now - BEGIN - t)
+            late.append(process._late_s)
+            return CentreGoals(np.zeros(0, dtype=np.intp), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+        monkeypatch.setattr(process.centre, "decide", decide)
+        process.run(over)
+    assert len(decided) == 12
+    assert max(decided) < 1.0 / hz + process._patience
+    assert process._missed == int(0.73 * hz)
+    assert max(late) == pytest.approx(0.73, abs=1e-9)

@@ -19,13 +19,15 @@ from tests.fuzz.loopnet import Net
 HZ, KEYS = 100.0, Keys("park")
 
 
+@pytest.mark.parametrize("asleep", [False, True])
 @pytest.mark.parametrize(("stands_s", "lost", "forgiven"), [(0.05, 0, False), (0.255, 19, False), (2.0, 194, True)])
-def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven, monkeypatch):
+def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven, asleep, monkeypatch):
     now, simulated, slept = [1000.0], [], []
     over = threading.Event()
+    lost += asleep and lost > 0  # it begins when a tick is due, not after one
 
     def sleep(seconds):
-        now[0] += seconds
+        now[0] += seconds + (stands_s if asleep and len(simulated) == 20 else 0.0)
 
     monkeypatch.setattr(world, "time", types.SimpleNamespace(sleep=sleep))
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
@@ -41,7 +43,7 @@ def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven
         def stand():
             advance()
             simulated.append(population.time)
-            now[0] += stands_s if len(simulated) == 20 else 0.001
+            now[0] += stands_s if len(simulated) == 20 and not asleep else 0.001
             if len(simulated) == 150:
                 over.set()
 
