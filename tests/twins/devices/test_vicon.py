@@ -285,10 +285,11 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 
 @pytest.fixture
-def process(router: RouterProcess) -> Iterator[subprocess.Popen[str]]:
+def process(router: RouterProcess, request: pytest.FixtureRequest) -> Iterator[subprocess.Popen[str]]:
+    """Process of the twin; a parameter is a list of more options."""
     command = [sys.executable, "-m", "twins.devices.vicon", "CF01", "KH01", "--connect", router.endpoint]
     made = subprocess.Popen(
-        [*command, "--sigma", "0", "--rate", "200", "--lifeline"],
+        [*command, "--sigma", "0", "--rate", "200", *getattr(request, "param", [])],
         cwd=ROOT,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -337,6 +338,7 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
 
 
 @pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
+@pytest.mark.parametrize("process", [["--lifeline"]], indirect=True)
 @pytest.mark.system
 def test_the_process_ends_with_its_starter_but_not_before_the_robots(
     process: subprocess.Popen[str], router: RouterProcess
