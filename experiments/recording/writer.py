@@ -147,7 +147,7 @@ class Recording:
         """
         self.path = path
         self.refused = 0  # messages left out, because they hold what their type excludes
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}  # by topic and robot
         self._schemas: dict[str, int] = {}
         self._latest = 0  # [ns]
         self._utc, self._draw = utc, draw
@@ -264,21 +264,23 @@ class Recording:
         except Unencodable:
             self.refused += 1
             return False
-        name = topic.name.format(robot=getattr(message, "robot", ""))
-        channel = self._channels.get(name) or self._register(topic, name)
-        # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
-        times = max(self._index.end, self._nanoseconds(logged)), self._nanoseconds(message.stamp)
+        robot = getattr(message, "robot", "")
+        channel = self._channels.get((topic.name, robot)) or self._register(topic, robot)
+        begun = self._nanoseconds(logged)
+        stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
-        self._write_or_fail(self._chunk.add, channel, times[0], data, times[1], number)
+        # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
+        self._write_or_fail(self._chunk.add, channel, max(self._index.end, begun), data, stamp, number)
         if self._chunk.full:
             self.flush()
         return True
 
-    def _register(self, topic: _Written, name: str) -> int:
+    def _register(self, topic: _Written, robot: str) -> int:
         if topic.kind not in self._schemas:
             self._schemas[topic.kind] = self._writer.register_schema(topic.kind, "ros2msg", topic.schema.encode())
-        self._channels[name] = self._writer.register_channel(name, "cdr", self._schemas[topic.kind])
-        return self._channels[name]
+        channel = self._writer.register_channel(topic.name.format(robot=robot), "cdr", self._schemas[topic.kind])
+        self._channels[topic.name, robot] = channel
+        return channel
 
     def _nanoseconds(self, stamp: float) -> int:
         if 0.0 <= stamp < LATEST_S:
