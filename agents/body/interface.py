@@ -45,7 +45,7 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     ] = None
 
     def without_noise(self) -> Disturbance:
-        """What is left without random parts: the latency."""
+        """Disturbance without its random parts: the latency."""
         return Disturbance(latency_s=self.latency_s)
 
 

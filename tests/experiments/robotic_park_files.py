@@ -184,7 +184,7 @@ OTHERS = {
 
 
 def flat(name, speaks="EvenBased", **changed):
-    """One robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
+    """Robot of a file of 2023, as text: a triangle of 0.8 m with a drone 0.7 m above its base."""
     wheels = name.startswith("khepera")
     address = (
         f"agent_ip: '192.168.0.{name[-1]}'\n  port_number: 50000\n  init_theta: -1.5"
