@@ -145,9 +145,14 @@ def reachable(net: Links, rows: int, sources: Index) -> Mask:
     return known
 
 
-def components(net: Links, rows: int) -> int:
-    """Number of connected parts when directions are ignored."""
+def part_of_rows(net: Links, rows: int) -> Index:
+    """Number (N,) of the connected part of each row when directions are ignored: that of one of its rows."""
     label = np.arange(rows)
     for i, j in edges(net):
         label[label == label[j]] = label[i]
-    return len(np.unique(label))
+    return label
+
+
+def components(net: Links, rows: int) -> int:
+    """Number of connected parts when directions are ignored."""
+    return len(np.unique(part_of_rows(net, rows)))

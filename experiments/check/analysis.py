@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -22,6 +22,8 @@ from experiments.check.findings import FORGIVEN
 from experiments.check.ideal_run import Prediction, closed_shares
 from experiments.check.realisation import (
     Shape,
+    Solids,
+    best_shape,
     find_shapes,
     formation_redundancy,
     formation_rigidity,
@@ -68,6 +70,7 @@ class Analysis:
     modes: Modes | None  # of the sampled loop at the shape
     prediction: Prediction  # the motion
     error: Array  # (T, E) of each link along it [m]; 0 while it is not there
+    anchored: Array  # (T, A) of each anchor along it [m]
     scene: Scene  # what stands in the arena
 
     @property
@@ -125,8 +128,25 @@ class Analysis:
         window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
         return moving_mean(self.error, window)
 
+    @property
+    def spans_end(self) -> tuple[float, ...]:
+        """Times until which the formation is to be acquired: before any plan begins, and at the end [s]."""
+        end = float(self.prediction.time[-1])
+        return tuple(dict.fromkeys((min(self.departure, end), end)))
+
+    def flown(self, prediction: Prediction) -> Analysis:
+        """The same with another motion."""
+        return replace(
+            self,
+            prediction=prediction,
+            error=link_errors(self.assignment.law, self.pattern, prediction),
+            anchored=anchor_errors(self.assignment, prediction),
+        )
+
     def acquired(self, until: float) -> float | None:
         """Time from which on the mean of every link over `WINDOW_S` is within the tolerance, up to `until` [s]."""
+        if not self.error.shape[1]:
+            return None
         time = self.prediction.time
         worst = self.mean_error[time <= until + 1e-9].max(axis=1, initial=0.0)[:, None]
         return after_last(worst > self.experiment.tolerance + FORGIVEN, time)[0] if len(worst) else None
@@ -216,7 +236,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
                 experiment, assignment, targets_of_law(assignment.law, wanted), there, prediction, aloft, silent
             )
             stages.append(stage)
-        shape = _best(stages[0])
+        shape = best_shape(stages[0])
         here = asked.take(standing)
         planar, spatial = formation_rigidity(shape.position, here, silent, assignment.anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
@@ -234,13 +254,14 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         standing=standing,
         shapes=tuple(stages[-1]) if stages else (),
         shape=shape,
-        later=tuple(_best(each) for each in stages[1:]),
+        later=tuple(best_shape(each) for each in stages[1:]),
         planar=planar,
         spatial=spatial,
         spare=spare,
         modes=loop,
         prediction=prediction,
         error=link_errors(assignment.law, pattern, prediction),
+        anchored=anchor_errors(assignment, prediction),
         scene=bodies.scene(experiment),
     )
 
@@ -250,8 +271,12 @@ def link_errors(law: Law, pattern: FormationArrays, prediction: Prediction) -> A
     return np.nan_to_num(errors_over_time(law, pattern, prediction.time, prediction.position))
 
 
-def _best(shapes: Sequence[Shape]) -> Shape:
-    return min(shapes, key=lambda each: each.worst)
+def anchor_errors(assignment: Assignment, prediction: Prediction) -> Array:
+    """Error of each anchor (T, A) along the motion [m]."""
+    count, rows = prediction.position.shape[:2]
+    if assignment.anchors is None:
+        return np.zeros((count, 0))
+    return assignment.anchors.repeated(count, rows).error(prediction.position.reshape(-1, 3)).reshape(count, -1)
 
 
 def _shapes(  # noqa: PLR0917 - one caller
@@ -282,8 +307,8 @@ def _shapes(  # noqa: PLR0917 - one caller
             place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
             yield _resting_place(np.column_stack([place, aloft[:, 2]]), end, moves)
 
-    found = []
-    for each in find_shapes(links, guesses(), moves, assignment.anchors):
+    found, solids = [], Solids.of(assignment.kinds, links, moves)
+    for each in find_shapes(links, guesses(), moves, assignment.anchors, solids=solids):
         error = np.zeros(len(there))
         error[there] = each.error
         found.append(replace(each, error=error))

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from agents.formation.graph import edges
-from experiments.check import motion, safety, theory
+from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
 from experiments.check.findings import FORGIVEN, MARK, Finding, first_of_each_code
@@ -40,7 +40,7 @@ def chance(analysis: Analysis) -> Iterator[Finding]:
 SUBJECTS: Final = (
     *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.flight, motion.starts, motion.formation, motion.softness, motion.walls, motion.encounters),
+    *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.encounters),
     *(motion.speeds, motion.rates, motion.ends),
     safety.architecture,
     safety.safety,
@@ -190,7 +190,7 @@ def _figures(analysis: Analysis) -> Figures:
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),
         acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,
-        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape else None,
+        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(assignment.links) else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),
         messages_hz=prediction.messages_hz,

@@ -42,6 +42,7 @@ class Prediction:
         0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
     )
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
+    noisy: Prediction | None = None  # the flight beside it with the noise of the experiment and its seed, if there was
 
 
 def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
@@ -86,7 +87,8 @@ def predict(experiment: Experiment) -> Prediction:
     if without.stuck and noisy:  # only the noise may hold the robots back
         return fly(bare, [bare.seed], quiet=1)[0]
     counted = (*noisy, without)[0]
-    return replace(without, messages_hz=counted.transmissions / bare.duration_s)
+    messages_hz = counted.transmissions / bare.duration_s
+    return replace(without, messages_hz=messages_hz, noisy=noisy[0] if noisy else None)
 
 
 def repetitions(bare: Experiment) -> int:
@@ -114,20 +116,24 @@ def fly(bare: Experiment, seeds: Sequence[int], *, quiet: int = 0) -> list[Predi
     return flights
 
 
+PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii
+
+
 class Approach(NamedTuple):
-    """Closest approach of two robots: `distance` [m] in the plane, at `time` [s]."""
+    """Closest approach of two robots."""
 
     first: int
     second: int
-    distance: float
-    time: float
+    distance: float  # in the plane [m]
+    gap: float  # free height between them then, negative where none is above the other [m]
+    time: float  # [s]
 
 
 def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) -> list[Approach]:
-    """Pairs that come nearer than the sum of their radii while one is not above the other.
+    """Pairs that come nearer than the sum of their radii while neither is above the other by the clearance.
 
     Args:
-        clearance: Free height from which on two robots pass above each other [m].
+        clearance: Free height from which on two robots pass above each other undisturbed [m].
     """
     radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
     low, high = prediction.position[..., :2].min(axis=0), prediction.position[..., :2].max(axis=0)
@@ -136,10 +142,16 @@ def approaches(prediction: Prediction, kinds: Sequence[Kind], clearance: float) 
         # the areas in which they move: of many robots most never come near each other
         apart = np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i]).max(axis=1)
         j = i + 1 + np.flatnonzero(apart < radius[i] + radius[i + 1 :])
-        offset = prediction.position[:, i, None] - prediction.position[:, j]
-        level = np.abs(offset[..., 2]) < (height[i] + height[j]) / 2.0 + clearance
-        gap = np.where(level, norm(offset[..., :2]), np.inf)
-        at = gap.argmin(axis=0)
-        near = np.flatnonzero(gap.min(axis=0) < radius[i] + radius[j])
-        found += [Approach(i, int(j[k]), float(gap[at[k], k]), float(prediction.time[at[k]])) for k in near]
+        offset = prediction.position[:, j] - prediction.position[:, i, None]
+        between = np.maximum(offset[..., 2] - height[i], -offset[..., 2] - height[j])
+        far = norm(offset[..., :2])
+        # where bodies pass through each other comes before where one is above the other
+        rank = np.where(between < 0.0, far, np.where(between < clearance, far + PASSES_ABOVE, np.inf))
+        touch = radius[i] + radius[j]
+        rank = np.where(far < touch, rank, np.inf)
+        at = rank.argmin(axis=0)
+        for k in np.flatnonzero(np.isfinite(rank.min(axis=0))):
+            when = at[k]
+            there = float(far[when, k]), float(between[when, k]), float(prediction.time[when])
+            found.append(Approach(i, int(j[k]), *there))
     return found

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from itertools import takewhile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, takewhile
 from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
+from agents.body.kinds import Kind
 from agents.formation.anchors import Anchors
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, edges
+from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, edges, part_of_rows
 from agents.formation.rigidity import Redundancy, Rigidity, redundancy, rigidity
 from agents.plugins.laws import Law, Mixed
 
@@ -22,7 +23,11 @@ TINY: Final = 1e-18  # [m²] no length is zero
 EXACT: Final = 1e-9  # [m] link errors below this are arithmetic
 ENOUGH: Final = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
 SLOWLY: Final = 1e-2  # share of the rest: smaller improvements of a small error are not worth their time
+OFF: Final = 1e-3  # [m] a shape that misses by more misses by more than written digits explain
 ROUNDED: Final = 1e-3  # [m] distances written with three decimals contradict one another by less
+MIRRORS: Final = 3  # robots on the wrong side that are sought
+MOST_MIRRORED: Final = 40  # robots of a formation in which they are sought: the time grows with the third power
+MOST_SIDES: Final = 4  # neighbours of a robot through which the lines are sought
 POINT: Final = 1e-6  # [m] robots that are nearer than this to each other stand in one point, which nothing turns
 
 
@@ -133,21 +138,61 @@ def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
 
 
 @dataclass(frozen=True)
+class Solids:
+    """Upright cylinders that stand for the N robots of a shape."""
+
+    radius: Array  # (N,) [m]
+    height: Array  # (N,) above the position of a robot [m]
+    part: Index  # (N,) of the network; places of robots in different parts say nothing about each other
+    free: Mask  # (N,) rows that a shape places; two others stand where they stand
+    clearance: float = 0.0  # free height that robots above one another need [m]
+
+    @classmethod
+    def of(cls, kinds: Sequence[Kind], links: Links, free: Mask, clearance: float = 0.0) -> Solids:
+        """Solids of robots with these links."""
+        radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
+        return cls(radius, height, part_of_rows(links, len(kinds)), free, clearance)
+
+    def overlaps(self, position: Array) -> Index:
+        """Pairs (K, 2) of rows that are in each other's way at `position` (N, 3) [m], the nearest first."""
+        found: list[tuple[float, int, int]] = []
+        for i in range(len(position) - 1):
+            apart, top = position[i + 1 :] - position[i], self.height[i + 1 :]
+            near = norm(apart[:, :2]) < self.radius[i] + self.radius[i + 1 :]
+            near &= np.maximum(apart[:, 2] - self.height[i], -apart[:, 2] - top) < self.clearance
+            near &= (self.part[i + 1 :] == self.part[i]) & (self.free[i + 1 :] | self.free[i])
+            found += [(float(norm(apart[k])), i, i + 1 + int(k)) for k in np.flatnonzero(near)]
+        return np.array([pair for _, *pair in sorted(found)], dtype=np.intp).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
 class Shape:
     """A place for every robot that meets the distances as well as they can be met."""
 
     position: Array  # (N, 3) [m]
     error: Array  # (E,) of each link as its law measures it, |‖p_i − p_j‖ − d_ij| for distances [m]
     anchored: Array = field(default_factory=lambda: np.zeros(0))  # (A,) of each anchor [m]
+    overlaps: Index = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))  # (K, 2) see `Solids`
 
     @property
     def worst(self) -> float:
         """The largest error of a link or an anchor [m]."""
         return max(float(self.error.max(initial=0.0)), float(self.anchored.max(initial=0.0)))
 
+    @property
+    def good(self) -> bool:
+        """Whether a better one need not be sought."""
+        return self.worst < ENOUGH and not len(self.overlaps)
+
 
 def find_shapes(
-    links: Links, guesses: Iterable[Array], moves: Mask, anchors: Anchors | None = None, climbs: Mask | None = None
+    links: Links,
+    guesses: Iterable[Array],
+    moves: Mask,
+    anchors: Anchors | None = None,
+    climbs: Mask | None = None,
+    *,
+    solids: Solids | None = None,
 ) -> list[Shape]:
     """Places where links and anchors have what they ask for, one for each guess, until one is good.
 
@@ -156,16 +201,25 @@ def find_shapes(
         guesses: (N, 3) each [m].
         moves: (N,) rows that may be placed elsewhere in the plane.
         climbs: (N,) rows whose heights are free as well; the others are held where they are.
+        solids: Robots of which none may stand in another.
 
     Returns:
         The shapes that were found, in the order of the guesses; only the last one may be good.
     """
-    found, free = [], np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
+    found, free = list[Shape](), np.column_stack([moves, moves, np.zeros_like(moves) if climbs is None else climbs])
     for guess in guesses:
-        found.append(fitted_shape(links, anchors, guess, free))
-        if found[-1].worst < ENOUGH:
+        shape = fitted_shape(links, anchors, guess, free)
+        if solids is not None and shape.worst <= OFF:  # of another shape nobody asks
+            shape = replace(shape, overlaps=solids.overlaps(shape.position))
+        found.append(shape)
+        if shape.good:
             break
     return found
+
+
+def best_shape(shapes: Sequence[Shape]) -> Shape:
+    """The shape that misses least; one in which robots stand in each other only if no other one meets all targets."""
+    return min(shapes, key=lambda each: (each.worst > OFF or len(each.overlaps) > 0, each.worst))
 
 
 def unfold_distances(links: Links, height: Array) -> Array:
@@ -222,6 +276,55 @@ def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask
             break
     error = Mixed().error(position, position[links.sender], links)
     return Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position))
+
+
+class Mirrored(NamedTuple):
+    """Robot on the wrong side of the line through two of its neighbours."""
+
+    row: int
+    ends: tuple[int, int]  # those neighbours
+    place: Array  # (3,) on the right side [m]
+
+
+def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchors | None = None) -> list[Mirrored]:
+    """Robots that have to change sides, at most `MIRRORS`, for the formation to get from `end` (N, 3) to its shape.
+
+    One after the other that one is mirrored that leads to the shape, or brings the formation nearest to it. Empty if
+    that does not end in the shape, and for formations of more than `MOST_MIRRORED` robots.
+    """
+    if len(end) > MOST_MIRRORED:
+        return []
+    free = np.column_stack([moves, moves, np.zeros_like(moves)])
+    pairs = edges(links)
+    neighbours = [np.setdiff1d(pairs[(pairs == row).any(axis=1)], [row]) for row in range(len(end))]
+    choices = [
+        (row, left, right)
+        for row in np.flatnonzero(moves).tolist()
+        for left, right in combinations(neighbours[row][:MOST_SIDES].tolist(), 2)
+    ]
+    place, found = end, list[Mirrored]()
+    best = fitted_shape(links, anchors, place, free)
+    for _ in range(MIRRORS):
+        tried = []
+        for row, left, right in choices:
+            guess = place.copy()
+            guess[row] = _mirror(place[row], place[left], place[right])
+            tried.append((fitted_shape(links, anchors, guess, free), row, (left, right)))
+        shape, row, ends = min(tried, key=lambda each: round(each[0].worst, 4), default=(best, -1, (-1, -1)))
+        if shape.worst >= best.worst:
+            return []
+        best, place = shape, shape.position
+        found.append(Mirrored(row, ends, shape.position[row]))
+        if best.worst <= OFF:
+            return found
+    return []
+
+
+def _mirror(point: Array, left: Array, right: Array) -> Array:
+    """Mirror image of a point (3,) across the vertical plane through two others [m]."""
+    way = right[:2] - left[:2]
+    across = np.array([-way[1], way[0]]) / max(float(norm(way)), POINT)
+    return point - 2.0 * float((point[:2] - left[:2]) @ across) * np.array([*across, 0.0])
 
 
 class Conflict(NamedTuple):

@@ -9,17 +9,16 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.arrays import Index, Mask
+from agents.arrays import Index, Mask, norm
 from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, components, reachable
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
-from experiments.check.realisation import Conflict, Shape, conflicts, contradictions
+from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
 from experiments.definition.links import gain_key
 from experiments.file.problems import Path
 
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
-OFF: Final = 0.001  # [m] more than written digits explain
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
@@ -31,7 +30,8 @@ def network(analysis: Analysis) -> Iterator[Finding]:
     names, links = analysis.names, analysis.assignment.links
     path = ("formation", "links")
     if not len(links):
-        yield Finding("note", "no-formation", "no links: every robot follows its own plan, or stays where it is")
+        how = "goes to its anchor" if analysis.experiment.formation.anchors else "follows its own plan"
+        yield Finding("note", "no-formation", f"no links: every robot {how}, or stays where it is")
         return
     rows = len(names)
     linked = np.union1d(links.receiver, links.sender)
@@ -85,7 +85,9 @@ def realisation(analysis: Analysis) -> Iterator[Finding]:
     shape = analysis.shape
     if shape is None:
         return
-    if shape.worst <= OFF:
+    if shape.worst <= OFF and len(shape.overlaps):
+        yield _in_one_place(analysis, shape)
+    elif shape.worst <= OFF:
         yield Finding("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
     else:
         yield from _unrealisable(analysis, shape)
@@ -103,9 +105,24 @@ def realisation(analysis: Analysis) -> Iterator[Finding]:
 def _asked(analysis: Analysis) -> str:
     """Kinds of targets of the links, in words."""
     wants = analysis.asked.wants
-    found = {BY_DISTANCE} if wants is None else set(wants[analysis.standing].tolist())
+    found = set() if not analysis.standing.any() else {BY_DISTANCE}
+    found = found if wants is None else set(wants[analysis.standing].tolist())
     words = {BY_DISTANCE: "distances", BY_RELATIVE: "offsets", BY_BEARING: "bearings"}
     return "the " + " and ".join([word for want, word in words.items() if want in found] or ["anchors"])
+
+
+def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
+    """Finding on targets that are met only where robots stand in one another."""
+    names, (first, second) = analysis.names, shape.overlaps[0].tolist()
+    apart = float(norm((shape.position[first] - shape.position[second])[:2]))
+    more = f", and {len(shape.overlaps) - 1} more like this" if len(shape.overlaps) > 1 else ""
+    message = (
+        f"no shape was found that meets {_asked(analysis)} and keeps robots out of one another: {names[first]} and "
+        f"{names[second]} would stand {apart:.2f} m apart{more}"
+    )
+    wanted = _measured(analysis)[analysis.standing].all()  # vectors leave no choice, so that this was meant, perhaps
+    remedy = "hold other heights, change the targets, or link these robots"
+    return Finding("error" if wanted else "warning", "in-one-place", message, remedy, ("formation", "links"))
 
 
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:

@@ -131,7 +131,7 @@ def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
 
 
 def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
-    monkeypatch.setattr("experiments.check.motion.fly", lambda *_: pytest.fail("flown again"))
+    monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
     codes = {each.code for each in check(of(document.read(PARK).cases()["event"]))}
     assert "acquired" in codes
 

@@ -1,0 +1,165 @@
+"""Flights with the noise of the experiment beside the ideal run: what noise prevents, and what it makes possible."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from experiments.check.analysis import Analysis
+from experiments.check.findings import FORGIVEN, Finding
+from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
+from experiments.check.theory import FAR_OFF, strength
+from experiments.metrics.measure import WINDOW_S
+
+SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
+LATER: Final = 2.0  # times the time without noise, from which on a formation is acquired late
+NARROW: Final = 0.6  # of the tolerance: noise may move a link that is farther off out of it
+DELAYED: Final = 1.2  # times the time without noise, from which on both times are given
+OPEN: Final = (
+    "acquired-late",
+    "wheels-stop",
+    "local-minimum",
+    "lags",
+    "not-acquired",
+)  # findings that noise may refute
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Flights with noise, of several seeds."""
+
+    flown: tuple[Analysis, ...]  # the case with these motions
+    seeds: str  # of all, in words
+    count: int
+
+    @classmethod
+    def of(cls, analysis: Analysis) -> Flights:
+        bare = isolated(analysis.experiment)
+        count, first = repetitions(bare), bare.seed
+        flown = fly(bare, range(first, first + count))
+        seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
+        return cls(tuple(analysis.flown(each) for each in flown if not each.stuck), seeds, count)
+
+    @property
+    def acquired(self) -> list[float]:
+        """Times of acquisition [s] of the flights that acquire the formation, and again by the end."""
+        return [at for each in self.flown if (at := acquired(each)) is not None]
+
+    def enough(self, number: int) -> bool:
+        """Whether so many flights are more than chance.
+
+        One of five may be: of such experiments one in four was lost with other seeds.
+        """
+        return number >= min(2, self.count)
+
+
+def acquired(analysis: Analysis) -> float | None:
+    """Time of acquisition [s], if the formation is within the tolerance at the end as well; else None."""
+    spans = [analysis.acquired(until) for until in analysis.spans_end]
+    return None if None in spans else spans[0]
+
+
+def span_of(times: list[float]) -> str:
+    """Range of times [s] in words."""
+    low, high = f"{min(times):.1f}", f"{max(times):.1f}"
+    return f"{low} s" if low == high else f"{low} to {high} s"
+
+
+def with_noise(analysis: Analysis, finding: Finding) -> Finding:
+    """A finding that the formation is not acquired, held against flights with noise; the good news if all acquire it.
+
+    A trigger or the wheels leave robots alone whose errors are small. Noise moves them on.
+    """
+    if finding.code not in OPEN or not has_noise(analysis.experiment):
+        return finding
+    flights = Flights.of(analysis)
+    times, count = flights.acquired, flights.count
+    if times and len(times) == count:
+        message = (
+            f"the formation is acquired after {span_of(times)} with the noise of [disturbance], in {count} of {count} "
+            f"flights ({flights.seeds}); without noise it is not: robots stop short of it"
+        )
+        return Finding("note", "acquired", message)
+    noisy = f"with the noise of [disturbance], in {len(times)} of {count} flights ({flights.seeds})"
+    if not times:
+        return replace(finding, message=f"{finding.message}; nor is it {noisy.replace(', in 0 of', ', in any of')}")
+    return replace(finding, message=f"{finding.message}; but it is {noisy}, after {span_of(times)}")
+
+
+def acquired_note(analysis: Analysis, formed: float, left: str) -> Finding:
+    """The note on an acquired formation; with the noise of the file's seed, if that takes longer."""
+    beside = analysis.prediction.noisy
+    delayed = None if beside is None or beside.stuck else acquired(analysis.flown(beside))
+    noisy = ""
+    if delayed is not None and delayed > max(DELAYED * formed, formed + WINDOW_S):
+        noisy = f" without noise, {delayed:.1f} s with that of seed {analysis.experiment.seed}"
+    return Finding("note", "acquired", f"the formation is acquired after {formed:.1f} s{noisy}; at the end {left}")
+
+
+def softness(analysis: Analysis) -> Iterator[Finding]:
+    """Check that a formation that is acquired without noise is also acquired, and in time, with that of its file.
+
+    Flown with more seeds are those whose flight with noise beside the ideal one is late, and those that are soft.
+    """
+    experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
+    formed = acquired(analysis)
+    if (
+        loop is None
+        or shape is None
+        or shape.worst > FAR_OFF
+        or formed is None
+        or analysis.prediction.stuck
+        or not has_noise(experiment)
+    ):
+        return
+    soft = bool(loop.free) or SOFT * loop.slowest_s > experiment.duration_s
+    late = max(LATER * formed, formed + WINDOW_S)
+    if not (soft or _doubtful(analysis, formed, late)):
+        return
+    flights = Flights.of(analysis)
+    spans = [(analysis.acquired(until) or 0.0, until) for until in analysis.spans_end]
+    lost, worst, worst_link = 0, experiment.tolerance + FORGIVEN, ""
+    for each in flights.flown:
+        time = each.prediction.time
+        due = np.any([(time > (begin + until) / 2.0) & (time <= until + 1e-9) for begin, until in spans], axis=0)
+        off = each.mean_error[due]
+        largest = float(off.max(initial=0.0))
+        lost += largest > experiment.tolerance + FORGIVEN
+        if largest > worst:
+            worst = largest
+            at, link = np.unravel_index(off.argmax(), off.shape)
+            worst_link = f": {analysis.link(int(link))} is {1e3 * worst:.0f} mm off at {time[due][at]:.1f} s"
+    times = flights.acquired
+    delayed = len(flights.flown) - sum(at <= late for at in times)
+    if not flights.enough(lost) and not flights.enough(delayed):
+        return
+    free = f"{loop.free} mode{'s' * (loop.free > 1)} slower than the run"
+    modes = free if loop.free else f"slowest mode {loop.slowest_s:.1f} s"
+    begin = (
+        f"soft formation, {modes}: acquired after {formed:.1f} s without noise, but with the noise of [disturbance] "
+    )
+    if flights.enough(lost):
+        message = (
+            f"{begin}outside the tolerance of {1e3 * experiment.tolerance:g} mm later, in {lost} of {flights.count} "
+            f"flights ({flights.seeds}){worst_link}"
+        )
+    else:
+        when = f"after {span_of(times)}" if times else "not at all"
+        rest = f", in {len(times)} of {flights.count} flights" if times else f" in {flights.count} flights"
+        message = f"{begin}{when}{rest} ({flights.seeds})"
+    remedy = f"raise {strength(analysis)}, add links that stiffen the formation, or allow a larger tolerance"
+    yield Finding("warning", "soft", message, remedy, ("formation", "links"))
+
+
+def _doubtful(analysis: Analysis, formed: float, late: float) -> bool:
+    """Whether the flight with noise beside the ideal one is late; without one, whether the ideal one is near it."""
+    beside, experiment = analysis.prediction.noisy, analysis.experiment
+    if beside is not None:
+        found = None if beside.stuck else acquired(analysis.flown(beside))
+        return found is None or found > late
+    time = analysis.prediction.time
+    settled = analysis.mean_error[(time >= formed) & (time <= analysis.spans_end[0] + 1e-9)]
+    return float(settled[len(settled) // 2 :].max(initial=0.0)) > NARROW * experiment.tolerance
