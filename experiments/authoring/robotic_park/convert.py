@@ -63,7 +63,7 @@ def convert_text(text: str, label: str, duration_s: float, poses: str | None = N
     park = read(label, text, {} if poses is None else starts_from(poses), notes)
     notes += _notes_on_robots(park)
     pose_hz = _rate("local_pose.T", "poses", [1e-3 * robot.local_pose.T for robot in park.robots], notes)
-    periods = [task.period for _, task in park.tasks] or [0.1]
+    periods = [park.period(robot) for robot, _ in park.tasks] or [0.1]
     coordination_hz = _rate("task.controller.period", "decisions", periods, notes)
     trigger: dict[str, Any] = {"kind": "periodic", "period_s": 1.0 / pose_hz}
     if sent := _commonest("communication", [robot.communication.event for robot in park.robots], notes):
@@ -226,6 +226,12 @@ def _formation(park: Park, found: Heights, notes: list[str]) -> tuple[dict[str, 
                 f"gain of {join_names(scaled)}: their driver divides by the distance, so its pull is zenpark's near"
                 " the distance that is wanted and weaker beyond"
             )
+        if park.recent and not park.central and any(robot.type == "virtual" for robot, _ in jobs):
+            notes.append(
+                "gain in Webots: the file does not say for which driver it is; taken is that of February 2024 and"
+                " before. A later one divides by the distance: for that, divide gains by the distance, and those of"
+                " anchors by four as well"
+            )
     if "pose" in usual:
         table["stiffness"] = usual["pose"]
         if any(task.kind == "pose" and task.law != "pid" for _, task in jobs):
@@ -238,10 +244,9 @@ def _formation(park: Park, found: Heights, notes: list[str]) -> tuple[dict[str, 
 def _divides(park: Park, robot: Robot) -> bool:
     """Whether the driver of a robot divides the pull of a neighbour by its distance.
 
-    The driver on real Kheperas does, and so do the Webots drivers of the files that `recent` tells; those before, the
-    driver of real Crazyflies and the central controller do not.
+    That of real Kheperas does; those in Webots, of real Crazyflies and the central controller do not.
     """
-    return not park.central and (park.recent if robot.type == "virtual" else robot.kind == "khepera4")
+    return not park.central and robot.type != "virtual" and robot.kind == "khepera4"
 
 
 def _gain(park: Park, robot: Robot, task: Task, distance: float, weight: float = 1.0) -> float:
@@ -301,7 +306,7 @@ def _anchors(park: Park, found: Heights, gains: dict[str, float], notes: list[st
             anchors[robot.name] = {"to": [*values[:2], float(found.hover[row])], "gain": gains[robot.name]}
         elif found.anchored:
             # the gain of the origin relative to a neighbour, as in the same drivers
-            weight = 2.0 if park.central or robot.type != "virtual" else 1.0 if park.recent else 4.0
+            weight = 2.0 if park.central or robot.type != "virtual" else 4.0
             centre = list(origin_of(park, robot, kept) or found.centre)
             gain = _gain(park, robot, task, values[0], weight)
             anchors[robot.name] = {"distance": values[0], "to": centre, "gain": gain}

@@ -40,6 +40,7 @@ KINDS: Final = {  # their launcher knows robots by parts of their names as well
 }
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
+MISSING: Final = "there is no such file"
 NOTHING: Final = ("none", "null")  # a relationship without another end
 SURFACES: Final = ("cone", "ellipsoid")
 PLACES: Final = ("origin", "line", *SURFACES)  # relations that are no robots
@@ -136,7 +137,7 @@ class Task(Struct, frozen=True, rename={"period_ms": "T"}):
 
     @property
     def period(self) -> float:
-        """Time between decisions [s]."""
+        """Time between decisions [s], of all drivers but one: see `Park.period`."""
         return self.controller.period or 1e-3 * self.period_ms
 
     @property
@@ -225,7 +226,14 @@ class Park:
     mode: str  # physical, virtual, hybrid
     robots: list[Robot]
     central: bool  # decided by a central controller
-    recent: bool  # for the drivers of 2024 on, which read `mars_data`
+    recent: (
+        bool  # for drivers of 2024, which read `mars_data`; the first of them have the law of before, later ones not
+    )
+
+    def period(self, robot: Robot) -> float:
+        """Time between decisions of a robot [s]: the driver of real Crazyflies takes the period of the task."""
+        own = robot.kind == "crazyflie" and robot.type != "virtual" and not self.central
+        return 1e-3 * robot.task.period_ms if own else robot.task.period
 
     @property
     def tasks(self) -> list[tuple[Robot, Task]]:
@@ -286,7 +294,7 @@ def text_of(file: str, hint: str) -> str:
     try:
         return content(Path(file), file)
     except FileNotFoundError:
-        raise refusal(file, "there is no such file", hint) from None
+        raise refusal(file, MISSING, hint) from None
 
 
 def load(file: str, text: str) -> Entry:
@@ -295,6 +303,8 @@ def load(file: str, text: str) -> Entry:
     Raises:
         DocumentError: If it is no YAML, or no table.
     """
+    if Path(file).suffix.lower() in {".toml", ".json"}:
+        raise refusal(file, "is no file of Robotic Park's authors, which are YAML", f"./zenpark check {file}")
     try:
         value = yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
@@ -342,7 +352,7 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         except DocumentError as error:
             problems += error.problems
     if problems:
-        raise DocumentError(problems)
+        raise DocumentError(_counted(file, problems))
     if given.robots:
         notes += _notes_on_sections(root, given)
     else:  # entries that only let the drones' driver publish where another robot of the file is
@@ -356,6 +366,17 @@ def read(file: str, text: str, poses: Mapping[str, Pose], notes: list[str]) -> P
         for robot in robots.values()
     ]
     return Park(mode, placed, central, any("mars_data" in entry.value for entry in entries))
+
+
+def _counted(file: str, problems: list[Problem]) -> list[Problem]:
+    """The problems, with all files that are missing in one."""
+    missing = [each for each in problems if each.message == MISSING]
+    if len(missing) < 2:
+        return problems
+    names = list(dict.fromkeys(Path(each.file).name for each in missing))
+    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    message = f"names {len(names)} file{'s' * (len(names) > 1)} of robots that are not beside it: {shown}"
+    return [*(each for each in problems if each not in missing), Problem(file, 0, 0, message, missing[0].hint)]
 
 
 def _strip_idle_task(entry: Entry) -> None:
@@ -446,6 +467,8 @@ def _relation(part: str, kind: str) -> Relation:
         return Relation(name, ())
     if name in CENTRES and len(rest) == 1:  # sphere_R-x-y-z
         rest = re.split(r"(?<=[\d.])-", rest[0])
+    elif kind == "pose" and len(rest) == 1 and "/" in rest[0]:  # name_x/y/z
+        rest = rest[0].split("/")
     name = "origin" if name in CENTRES else "line" if name.startswith("line") else name
     counts = {"origin": (1, 3, 4), "line": (6,)}.get(name, (3,) if kind == "pose" else (1,))
     try:

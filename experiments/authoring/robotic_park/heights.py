@@ -13,7 +13,8 @@ from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchors
 from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links
 from experiments.authoring.robotic_park.file import Park, Relation, Robot
-from experiments.check.realisation import ENOUGH, Shape, find_shapes
+from experiments.check.motion import CLEARANCE
+from experiments.check.realisation import Shape, Solids, find_shapes
 
 BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
 ATTEMPTS: Final = 40  # random beginnings
@@ -26,23 +27,50 @@ MOVED: Final = 0.02  # [m] a height that is another than at the start
 SPACING: Final = 0.6  # [m] between robots whose start is made up
 
 
-def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mask) -> Shape:
-    """Best places for what links and anchors ask for.
+@dataclass(frozen=True)
+class Room:
+    """Places that a shape may have."""
+
+    solids: Solids  # robots, which keep apart
+    flies: Mask  # (N,)
+    lowest: float  # height of a drone; minus infinity where the whole shape can be lifted [m]
+
+    def holds(self, shape: Shape) -> bool:
+        """Whether robots stand apart, and drones are in the air."""
+        low = shape.position[self.flies, 2].min(initial=np.inf)
+        return not len(self.solids.overlaps(shape.position)) and bool(low >= self.lowest)
+
+
+def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mask, room: Room | None = None) -> Shape:
+    """Best places for what links and anchors ask for, with robots apart from one another and drones in the air.
 
     A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
     begin at the starts, at a dome above them and at starts that are moved at random (always the same ones): a single
-    beginning ends in a local minimum for about two of three of the shapes in space that the authors fly.
+    beginning ends in a local minimum for about two of three of the shapes in space that the authors fly. A shape that
+    hangs below the floor is mirrored.
 
     Args:
         start: (N, 3) [m].
         climbs: (N,) robots whose height may be another; the others keep theirs.
+        room: What a shape has to keep to; None: nothing.
     """
     moves = np.ones_like(climbs)
+    solids = None if room is None else room.solids
     mirrored = start * [1.0, -1.0, 1.0] + [0.0, 2.0 * start[:, 1].mean(), 0.0]
-    found = find_shapes(wanted, [start, mirrored], moves, anchors)
-    if climbs.any() and found[-1].worst >= ENOUGH:
-        found += find_shapes(wanted, _guesses_in_space(start, climbs), moves, anchors, climbs)
-    return min(found, key=lambda each: round(each.worst, 4))
+    found = find_shapes(wanted, [start, mirrored], moves, anchors, solids=solids)
+    beginnings = _guesses_in_space(start, climbs) if climbs.any() and not found[-1].good else iter(())
+    fixed = np.concatenate([start[~climbs, 2], np.zeros(0) if anchors is None else anchors.point[:, 2]])
+    mirror = float(fixed.mean()) if len(fixed) else 0.0
+    for guess in beginnings:
+        found += find_shapes(wanted, [guess], moves, anchors, climbs, solids=solids)
+        if found[-1].worst <= SHAPE_MET and not (room is None or room.holds(found[-1])):
+            turned = found[-1].position.copy()
+            turned[climbs, 2] = 2.0 * mirror - turned[climbs, 2]
+            found += find_shapes(wanted, [turned], moves, anchors, climbs, solids=solids)
+        if found[-1].good and (room is None or room.holds(found[-1])):
+            break
+    kept = [each for each in found if room is None or room.holds(each)]
+    return min(kept or found, key=lambda each: round(each.worst, 4))
 
 
 def _guesses_in_space(start: Array, climbs: Mask) -> Iterator[Array]:
@@ -85,19 +113,25 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     if not len(wanted):
         return plain
     given = any(origin_of(park, robot, relation) for robot, task in park.tasks for relation in task.relations)
-    found, anchored = find_shape(wanted, anchors, start, flies), anchors is not None
+    kinds = [KINDS[robot.kind] for robot in park.robots]
+    solids = Solids.of(kinds, wanted, np.ones_like(flies), CLEARANCE)
+    room = Room(solids, flies, -np.inf if flies.all() and not given else LOWEST)
+    found, anchored = find_shape(wanted, anchors, start, flies, room), anchors is not None
     missed = found.worst
-    if anchored and missed > SHAPE_MET:
-        found, anchored = find_shape(wanted, None, start, flies), False
+    if anchored and (missed > SHAPE_MET or not room.holds(found)):
+        given, anchored = False, False
+        room = replace(room, lowest=-np.inf if flies.all() else LOWEST)
+        found = find_shape(wanted, None, start, flies, room)
         if found.worst <= SHAPE_MET:
+            how = f"misses by {1e3 * missed:.0f} mm" if missed > SHAPE_MET else "has robots in one place or too low"
             notes.append(
                 "distances to the origin: no shape was found that meets them and those between robots; the best one"
-                f" misses by {1e3 * missed:.0f} mm, so those to the origin are left out"
+                f" {how}, so those to the origin are left out"
             )
     if found.worst > SHAPE_MET:
         notes.append(
-            f"the distances: no shape was found that meets them, even in space; the best one misses by"
-            f" {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
+            f"the distances: no shape was found that meets them with robots apart from one another, even in space; the"
+            f" best one misses by {1e3 * found.worst:.0f} mm, so drones hold the heights at which they start"
         )
         return plain
     shape, lift = found.position, 0.0

@@ -226,10 +226,10 @@ def test_tasks_that_are_off_are_counted(tmp_path):
     ("place", "name", "recent", "expected"),
     [
         ("virtual", "khepera", False, (0.5, 4.0)),
-        ("virtual", "khepera", True, (0.5 / 0.8, 1.0)),
+        ("virtual", "khepera", True, (0.5, 4.0)),
         ("physical", "khepera", False, (0.5 / 0.8, 2.0)),
         ("virtual", "dron", False, (0.5, 4.0)),
-        ("virtual", "dron", True, (0.5 / 0.8, 1.0)),
+        ("virtual", "dron", True, (0.5, 4.0)),
         ("physical", "dron", False, (0.5, 2.0)),
         ("physical", "dron", True, (0.5, 2.0)),
     ],
@@ -242,12 +242,42 @@ def test_gains_by_the_driver_that_the_file_is_for(tmp_path, place, name, recent,
     text = text.replace("pose: 0.00, 0.00, 0.00", "pose: 0.01, 0.00, 0.00")
     if recent:
         text = text.replace("    local_pose:", "    mars_data:\n      enable: True\n    local_pose:")
-    formation = converted(tmp_path, text)[0].experiment.formation
+    read, notes = converted(tmp_path, text)
+    formation = read.experiment.formation
+    assert any("for which driver" in note for note in notes) == (recent and place == "virtual")
     assert formation.gain == pytest.approx(gain, rel=1e-3)
     if name == "dron":  # on the floor a sphere about 0.7 m is out of reach
         divided = 1.0 if gain == 0.5 else radius
         gains = [anchor.gain for anchor in formation.anchors.values()]
         assert gains == pytest.approx([0.5 / divided * weight] * 3, rel=1e-3)
+
+
+@pytest.mark.parametrize(("place", "hz"), [("physical", 20.0), ("virtual", 10.0)])
+def test_real_crazyflies_decide_by_task_period(tmp_path, place, hz):
+    text = file(three(TRIANGLE, place=place)).replace("khepera", "dron").replace("      T: 100\n", "      T: 50\n")
+    assert converted(tmp_path, text)[0].experiment.rates.coordination_hz == hz
+
+
+def test_relative_pose_by_slashes(tmp_path):
+    text = file(three([["khepera02_-0.3/-0.3/0.2"], [], []], kind="relative_pose"))
+    links = converted(tmp_path, text)[0].experiment.formation.links
+    assert links["khepera02 > khepera01"].offset == [-0.3, -0.3]
+
+
+def test_missing_files_of_robots_are_counted_once(tmp_path):
+    listed = index(tmp_path)
+    for each in tmp_path.glob("AC_*.yaml"):
+        each.unlink()
+    with pytest.raises(DocumentError) as raised:
+        convert_text(listed, "AC.yaml", 20.0)
+    (problem,) = raised.value.problems
+    assert problem.file == "AC.yaml"
+    assert "3 files of robots that are not beside it: AC_dron01.yaml" in problem.message
+
+
+def test_import_of_toml_names_the_check():
+    with pytest.raises(DocumentError, match=r"is no file of Robotic Park's authors(.|\n)*zenpark check park.toml"):
+        convert_text('title = "park"\n', "park.toml", 20.0)
 
 
 def test_a_law_that_gives_a_velocity_becomes_a_step(tmp_path):
@@ -260,6 +290,29 @@ def test_the_address_may_be_called_ip(tmp_path):
     text = file(three(TRIANGLE, place="physical"), "physical").replace("agent_ip:", "ip:")
     robots = converted(tmp_path, text)[0].experiment.robots
     assert robots["khepera02"].body == "khepera4://192.168.0.22:50000"
+
+
+def pyramid(**more):
+    """Four drones on a square and one above it, from one height: folded, two opposite corners are in one place."""
+    place = np.array([[1.2, 0, 0], [0, 1.2, 0], [-1.2, 0, 0], [0, -1.2, 0], [0, 0, 1.0]])
+    names = [f"dron0{k + 1}" for k in range(5)]
+    robots = []
+    for k, (x, y, _) in enumerate(place):
+        others = range(4) if k == 4 else ((k + 1) % 4, (k - 1) % 4, 4)
+        relations = [f"{names[j]}_{np.linalg.norm(place[k] - place[j]):.4f}" for j in others]
+        robots.append(robot(k + 1, names[k], (1.1 * x, 0.9 * y, 0.7), relations, **more))
+    return file(robots)
+
+
+def test_pyramid_is_not_folded(tmp_path):
+    experiment = converted(tmp_path, pyramid())[0].experiment
+    hover = [each.hover for each in experiment.robots.values()]
+    assert hover[4] > max(hover[:4]) + 0.7
+    predicted = figures(experiment)
+    assert predicted.acquired_s is not None
+    place = np.array(list(predicted.end.values()))
+    apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)[np.triu_indices(5, 1)]
+    assert apart.min() > 1.0
 
 
 @pytest.mark.slow

@@ -3,11 +3,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.formation.anchors import Anchors
 from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links, links
 from experiments.authoring import layouts
-from experiments.authoring.robotic_park.heights import find_shape
-from experiments.check.realisation import ENOUGH
+from experiments.authoring.robotic_park.heights import Room, find_shape
+from experiments.check.realisation import ENOUGH, Solids
 
 
 def asked(position, pairs=None, *, relative=False):
@@ -67,3 +68,33 @@ def test_shapes_in_space_are_found_from_starts_in_one_plane(seed):
     shape = made.position
     start = shape * [1.2, 1.2, 0.0] + np.random.default_rng(seed).normal(0.0, [0.25, 0.25, 0.0], shape.shape)
     assert find_shape(asked(shape, made.pairs), None, start, np.ones(12, dtype=bool)).worst < ENOUGH
+
+
+def solids(flies):
+    kinds = [CRAZYFLIE if each else KHEPERA4 for each in flies]
+    return Room(Solids.of(kinds, links([(0, k) for k in range(1, len(flies))]), flies, 0.1), flies, 0.3)
+
+
+def test_a_shape_below_the_floor_is_mirrored():
+    ring = np.array([(np.cos(a), np.sin(a), 0.0) for a in 2.0 * np.pi * np.arange(5) / 5])
+    shape = np.concatenate([ring, [[0.1, 0.0, 0.9], [-0.3, 0.2, 0.8]]])
+    climbs = np.arange(7) >= 5
+    start = shape * [1.2, 1.0, -0.2]  # nearer to the mirror image
+    below = find_shape(asked(shape), None, start, climbs)
+    assert below.worst < ENOUGH
+    assert below.position[climbs, 2].max() < 0.0
+    above = find_shape(asked(shape), None, start, climbs, solids(climbs))
+    assert above.worst < ENOUGH
+    assert above.position[climbs, 2] == pytest.approx([0.9, 0.8], abs=1e-3)
+
+
+def test_robots_in_one_place_are_no_shape():
+    """A square without diagonals may fold: two corners then are in one place."""
+    square = np.array([(0.0, 0, 0.7), (1.0, 0, 0.7), (1.0, 1.0, 0.7), (0.0, 1.0, 0.7)])
+    pairs = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])
+    flies = np.ones(4, dtype=bool)
+    start = np.array([(0.0, 0, 0.7), (1.0, 0, 0.7), (0.01, 0.1, 0.7), (1.0, 0.01, 0.7)])
+    assert np.ptp(find_shape(asked(square, pairs), None, start, flies).position, axis=0)[2] < 0.01
+    found = find_shape(asked(square, pairs), None, start, flies, solids(flies))
+    assert found.worst < ENOUGH
+    assert not len(solids(flies).solids.overlaps(found.position))
