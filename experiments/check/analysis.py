@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import msgspec
@@ -142,6 +143,18 @@ class Analysis:
             error=link_errors(self.assignment.law, self.pattern, prediction),
             anchored=anchor_errors(self.assignment, prediction),
         )
+
+    @cached_property
+    def noisy(self) -> Analysis | None:
+        """The same with the motion of the flight with noise beside the ideal one, if there was one."""
+        beside = self.prediction.noisy
+        return None if beside is None or beside.stuck else self.flown(beside)
+
+    @cached_property
+    def acquired_for_good(self) -> float | None:
+        """Time of acquisition [s], if the formation is within the tolerance at the end as well."""
+        times = [self.acquired(until) for until in self.spans_end]
+        return None if None in times else times[0]
 
     def acquired(self, until: float) -> float | None:
         """Time from which on the mean of every link over `WINDOW_S` is within the tolerance, up to `until` [s]."""

@@ -78,6 +78,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     speed_needed: float | None  # of the fastest plan [m/s]
     speed_available: float | None  # of the slowest follower [m/s]
     acquired_s: float | None  # when the formation keeps within the tolerance, before any plan begins
+    acquired_noisy_s: float | None  # the same, with the noise of the file's seed; None without such a flight as well
     end_error_mm: float | None  # worst link at the end
     end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
     end_inside: bool  # whether all of them are inside the arena then
@@ -190,6 +191,7 @@ def _figures(analysis: Analysis) -> Figures:
         speed_needed=_finite(fastest[2].speed()) if fastest else None,
         speed_available=None if follower is None else float(analysis.pull[follower]),
         acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,
+        acquired_noisy_s=analysis.noisy.acquired(min(analysis.departure, last)) if shape and analysis.noisy else None,
         end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(assignment.links) else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),

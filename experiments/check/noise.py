@@ -18,13 +18,13 @@ SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then,
 LATER: Final = 2.0  # times the time without noise, from which on a formation is acquired late
 NARROW: Final = 0.6  # of the tolerance: noise may move a link that is farther off out of it
 DELAYED: Final = 1.2  # times the time without noise, from which on both times are given
-OPEN: Final = (
-    "acquired-late",
-    "wheels-stop",
-    "local-minimum",
-    "lags",
-    "not-acquired",
-)  # findings that noise may refute
+WITHOUT: Final = {  # findings that noise may refute: what robots do without it
+    "acquired-late": "are late",
+    "wheels-stop": "on wheels stop short of their goals",
+    "local-minimum": "balance in another shape",
+    "lags": "lag behind their leader",
+    "not-acquired": "stop short of their places",
+}
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Flights:
     @property
     def acquired(self) -> list[float]:
         """Times of acquisition [s] of the flights that acquire the formation, and again by the end."""
-        return [at for each in self.flown if (at := acquired(each)) is not None]
+        return [at for each in self.flown if (at := each.acquired_for_good) is not None]
 
     def enough(self, number: int) -> bool:
         """Whether so many flights are more than chance.
@@ -54,12 +54,6 @@ class Flights:
         One of five may be: of such experiments one in four was lost with other seeds.
         """
         return number >= min(2, self.count)
-
-
-def acquired(analysis: Analysis) -> float | None:
-    """Time of acquisition [s], if the formation is within the tolerance at the end as well; else None."""
-    spans = [analysis.acquired(until) for until in analysis.spans_end]
-    return None if None in spans else spans[0]
 
 
 def span_of(times: list[float]) -> str:
@@ -73,14 +67,14 @@ def with_noise(analysis: Analysis, finding: Finding) -> Finding:
 
     A trigger or the wheels leave robots alone whose errors are small. Noise moves them on.
     """
-    if finding.code not in OPEN or not has_noise(analysis.experiment):
+    if finding.code not in WITHOUT or not has_noise(analysis.experiment):
         return finding
     flights = Flights.of(analysis)
     times, count = flights.acquired, flights.count
     if times and len(times) == count:
         message = (
             f"the formation is acquired after {span_of(times)} with the noise of [disturbance], in {count} of {count} "
-            f"flights ({flights.seeds}); without noise it is not: robots stop short of it"
+            f"flights ({flights.seeds}); without noise it is not, because robots {WITHOUT[finding.code]}"
         )
         return Finding("note", "acquired", message)
     noisy = f"with the noise of [disturbance], in {len(times)} of {count} flights ({flights.seeds})"
@@ -91,8 +85,7 @@ def with_noise(analysis: Analysis, finding: Finding) -> Finding:
 
 def acquired_note(analysis: Analysis, formed: float, left: str) -> Finding:
     """The note on an acquired formation; with the noise of the file's seed, if that takes longer."""
-    beside = analysis.prediction.noisy
-    delayed = None if beside is None or beside.stuck else acquired(analysis.flown(beside))
+    delayed = None if analysis.noisy is None else analysis.noisy.acquired_for_good
     noisy = ""
     if delayed is not None and delayed > max(DELAYED * formed, formed + WINDOW_S):
         noisy = f" without noise, {delayed:.1f} s with that of seed {analysis.experiment.seed}"
@@ -105,7 +98,7 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
     Flown with more seeds are those whose flight with noise beside the ideal one is late, and those that are soft.
     """
     experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
-    formed = acquired(analysis)
+    formed = analysis.acquired_for_good
     if (
         loop is None
         or shape is None
@@ -156,10 +149,9 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
 
 def _doubtful(analysis: Analysis, formed: float, late: float) -> bool:
     """Whether the flight with noise beside the ideal one is late; without one, whether the ideal one is near it."""
-    beside, experiment = analysis.prediction.noisy, analysis.experiment
-    if beside is not None:
-        found = None if beside.stuck else acquired(analysis.flown(beside))
+    if analysis.noisy is not None:
+        found = analysis.noisy.acquired_for_good
         return found is None or found > late
     time = analysis.prediction.time
     settled = analysis.mean_error[(time >= formed) & (time <= analysis.spans_end[0] + 1e-9)]
-    return float(settled[len(settled) // 2 :].max(initial=0.0)) > NARROW * experiment.tolerance
+    return float(settled[len(settled) // 2 :].max(initial=0.0)) > NARROW * analysis.experiment.tolerance

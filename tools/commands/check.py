@@ -264,11 +264,19 @@ def _formatted(of: Figures) -> dict[str, str]:
         + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
         "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
         "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
-        "formation acquired after": number(of.acquired_s, ".1f", " s"),
+        "formation acquired after": number(of.acquired_s, ".1f", " s")
+        + (f", with noise {of.acquired_noisy_s:.1f} s" if _differs(of.acquired_s, of.acquired_noisy_s) else ""),
         "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
         "all end inside the arena": "yes" if of.end_inside else "no",
         "poses sent by all, estimated": number(of.messages_hz, ".1f", " per second"),
     }
+
+
+def _differs(ideal: float | None, noisy: float | None) -> bool:
+    """Whether the time with noise says something else than the one without."""
+    from experiments.check.noise import DELAYED
+
+    return noisy is not None and (ideal is None or noisy > max(DELAYED * ideal, ideal + 1.0))
 
 
 def _redundancy_text(spare: int | None, vital: int) -> str:

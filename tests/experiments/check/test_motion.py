@@ -197,7 +197,6 @@ def test_a_trigger_that_never_fires_is_named():
         ),
         (PARK, "timeline.0.at_s=5", ("warning", "acquired-late"), "when the plans begin at 5 s", "begin later"),
         (PARK, "duration_s=24", ("warning", "lags"), "lags behind its leader", "slowly"),
-        (TRIANGLE, "robots.CF01.start=[0.0,-0.5]", ("warning", "local-minimum"), "another shape", "order"),
         (TRIANGLE, "duration_s=2", ("warning", "not-acquired"), "mm off after 2 s", "duration_s"),
     ],
 )
