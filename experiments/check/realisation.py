@@ -289,8 +289,8 @@ class Mirrored(NamedTuple):
 def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchors | None = None) -> list[Mirrored]:
     """Robots that have to change sides, at most `MIRRORS`, for the formation to get from `end` (N, 3) to its shape.
 
-    One after the other that one is mirrored that leads to the shape, or brings the formation nearest to it. Empty if
-    that does not end in the shape, and for formations of more than `MOST_MIRRORED` robots.
+    One after the other that one is mirrored that leads to the shape, or nearest to it, with the least motion of all.
+    Empty if that does not end in the shape, and for formations of more than `MOST_MIRRORED` robots.
     """
     if len(end) > MOST_MIRRORED:
         return []
@@ -310,7 +310,13 @@ def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchors | No
             guess = place.copy()
             guess[row] = _mirror(place[row], place[left], place[right])
             tried.append((fitted_shape(links, anchors, guess, free), row, (left, right)))
-        shape, row, ends = min(tried, key=lambda each: round(each[0].worst, 4), default=(best, -1, (-1, -1)))
+        ranked = [
+            (round(shape.worst, 3), float(norm(shape.position - place).sum()), k)
+            for k, (shape, _, _) in enumerate(tried)
+        ]
+        if not ranked:
+            return []
+        shape, row, ends = tried[min(ranked)[-1]]
         if shape.worst >= best.worst:
             return []
         best, place = shape, shape.position

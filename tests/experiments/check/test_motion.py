@@ -261,3 +261,54 @@ def test_a_formation_that_is_lost_again_was_acquired_and_names_the_stiffness(tmp
     assert message.startswith("the formation, acquired after ")
     assert " s, is not acquired again after 8 s: L - F is " in message
     assert remedy.endswith("or raise the stiffness")
+
+
+def anchored(**changed) -> Experiment:
+    made = Experiment(
+        title="One robot, one anchor",
+        robots={"CF01": Robot(kind="crazyflie", start=[0.0, 0.3], hover=0.7)},
+        formation=Formation(anchors={"CF01": 1.0}),
+        duration_s=20.0,
+    )
+    return msgspec.structs.replace(made, **changed)
+
+
+def test_anchors_without_links_are_checked():
+    claims = {each.code: each.message for each in check(of(anchored()))}
+    assert "CF01 is 0 mm off at the end" in claims["anchored"]
+    assert "the anchors can be met" in claims["realisable"]
+    assert figures(anchored()).end_error_mm is None
+    late = {each.code: each for each in check(of(anchored(formation=Formation(anchors={"CF01": 1.0}, gain=1e-4))))}
+    assert late["anchor-missed"].severity == "warning"
+    assert "anchored" not in late
+
+
+def test_noise_that_frees_robots_is_good_news():
+    """Three drones that start on a line: without noise they stay on it."""
+    given = document.read(TRIANGLE, ["robots.CF01.start=[0.0,-0.5]"])
+    claims = {each.code: each for each in check(given, ["periodic"])}
+    assert claims["acquired"].severity == "note"
+    assert "in 5 of 5 flights (seeds 1 to 5); without noise it is not" in claims["acquired"].message
+    assert not {"local-minimum", "not-acquired"} & claims.keys()
+    still = document.read(TRIANGLE, ["robots.CF01.start=[0.0,-0.5]", "disturbance={}"])
+    assert "local-minimum" in {each.code for each in check(still, ["periodic"])}
+
+
+def test_what_noise_does_not_free_is_told():
+    found = {each.code: each.message for each in check(document.read(TRIANGLE, ["duration_s=2"]), ["periodic"])}
+    assert "nor is it with the noise of [disturbance], in any of 5 flights" in found["not-acquired"]
+
+
+def test_drones_above_one_another_do_not_touch():
+    def crossing(height: float) -> dict[str, str]:
+        robots = {
+            "CF01": Robot(kind="crazyflie", start=[-1.0, 0.0], hover=0.5),
+            "TL01": Robot(kind="tello", start=[0.0, 0.0], hover=height),
+        }
+        way = [Leg(at_s=1.0, robot="CF01", plan={"kind": "line", "move_by": [2.0, 0.0], "speed": 0.3})]
+        made = Experiment(title="Crossing", robots=robots, timeline=way, duration_s=15.0)
+        return {each.code: each.message for each in check(of(made))}
+
+    assert "they touch at 0.17 m" in crossing(0.52)["too-close"]
+    assert "one is above the other then, with 0.07 m between them" in crossing(0.6)["too-close"]
+    assert "too-close" not in crossing(0.65)

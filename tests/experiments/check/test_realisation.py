@@ -9,16 +9,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
 from agents.formation.graph import Links, links
+from experiments.check.check import check
 from experiments.check.realisation import (
+    Solids,
     algebraic_connectivity,
     conflicts,
     find_shapes,
+    fitted_shape,
     formation_rigidity,
+    mirrored_robots,
     unfold_distances,
 )
+from experiments.definition.experiment import Experiment, Formation, Robot
 from experiments.definition.plan import Plan
 from experiments.file import document
+from tests.experiments.checked import of
 from tests.experiments.traces import link_errors
 
 # where the reference formation may stand: TB01, KH01..03, CF01..03
@@ -105,3 +112,42 @@ def test_distances_of_a_drawing_are_met_again(seed, rows):
     found = find_shapes(net, [unfold_distances(net, height)], np.ones(rows, dtype=bool))
     assert found[-1].worst < 1e-6
     assert conflicts(net, height) == []
+
+
+def test_robots_on_the_wrong_side_are_named():
+    rng = np.random.default_rng(3)
+    shape = np.column_stack([rng.uniform(-1.0, 1.0, (5, 2)), np.zeros(5)])
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    wanted = links(pairs, [float(np.linalg.norm(shape[i] - shape[j])) for i, j in pairs])
+    moves, held = np.arange(5) > 1, np.ones((5, 3), dtype=bool)
+    held[:2], held[:, 2] = False, False
+    turned = shape.copy()
+    way = shape[1, :2] - shape[0, :2]
+    across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+    turned[4, :2] -= 2.0 * ((turned[4] - turned[0])[:2] @ across) * across
+    end = fitted_shape(wanted, None, turned, held)
+    assert end.worst > 0.05  # a local minimum
+    (found,) = mirrored_robots(wanted, end.position, moves)
+    assert found.row == 4
+    assert found.place == pytest.approx(shape[4], abs=1e-3)
+    assert mirrored_robots(wanted, shape, moves) == []
+
+
+def test_robots_in_one_another_are_found():
+    kinds, all_of_them = [CRAZYFLIE, TELLO, KHEPERA4], np.ones(3, dtype=bool)
+    solids = Solids.of(kinds, links([(0, 1), (1, 2)]), all_of_them, clearance=0.1)
+    near = np.array([(0.0, 0.0, 0.5), (0.1, 0.0, 0.5), (0.0, 0.05, 0.0)])
+    assert solids.overlaps(near).tolist() == [[0, 1]]
+    assert solids.overlaps(near + np.array([[0, 0, 0.1], [0, 0, 0], [0, 0, 0]])).tolist() == [[0, 1]]
+    assert not len(solids.overlaps(near + np.array([[0, 0, 0.2], [0, 0, 0], [0, 0, 0]])))
+    assert not len(Solids.of(kinds, links([(1, 2)]), all_of_them).overlaps(near))  # places of parts are their own
+
+
+def test_shape_in_one_place_is_an_error():
+    """A square of four links and a diagonal of nothing: two corners are to be in one place."""
+    robots = {f"K{k}": Robot(kind="khepera4", start=[0.5 * k, 0.1 * k]) for k in range(4)}
+    sides = {"K0 - K1": 1.0, "K1 - K2": 1.0, "K2 - K3": 1.0, "K0 - K3": 1.0, "K0 - K2": 0.01}
+    made = Experiment(title="Folded", robots=robots, formation=Formation(links=sides, gain=1.0), duration_s=5.0)
+    found = {each.code: each for each in check(of(made))}
+    assert found["in-one-place"].severity == "error"
+    assert "K0 and K2 would stand 0.01 m apart" in found["in-one-place"].message
