@@ -1,7 +1,8 @@
 """Clock of an experiment in one process: the machine's clock plus its known correction.
 
-The wall clock is read once and continued with the monotonic one, so that a step in mid-run (NTP, an operator) changes
-nothing. All processes of a run on the launcher's machine share one reading, however late they are started.
+The wall clock is read once and continued with `uptime`, so that a step in mid-run (NTP, an operator) changes nothing,
+and a machine that was suspended is not behind the others afterwards. All processes of a run on the launcher's machine
+share one reading, however late they are started.
 
 Clocks drift. The starter of a process on another machine measures the offset again during the run and writes it to the
 process's lifeline, `clock -0.200131`; the process follows by going a little faster or slower, never back: stamps decide
@@ -18,7 +19,7 @@ from typing import Final
 
 SLEW: Final = 0.005  # [s/s] a hundred times the drift of quartz, harmless for any body
 STEP_S: Final = 0.5  # larger changes are no drift: a suspended or mistaken peer
-READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's monotonic clock was 0 [s]
+READING: Final = "ZENPARK_CLOCK"  # environment: UTC at which the machine's `uptime` was 0 [s]
 _WORD: Final = b"clock "
 _UPTIME: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
@@ -40,15 +41,15 @@ class Clock:
         # added to this machine's UTC where stamps are made, so that their readers need no machine [s]
         self.correction_s = self._wanted = correction_s
         shared = os.environ.get(READING)
-        self._zero = time.time() - time.monotonic() if shared is None else float(shared)
+        self._zero = time.time() - uptime() if shared is None else float(shared)
 
     def utc(self) -> float:
         """Now, UTC [s]."""
-        return self.at(time.monotonic())
+        return self.at(uptime())
 
-    def at(self, monotonic: float) -> float:
-        """UTC [s] at a time of the monotonic clock [s]."""
-        return self._zero + monotonic + self.correction_s
+    def at(self, up: float) -> float:
+        """UTC [s] at a time `up` of the clock `uptime` [s]."""
+        return self._zero + up + self.correction_s
 
     def shared(self) -> dict[str, str]:
         """Environment of processes on this machine that share this clock."""

@@ -18,6 +18,7 @@ from agents.arrays import Array, Index, Mask, norm, some
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState
 from agents.body.measured_positions import MeasuredPositions
+from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -56,7 +57,7 @@ class _RepeatedOrder(msgspec.Struct):
 class ExternalBody:
     """Robots of another process; implements `agents.body.interface.Body`.
 
-    Its own clock is monotonic and starts at creation; `read` measures the offset of the caller's clock.
+    Its own clock is `uptime` and starts at creation; `read` measures the offset of the caller's clock.
     """
 
     def __init__(self, request: BodyRequest) -> None:
@@ -68,7 +69,7 @@ class ExternalBody:
         self._names, self._kinds, self._keys = request.names, request.kinds, request.keys
         self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
-        self._zero = time.monotonic()
+        self._zero = uptime()
         self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
         self._clock_offset = np.inf  # from the caller's clock to this one [s]
@@ -190,7 +191,7 @@ class ExternalBody:
     # ------------------------------------------------------------------ positions received
 
     def _now(self) -> float:
-        return time.monotonic() - self._zero + self._clock.correction_s - self._corrected
+        return uptime() - self._zero + self._clock.correction_s - self._corrected
 
     def _stamp(self) -> float:
         return round(self._utc + self._now(), 6)

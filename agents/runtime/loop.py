@@ -1,6 +1,6 @@
 """The robot process: a deadline loop around the decision. Here is the I/O; `agents.agent` decides.
 
-One plain loop on the monotonic clock, no asyncio, no callbacks: received samples wait in ring channels and are polled.
+One plain loop on the clock `uptime`, no asyncio, no callbacks: received samples wait in ring channels and are polled.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Runtime:
         self._state: BodyState | None = None  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._joined = False
-        self._ticks = Ticks(assignment.body_hz)
+        self._ticks = Ticks(assignment.body_hz, clock=uptime)
         self._utc = 0.0
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names], network.ROBOT_LEASE_S)
         self._hands_off = False  # another process drives the bodies, or may do so

@@ -18,7 +18,7 @@ import zenoh
 from msgspec import Meta
 
 from agents.body.external_pose import External
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -161,10 +161,10 @@ class Bridge:
         return True
 
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
-        heard = time.monotonic()
+        heard = uptime()
         while not over():
             frame = reader.newest(POLL_S)
-            now = time.monotonic()
+            now = uptime()
             if frame is None:
                 if now - heard > SILENCE_S:
                     raise TimeoutError(f"no frame for {SILENCE_S:g} s (is the system live, and not paused?)")

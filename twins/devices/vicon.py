@@ -18,7 +18,7 @@ import zenoh
 from msgspec import Meta
 
 from agents.arrays import Array
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -271,7 +271,7 @@ def run(launch: TwinLaunch) -> int:
             farewell = Farewell(session, keys, launch.robots, lost)
             truth = TruthSubscription(session, keys, launch.robots)
             declared += [farewell, truth]
-            ticks, clock = Ticks(launch.rate), Clock()
+            ticks, clock = Ticks(launch.rate, clock=uptime), Clock()
             while not (stop.is_set() or farewell.over()):
                 t = serve_until_next(vicon, ticks)
                 truth.update(vicon, clock.utc())

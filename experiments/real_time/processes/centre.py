@@ -19,7 +19,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agents.arrays import Index
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.decision.centralised import Centre, CentreGoals
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
@@ -56,7 +56,7 @@ class CentreProcess:
         self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
-        self._ticks = Ticks(assignment.body_hz / assignment.decide_every)
+        self._ticks = Ticks(assignment.body_hz / assignment.decide_every, clock=uptime)
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
         self._patience = 0.5 / assignment.body_hz
         names, rows = self._names, centre.needed.tolist()

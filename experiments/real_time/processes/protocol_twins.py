@@ -15,7 +15,7 @@ import msgspec
 import zenoh
 
 from agents.body.kinds import KINDS
-from agents.clock import Clock
+from agents.clock import Clock, uptime
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import DEFAULT_ENDPOINT
@@ -116,7 +116,7 @@ def _serve(
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
-        ticks, clock = Ticks(experiment.rates.body_hz), Clock()
+        ticks, clock = Ticks(experiment.rates.body_hz, clock=uptime), Clock()
         while not (over.is_set() or ended()):
             now = serve_until_next(device, ticks)
             device.advance(now)

@@ -16,6 +16,7 @@ from typing import Annotated, Final
 import msgspec
 import zenoh
 
+from agents.clock import uptime
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end
@@ -63,7 +64,7 @@ class WorldProcess:
         self._population, self._session, self._lost = population, session, lost
         self._engine = registry.split(experiment.world.engine)[0]
         hz = experiment.rates.body_hz
-        self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz))
+        self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=uptime)
         self.exchange = Exchange(experiment, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)

@@ -109,9 +109,9 @@ class Exchange:
         self._mirrors = [(row, self._states_of(names[row])) for row in self._mirrored.tolist()]
         self.restart()
 
-    def begin(self, monotonic: float) -> None:
-        """Sets the clock of the world to 0 at this time of the monotonic clock [s]."""
-        self.utc = self._clock.at(monotonic)
+    def begin(self, up: float) -> None:
+        """Sets the clock of the world to 0 at a time `up` of the clock `uptime` [s]."""
+        self.utc = self._clock.at(up)
 
     def restart(self) -> None:
         """Follows a body that is made anew: it has no commands, and does not know the mirrored robots."""

@@ -60,7 +60,7 @@ class Frames:
 def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
     Frames.steady, wall = 5.0, 1.8e9
     monkeypatch.setattr(publisher, "Reader", Frames)
-    monkeypatch.setattr(time, "monotonic", lambda: Frames.steady)
+    monkeypatch.setattr(time, "clock_gettime", lambda _clock: Frames.steady)
     monkeypatch.setattr(time, "time", lambda: wall + Frames.steady + (step if Frames.steady > 6.0 else 0.0))
     stamps: list[float] = []
 
