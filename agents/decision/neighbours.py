@@ -13,7 +13,8 @@ class NeighbourPoses:
     """Last pose received on each link (E), and liveliness of its sender."""
 
     def __init__(self, links: int) -> None:
-        self.position: Array = np.full((links, 3), np.nan)  # (E, 3) [m], NaN before the first pose
+        # (E, 3) [m], NaN before the first pose; that of a former process until its successor has sent one
+        self.position: Array = np.full((links, 3), np.nan)
         self.velocity: Array = np.zeros((links, 3))  # (E, 3) [m/s]
         # (E,) time of measurement, limited to plausible values [s]; −inf before the first pose
         self.stamp: Array = np.full(links, -np.inf)
@@ -44,9 +45,14 @@ class NeighbourPoses:
         self.lost_since[at] = np.inf
 
     def discard(self, at: Index) -> None:
-        """Discard the poses of the senders of links `at`, which were restarted."""
-        self.position[at], self.velocity[at] = np.nan, 0.0
+        """Discard the poses of the senders of links `at`, which were restarted: each stands where it was last."""
+        self.velocity[at] = 0.0
         self.stamp[at] = self.arrival[at] = -np.inf
+
+    @property
+    def silent(self) -> Mask:
+        """(E,) senders of which only the last place is known: lost, or restarted and without a pose since."""
+        return np.asarray((self.lost_since < np.inf) | (self.stamp == -np.inf))
 
     def extrapolate_position(self, predictor: Predictor, t: float, which: Index) -> Array:
         """Positions (K, 3) [m] at `t` [s] of the senders of links `which` (K,), each received at least once."""
@@ -129,9 +135,15 @@ class NeighbourStates:
         return np.concatenate([self._select(), links.receiver[changed]])
 
     def extrapolate_all(self, predictor: Predictor, t: float) -> Array:
-        """Positions (E, 3) [m] of the senders of all links at `t` [s], NaN before the first pose."""
+        """Positions (E, 3) [m] of the senders of all links at `t` [s], NaN before the first pose.
+
+        A lost sender has stopped where it was at its loss.
+        """
         poses = self.poses
-        age = np.where(np.isfinite(poses.stamp), t - poses.stamp, 0.0)
+        known = np.isfinite(poses.stamp)
+        stamp = np.where(known, poses.stamp, 0.0)
+        until = np.where(poses.lost_since < np.inf, np.maximum(stamp, np.minimum(t, poses.lost_since)), t)
+        age = np.where(known, until - stamp, 0.0)
         return predictor.position(poses.position, poses.velocity, age)
 
     def _select(self) -> Index:

@@ -82,7 +82,7 @@ class Perception:
         apart = state.position[row] - position
         near = (np.vecdot(apart[:, :2], apart[:, :2]) <= REACH**2) & aware[row]
         # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
-        lost = t - poses.lost_since > self._limits.link_silence_s
+        lost = (t - poses.lost_since > self._limits.link_silence_s) | (poses.stamp == -np.inf)
         sinking = np.where((poses.velocity[:, 2] < -DESCENT) & (age <= BELIEVED_S), poses.velocity[:, 2], 0.0)
         low = position[:, 2] + DESCENT_S * sinking
         # their lower end under the own upper one, and the other way round; `apart` is the own height above them

@@ -35,12 +35,14 @@ class Separation:
     def distances(self, t: float, position: Array, neighbours: NeighbourStates) -> Array:
         """Distances (E,) [m] from rows at `position` (N, 3) to the extrapolated senders at `t` [s].
 
-        Infinite where nothing was received, the own position is unknown, or the sender is lost for long.
+        Infinite where nothing was received, the own position is unknown, or the sender is lost for long, or restarted
+        and without a pose since.
         """
-        assignment = self._assignment
+        assignment, poses = self._assignment, neighbours.poses
         believed = neighbours.extrapolate_all(assignment.predictor, t)
         apart = norm(position[assignment.links.receiver] - believed)
-        there = np.isfinite(apart) & (t - neighbours.poses.lost_since <= assignment.limits.link_silence_s)
+        there = np.isfinite(apart) & np.isfinite(poses.stamp)
+        there &= t - poses.lost_since <= assignment.limits.link_silence_s
         return np.where(there, apart, np.inf)
 
     def nearest_robot(self, row: int, distances: Array) -> tuple[float, str]:

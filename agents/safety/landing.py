@@ -63,7 +63,7 @@ class Landing:
         if commands is not None and ordered:
             due[commands.land] = True
             self._until[commands.land] = t + PATIENCE_S
-        lost = neighbours.poses.lost_since < np.inf
+        lost = neighbours.poses.silent
         place = neighbours.extrapolate_all(self._assignment.predictor, t)
         able = due & self._flies & state.flying & ~where.invalid & ~where.outside_wall & (t <= self._until)
         able &= (state.position[:, 2] > LOW) & (not now.health.loop_failing)

@@ -134,6 +134,17 @@ def test_who_is_gone_is_in_the_way_where_it_was_heard_last():
         assert len(placed(sight, 9.0, now, told)) == 1
 
 
+def test_restarted_robot_is_in_the_way_where_it_was():
+    drone, now = pair(CRAZYFLIE, CRAZYFLIE), state([0, 0, 0.1], time=9.0)
+    told = heard([0.5, 0, 1.0], [0.3, 0.0, 0.0], stamp=7.0)
+    assert len(placed(drone, 9.0, now, told)) == 0
+    told.discard(np.array([0]))  # its new process has claimed the name, and has sent no pose
+    _, near = drone.sense(9.0, now, told)
+    np.testing.assert_array_equal(near.position, [[0.5, 0.0]])
+    assert near.low[0] == 0.0, "it may have come down"
+    assert not near.velocity.any()
+
+
 def test_who_sinks_is_in_the_way_wherever_it_soon_is():
     sight, now = pair(TURTLEBOT3, CRAZYFLIE), state([0, 0, 0], time=9.0)
     hovers, sinks, old = (heard([0.1, 0, 0.9], (0, 0, v), stamp) for v, stamp in ((-0.05, 9), (-0.4, 9), (-0.4, 8)))

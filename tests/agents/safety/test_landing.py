@@ -12,8 +12,9 @@ from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.safety.situation import ProcessHealth, Situation
-from experiments.definition.experiment import Arena, Experiment, Formation, Robot
+from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.definition.plan import Plan
+from tests.agents.few import pair
 from tests.agents.swarm import Swarm
 from tests.agents.things import poses
 
@@ -238,3 +239,34 @@ def test_a_run_ends_beside_and_says_so():
     told = [each.text for each in agent.hazards.incidents if each.cause == Cause.BELOW]
     assert told[0] == "warn: a robot is below it: G; it goes aside first"
     assert swarm.phase("G") == DONE
+
+
+@pytest.mark.parametrize("trigger", ["send-on-delta", "predictive"])
+def test_drone_lands_beside_robot_that_died_moving(trigger):
+    robots = {
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=1.0),
+        "K": Robot(kind="khepera4", start=[-0.4, 0.0]),
+    }
+    leg = Leg(at_s=0.0, robot="K", plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2})
+    swarm = Swarm(
+        pair(
+            robots=robots,
+            formation=Formation(),
+            trigger={"kind": trigger, "threshold": 0.01},
+            avoidance={"kind": "barrier", "hears": "all"},
+            timeline=[leg],
+        ),
+        [["F"], ["K"]],
+    ).running()
+    drone, dead = swarm.where["F"][0], swarm.where["K"][0]
+    while dead.body.engine.position[0, 0] < -0.02:
+        swarm.step()
+    swarm.groups.remove(dead)
+    swarm.names = ("F",)
+    drone.agent.neighbours.mark_lost(drone.by_speaker["K"], swarm.t)
+    swarm.run(3.0)
+    drone.agent.lifecycle.land(0, "ordered to land")
+    swarm.until(DONE)
+    apart = np.hypot(*(drone.body.engine.position[0, :2] - dead.body.engine.position[0, :2]))
+    radii = drone.assignment.kinds[0].radius + dead.assignment.kinds[0].radius
+    assert apart - radii > NEAR
