@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, PoseTable, every, some
@@ -75,6 +77,7 @@ class NeighbourStates:
         self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
         # (E,) age of poses on arrival [s] where the sender's clock lags, else 0; None: nowhere
         self.clock_lag: Array | None = None
+        self.refused: dict[int, str] = {}  # links of which all poses are refused, and why
         self._all, self._avoidance_only, self._silence_s = links, avoidance_only, silence_s
         self._present: Mask = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._in_law = self._available = np.zeros(len(links), dtype=bool)
@@ -102,6 +105,11 @@ class NeighbourStates:
         age = np.zeros(len(self._all)) if self.clock_lag is None else self.clock_lag
         age[at] = lag
         self.clock_lag = age if age.any() else None
+
+    def mark_refused(self, at: Collection[int], reason: str) -> None:
+        """All poses on links `at` are refused for a `reason`; empty: they are not, or no longer."""
+        refused = {link: why for link, why in self.refused.items() if link not in at}
+        self.refused = refused | (dict.fromkeys(at, reason) if reason else {})
 
     @property
     def stamp_once_alive(self) -> Array:

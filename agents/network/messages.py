@@ -141,7 +141,8 @@ class Status(Message, frozen=True):
     # worst present hazard and its outcome: "hold: minimum separation: 0.18 m from CF03 (limit 0.25 m)"
     hazard: str = ""
     incidents: list[Incident] = []  # the last ones, repeated in each status so that a lost status loses none
-    stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one, or of a former process
+    stale: dict[str, int] = {}  # by neighbour, if any: samples older than a known one
+    foreign: dict[str, int] = {}  # by neighbour, if any: samples from another source than its process
 
     def incidents_since(self, before: Status | None) -> list[Incident]:
         """Incidents since an earlier status; all, if that is of another process."""

@@ -19,9 +19,11 @@ from agents.decision.neighbours import NeighbourStates
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
+from agents.runtime.pose_order import News, PoseOrder
 
 LATE_S: Final = 3.0  # longest delay of a pose in a network: Zenoh holds one back for 2 s behind a missing one
 PROOFS: Final = 3  # late poses in succession that prove a slow clock: one may be the last value of a silent robot
+DOUBT_S: Final = 0.5  # time in which all poses of a robot are refused before the robot counts as lost
 
 
 class TokenChange(Enum):
@@ -69,88 +71,82 @@ class NeighbourSubscription:
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
         self.tokens = self._alive.waiting  # queued for `token_changes`, nearly always none
-        self._now = 0.0  # of the last poll (UTC [s])
-        self._seq, self._stamp = 0, 0.0
-        self._life: str | None = None  # session of the robot's process, as far as it is known
-        self._past: set[str] = set()
-        self._owned = False  # the token of that session is there: no other session is the robot
-        self._vanished = False
+        self._order = PoseOrder()
+        self.alive: bool | None = None  # its plain token stands; None: never seen
         self._received_at = -inf  # last new pose (UTC [s])
         self._old, self._old_at = 0, 0.0  # how often in succession poses were old on arrival, and when last
         self.lost = 0  # poses; counted by the caller, which knows from when on they matter
-        self.stale = 0  # poses that were dropped: older than a known one, or of a former session
+        self.stale = 0  # poses that were dropped: older than a known one
+        self.foreign = 0  # poses that were dropped: from another source than the robot's process
+        self.doubt = ""  # reason of the last refusal while all poses of the robot are refused; else empty
+        self._refused, self._refusals, self._refused_since = 0, 0, 0.0
         # [s] age of the last pose on arrival if the clock of the robot is behind: the last poses were older than the
         # longest delay of a network; else 0
         self.behind = 0.0
 
     @property
     def malformed(self) -> int:
-        return self._poses.malformed
+        return self._poses.malformed + self._refused
 
     def new_poses(self, now: float) -> Iterable[ReceivedPose]:
-        """Poses received until `now` (UTC [s]), oldest first, without invalid and known ones.
+        """Poses received until `now` (UTC [s]), oldest first, without invalid, foreign and known ones.
 
         A new session of the robot resets the order of poses, as does a clock that was set back in one session.
         """
-        self._now = now
-        received = self._poses.read_samples(self._check)
+        received = self._poses.read_samples()
         return self._newer_poses(received, now) if received else ()
-
-    def _check(self, pose: messages.Pose) -> None:
-        validation.check_pose(pose, now=self._now, reach=self._reach)
 
     def _newer_poses(
         self, received: Iterable[tuple[messages.Pose, zenoh.Sample]], now: float
     ) -> Iterator[ReceivedPose]:
         before = self._received_at  # poses that waited while this process stood still count as one reception
+        order = self._order
         for pose, sample in received:
-            life, anew = _session_of(sample), False
-            if life != self._life and life is not None:
-                if self._owned or life in self._past:
-                    self.stale += 1
-                    continue
-                anew = self._note_session(life)
-            if pose.stamp <= self._stamp:
-                if pose.seq <= self._seq:
-                    self.stale += pose.stamp < self._stamp  # equal: repeated after a reconnection
-                    continue
-                self._seq, self._stamp, anew = 0, 0.0, True  # its clock was set back
-            age, since, missed = now - pose.stamp, pose.stamp - self._stamp, 0
+            session = _session_of(sample)
+            if order.is_foreign(session):
+                self.foreign += 1
+                continue
+            try:
+                validation.check_pose(pose, now=now, reach=self._reach)
+            except messages.Malformed as error:
+                self._note_refusal(now, str(error))
+                continue
+            seq, stamp = order.seq, order.stamp
+            news = order.compare(session, pose.seq, pose.stamp)
+            if news in (News.OLD, News.REPEATED):
+                self.stale += news is News.OLD
+                continue
+            age, missed = now - pose.stamp, 0
             if age > LATE_S or self._old:
                 self._detect_lag(now, age)
-            if self._seq and pose.seq != self._seq + 1:
-                missed = validation.missed(self._seq, pose.seq, since, self._rate)
-            self._seq, self._stamp = pose.seq, pose.stamp
+            if news is News.NEXT and seq and pose.seq != seq + 1:
+                missed = validation.missed(seq, pose.seq, pose.stamp - stamp, self._rate)
             # A clock that is behind: a predictor must not extrapolate over that time. A pose from before the last
             # reception, too late for a network, proves it at once; the first pose ever may be that of a silent robot.
             slow = self.behind or (pose.stamp < before and age > LATE_S)
             measured = now - LATE_S if slow else validation.taken(pose.stamp, now)
-            self._received_at = now
-            yield ReceivedPose(pose, len(sample.payload), missed, measured, anew)
+            self._received_at, self._refusals, self.doubt = now, 0, ""
+            yield ReceivedPose(pose, len(sample.payload), missed, measured, news is News.ANEW)
+
+    def _note_refusal(self, now: float, reason: str) -> None:
+        """Counts a refused pose of the robot; after several in succession, for long, the robot is in doubt."""
+        self._refused += 1
+        self._refusals += 1
+        if self._refusals == 1:
+            self._refused_since = now
+        if self._refusals >= PROOFS and now - self._refused_since > DOUBT_S:
+            self.doubt = reason
 
     def token_changes(self) -> Iterator[TokenChange]:
         """Changes of the liveliness of the robot, oldest first."""
         for token, there in self._alive.changes():
             if token == self._token:
-                if there and self._vanished and self._life is None and self._stamp:  # no token names its session
-                    self._seq, self._stamp = 0, 0.0
+                if there and self.alive is False and self._order.return_token():
                     yield TokenChange.NEW_SESSION
-                self._vanished = not there
+                self.alive, self._refusals, self.doubt = there, 0, ""
                 yield TokenChange.APPEARED if there else TokenChange.VANISHED
-            elif (life := Keys.life_of(token)) is not None and life not in self._past:
-                if there and self._note_session(life):
-                    yield TokenChange.NEW_SESSION
-                self._owned = there if life == self._life else self._owned
-
-    def _note_session(self, life: str) -> bool:
-        """Stores the session of the robot's process; returns whether it follows another one."""
-        if life == self._life:
-            return False
-        before, self._life = self._life, life
-        if before is not None:
-            self._past.add(before)
-            self._seq, self._stamp = 0, 0.0
-        return before is not None
+            elif (session := Keys.life_of(token)) is not None and self._order.note_life(session, there=there):
+                yield TokenChange.NEW_SESSION
 
     def _detect_lag(self, now: float, age: float) -> None:
         """Detects a clock that is behind, from the `age` [s] of poses on arrival."""
@@ -198,6 +194,7 @@ class ModelledInbox:
         self.dropped: Index = self._channel.dropped  # (E,) samples that the channel dropped
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
         self.changed = False  # a sender appeared or vanished since the caller reset this
+        self._doubted = [False] * len(self.senders)
 
     @property
     def malformed(self) -> int:
@@ -229,6 +226,7 @@ class ModelledInbox:
                     self._begin(sender)
                     arrived = [(link, before) for link, before in arrived if link not in sender.links]
                 arrived += [(link, received) for link in sender.numbers]
+        self._follow_doubts(t)
         if arrived:
             poses = _table(arrived, t, utc)
             if self._channel.ideal:
@@ -238,6 +236,17 @@ class ModelledInbox:
                 one = poses.take(np.array([at]))
                 self._channel.send(one, start=begun[one.link], now=t)
         return self._channel.due(t)
+
+    def _follow_doubts(self, t: float) -> None:
+        """A sender of which no pose can be believed is lost, although its token stands."""
+        if (doubted := [bool(sender.doubt) for sender in self.senders]) == self._doubted:
+            return
+        for sender, doubt, before in zip(self.senders, doubted, self._doubted, strict=True):
+            if doubt and not before:
+                self._states.mark_lost(sender.links, t)
+            elif before and not doubt and sender.alive:
+                self._states.mark_alive(sender.links)
+        self._doubted, self.changed = doubted, True
 
     def _begin(self, sender: NeighbourSubscription) -> None:
         """Forgets a sender that has a new session."""
@@ -289,15 +298,16 @@ class PoseInbox(ModelledInbox):
         # (n) newest received poses of each row, for telemetry, which empties them
         self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
         self.received = [0] * len(agent.assignment.names)  # (n) received poses of each row
-        self._behind = [0.0] * len(self.senders)
+        self._marks = [(0.0, "")] * len(self.senders)
 
     def deliver(self, t: float, utc: float) -> None:
         """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the agent and to telemetry."""
         got = self.receive(t, utc, self._start, self._assignment.names)
-        if (behind := [sender.behind for sender in self.senders]) != self._behind:
-            self._behind = behind
+        if (marks := [(sender.behind, sender.doubt) for sender in self.senders]) != self._marks:
+            self._marks = marks
             for sender in self.senders:
                 self._neighbours.mark_clock_lag(sender.links, sender.behind)
+                self._neighbours.mark_refused(sender.numbers, sender.doubt)
         if got is None:
             return
         assert got.extra is not None  # the recorded pose keeps its own stamp

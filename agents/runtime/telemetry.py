@@ -171,6 +171,7 @@ class Telemetry:
                 lost={sender.name: sender.lost for sender in mine},
                 dropped=self._dropped_of(row),
                 stale={sender.name: sender.stale for sender in mine if sender.stale},
+                foreign={sender.name: sender.foreign for sender in mine if sender.foreign},
                 malformed=self._malformed() + self._neighbours.malformed,
                 refused=counts.refused,
                 ticks=counts.ticks,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from math import asin, degrees, hypot, sin
@@ -156,6 +156,8 @@ class Detector:
             found.append(self._lost_neighbours(now, rows))
         if neighbours.clock_lag is not None:
             found.append(self._lagging(neighbours, neighbours.clock_lag))
+        if neighbours.refused:
+            found.append(self._refused_poses(neighbours.refused))
         if health.just_resumed(now.t):
             found.append(self._not_refreshed(now, rows))
         if health.troubled:
@@ -283,6 +285,17 @@ class Detector:
             )
 
         yield Observation(Cause.BEHIND, self._receivers(late), names)
+
+    def _refused_poses(self, refused: Mapping[int, str]) -> Iterator[Observation]:
+        links, robots = self._assignment.links, self._assignment.robots
+        there = np.zeros(len(links), dtype=bool)
+        there[list(refused)] = True
+
+        def reasons(row: int) -> str:
+            mine = np.flatnonzero(there & (links.receiver == row)).tolist()
+            return ", ".join(f"{robots[links.sender[link]]}: {refused[link]}" for link in mine)
+
+        yield Observation(Cause.REFUSED, self._receivers(there), reasons)
 
     def _surroundings(self, t: float, health: ProcessHealth) -> Iterator[Observation]:
         """Router, conductor and control loop."""

@@ -90,6 +90,7 @@ class Cause(IntEnum):
     SINKING = Rule("it comes down by itself", Outcome.LAND, after_s=0.1)
     CLOCK = Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5)  # not one late sample
     BEHIND = Rule("a neighbour's clock is behind", Outcome.WARN)
+    REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
     STANDSTILL = Rule("its process stood still", Outcome.HOLD)
     STILL = Rule("it is told to move and does not", Outcome.WARN)
     STRAYING = Rule("it moves and is not told to", Outcome.LAND)

@@ -132,7 +132,7 @@ def test_a_neighbour_that_is_restarted_is_heard_at_once_whatever_its_clock_says(
     robot.pose(100, 0.4, session="one")  # held back by the network since the first life
     robot.after()
     assert robot.x == -0.4
-    assert robot.sender.stale == 1
+    assert robot.sender.foreign == 1
 
 
 def test_a_neighbour_that_was_cut_off_is_believed_where_it_was(robot):
@@ -172,15 +172,170 @@ def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
     robot.token("one")
     robot.pose(1, 0.4, session="one")
     robot.after()
-    robot.pose(9, 3.0, session="other")
+    for source in ("other", None):  # another process, or a tool that puts old poses again
+        robot.pose(9, 3.0, session=source)
+        robot.pose(10, 3.0, session=source, age=100.0)
+        robot.after()
+    assert (robot.x, robot.sender.foreign) == (0.4, 4)
+
+
+def test_superseded_session_is_heard_again(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one")
     robot.after()
-    assert (robot.x, robot.sender.stale) == (0.4, 1)
+    robot.token("one", gone=True)  # it stands still
+    robot.after(2.0)
+    robot.token("two")  # a second process of its name comes,
+    robot.pose(1, 0.9, session="two")
+    robot.after()
+    assert robot.x == 0.9
+    robot.token("two", gone=True)  # and goes
+    robot.after(2.0)
+    robot.token("one")
+    robot.pose(8, 0.5, session="one")
+    robot.after()
+    assert (robot.live, robot.x, robot.sender.foreign) == (True, 0.5, 0)
+    robot.pose(2, 0.9, session="two")  # held back by the network
+    robot.after()
+    assert (robot.x, robot.sender.foreign) == (0.5, 1)
+
+
+@pytest.mark.parametrize("first", ["owner", "loser"])
+def test_of_two_claims_the_one_that_stays_is_heard(robot, first):
+    second = {"owner": "loser", "loser": "owner"}[first]
+    for session in (first, second):
+        robot.tell(Keys.life(KEYS.alive("B"), session))
+    robot.after()
+    robot.tell(Keys.life(KEYS.alive("B"), "loser"), gone=True)
+    robot.tell(KEYS.alive("B"))
+    robot.pose(1, 0.4, session="owner")
+    robot.after()
+    assert (robot.live, robot.x, robot.sender.foreign) == (True, 0.4, 0)
+
+
+def test_session_that_returns_does_not_displace_the_present_one(robot):
+    robot.token("two")
+    robot.pose(1, 0.4, session="two")
+    robot.after()
+    robot.tell(Keys.life(KEYS.alive("B"), "one"))  # it was cut off, and will give way
+    robot.pose(900, 0.9, session="one")
+    robot.pose(2, 0.5, session="two")
+    robot.after()
+    assert (robot.x, robot.sender.foreign) == (0.5, 1)
+
+
+def test_restarted_robot_keeps_its_place_and_leaves_the_law(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one", speed=0.3)
+    robot.after()
+    robot.token("one", gone=True)
+    robot.after(5.0)
+    robot.tell(Keys.life(KEYS.alive("B"), "two"))  # its body is opened, which takes a minute, or fails
+    robot.after(60.0)
+    robot.after()
+    assert not robot.live
+    assert robot.agent.missing_neighbours(0) == ["B"]
+    assert (robot.x, believed_of_all(robot)) == (0.4, 0.4)
+    assert robot.agent.neighbours.poses.silent.all()
+    robot.tell(KEYS.alive("B"))
+    robot.after()
+    assert (robot.live, robot.x) == (False, 0.4)
+    robot.pose(1, -0.2, session="two")
+    robot.after()
+    assert (robot.live, robot.x) == (True, -0.2)
+    assert not robot.agent.neighbours.poses.silent.any()
+
+
+def believed_of_all(robot: Robot) -> float:
+    return float(robot.agent.neighbours.extrapolate_all(ConstantVelocity(), robot.t)[0, 0])
+
+
+@pytest.mark.parametrize("source", [None, "storage"])
+def test_stored_pose_before_the_first_token_is_void(robot, source):
+    robot.pose(5000, 0.9, session=source, age=600.0)  # the answer of a storage to the first query
+    robot.after()
+    robot.token("one")
+    robot.after()
+    assert not robot.live
+    assert robot.agent.missing_neighbours(0) == ["B"]
+    robot.pose(1, 0.4, session="one")
+    robot.after()
+    assert (robot.live, robot.x, robot.sender.lost) == (True, 0.4, 0)
+
+
+def test_cached_pose_of_the_session_is_kept(robot):
+    robot.pose(7, 0.4, session="one", age=20.0)  # the answer of its own cache, before the token
+    robot.token("one")
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.4)
+
+
+def test_after_reconnection_tokens_may_come_in_any_order(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one")
+    robot.after()
+    robot.token("one", gone=True)
+    robot.after()
+    robot.tell(KEYS.alive("B"))
+    robot.pose(9000, 0.9, session=None, age=100.0)
+    robot.after()
+    robot.tell(Keys.life(KEYS.alive("B"), "one"))
+    robot.pose(8, 0.5, session="one")
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.5)
+
+
+def test_new_process_is_heard_although_its_token_comes_later(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one")
+    robot.after()
+    robot.token("one", gone=True)  # the router dies; meanwhile B is restarted
+    robot.after(3.0)
+    robot.pose(1, 0.6, session="two")
+    robot.after()
+    robot.token("two")
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.6)
+
+
+def test_robot_of_another_make_may_take_the_name(robot):
+    robot.token("one")
+    robot.pose(7, 0.4, session="one")
+    robot.after()
+    robot.token("one", gone=True)
+    robot.after(3.0)
+    robot.token(None)
+    robot.pose(1, 0.6, session=None)
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.6)
+
+
+@pytest.mark.parametrize("sends", [True, False])
+def test_neighbour_whose_poses_are_all_refused_is_lost(robot, sends):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one")
+    robot.after()
+    for seq in range(2, 72):
+        if sends:
+            robot.pose(seq, 0.4, session="one", age=-8.0)  # this process, or that one, has a wrong clock
+        robot.pose(seq, 0.4, session="other", age=-8.0)  # which says nothing about B
+        robot.after()
+    assert (robot.agent.missing_neighbours(0) == ["B"]) == sends
+    assert [text.split(": ")[:2] for text in hazards(robot)] == ([["REFUSED", "B"]] if sends else [])
+    assert robot.neighbours.malformed == 70 * sends
+    robot.pose(90, 0.4, session="one")
+    robot.after()
+    robot.after()
+    assert robot.live
+    assert robot.agent.missing_neighbours(0) == []
+    assert hazards(robot) == []
 
 
 def hazards(robot: Robot) -> list[str]:
     agent = robot.agent
-    lag = agent.neighbours.clock_lag
+    lag, refused = agent.neighbours.clock_lag, agent.neighbours.refused
     seen = [] if lag is None else list(agent._detector._lagging(agent.neighbours, lag))
+    seen += list(agent._detector._refused_poses(refused)) if refused else []
     return [f"{each.cause.name}: {each.detail(0)}" for each in seen if each.rows[0]]
 
 
