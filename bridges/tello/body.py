@@ -1,31 +1,26 @@
 """Body of several DJI Tellos through djitellopy: velocity commands, external positions.
 
-Of the library only sockets, parser and non-blocking sends are used (reasons in `bridges.tello.pilot`); one thread runs
-the pilots of all drones.
+Of the library only its parser and its non-blocking sends are used (reasons in `bridges.tello.library` and `.pilot`); one
+thread runs the pilots of all drones.
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import logging
 import math
-import socket
-import sys
 import threading
 import time
-import types
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import FRESH_S, TROUBLE, BodyError, BodyRequest, BodyState, call_all, settings
+from agents.body.interface import FRESH_S, BodyError, BodyRequest, BodyState, call_all, settings
 from agents.protocols import tello as protocol
-from bridges.tello.pilot import Duty, TelloPilot, Vendor
+from bridges.tello.library import TelloLibrary
+from bridges.tello.pilot import Duty, TelloPilot
 
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
 
@@ -49,6 +44,7 @@ class TelloBody:
         self._start_yaw = request.yaw
         self._external = External(rows)
         self._rows = np.arange(rows)
+        self._library: TelloLibrary | None = None
         self._pilots: list[TelloPilot] = []
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -59,16 +55,16 @@ class TelloBody:
         """See `Body.open`. Drones without answer are retried while the others fly."""
         self._claims.take()
         try:
-            make = _load_library()
+            library = self._library = TelloLibrary()
         except BodyError:
             self._claims.release()
             raise
         self._pilots = [
-            TelloPilot(make(*place), kind, chosen)
+            TelloPilot(library.drone(*place), kind, chosen)
             for place, kind, chosen in zip(self._endpoints, self._kinds, self._settings, strict=True)
         ]
         self._ending.clear()
-        self._thread = threading.Thread(target=self._run, name="tello pilots", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(library,), name="tello pilots", daemon=True)
         self._thread.start()
         deadline = time.monotonic() + OPEN_S
         while time.monotonic() < deadline and any(pilot.state_received == -math.inf for pilot in self._pilots):
@@ -146,56 +142,19 @@ class TelloBody:
         try:
             call_all(pilot.leave for pilot in pilots)
         finally:
+            if self._library is not None:
+                self._library.close()
+                self._library = None
             self._claims.release()
 
-    def _run(self) -> None:
+    def _run(self, library: TelloLibrary) -> None:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)
         while not self._ending.wait(period):  # not by `Ticks`: a stop needs the lock, and gets it in this pause
             with self._lock:
+                library.receive()
                 now = time.monotonic()
                 for pilot in self._pilots:
                     try:
                         pilot.step(now, self._last_read)
-                    except TROUBLE as error:  # the others fly on
-                        pilot.trouble = f"cannot be driven: {type(error).__name__}: {error}"
-
-
-class _TelloFactory(Protocol):
-    def __call__(self, host: str, port: int, /) -> Vendor: ...
-
-
-def _load_library() -> _TelloFactory:
-    """Import and prepare djitellopy; returns the function that creates a drone for an address."""
-    if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-        sys.modules["av"] = types.ModuleType("av")  # only needed by the library's video, which is not used
-    try:
-        library = importlib.import_module("djitellopy.tello")
-    except ModuleNotFoundError as error:
-        raise BodyError(
-            f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "
-            "pip install -e '.[tello]'"
-        ) from error
-    library.Tello.LOGGER.setLevel(logging.ERROR)  # else it logs every command
-    if not library.threads_initialized:
-        for port in (protocol.CONTROL_PORT, protocol.STATE_PORT):
-            _check_free(port)
-
-    def make(host: str, port: int) -> Vendor:
-        drone = library.Tello(host=host, retry_count=1)
-        drone.address = (host, port)  # the library itself supports only the default ports
-        vendor: Vendor = drone
-        return vendor
-
-    return make
-
-
-def _check_free(port: int) -> None:
-    """Raise an error if a port is taken: the library binds its ports in threads, which then die without a message."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", port))
-        except OSError as error:
-            raise BodyError(
-                f"UDP port {port} of this computer is taken ({error.strerror}): another program flies Tellos; end it, "
-                "or give all Tellos the same `process`"
-            ) from error
+                    except Exception as error:  # noqa: BLE001 - of any kind: the others fly on
+                        pilot.fail(error)

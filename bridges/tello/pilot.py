@@ -1,7 +1,8 @@
 """Control of one DJI Tello: current duty, commands sent, state received.
 
 djitellopy's blocking calls are not used: they wait seconds for an answer, take a late answer for that of the next
-command, and repeat relative moves. A pilot sends without waiting, and repeats commands without an answer.
+command, and repeat relative moves. A pilot sends without waiting, and repeats commands without an answer. A refused
+`land` is repeated too: only the state of a drone, or an `ok` near the floor, shows that it has landed.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ UNREAD_S: Final = 2.0  # drones land when their process has not read the state f
 ON_GROUND_S: Final = 3.0  # low for this long, motors not running: on the ground
 LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
 LOW: Final = 30  # [cm] the reported height is rounded and drifts
+UNORDERED: Final = 3  # seconds on the motors' clock of a high drone that rests: it flies without an order
+REFUSALS: Final = 3  # answers in a row that refuse the sticks: the note says so
+REFUSED_S: Final = 1.0  # for so long after the last of them
 
 ZERO_STICKS: Final = (0, 0, 0, 0)
 
@@ -35,7 +39,6 @@ ZERO_STICKS: Final = (0, 0, 0, 0)
 class Vendor(Protocol):
     """The part of `djitellopy.Tello` that is used."""
 
-    def send_rc_control(self, right: int, forward: int, up: int, clockwise: int, /) -> None: ...
     def send_command_without_return(self, command: str, /) -> None: ...
     def get_current_state(self) -> dict[str, Any]: ...
     def get_own_udp_object(self) -> dict[str, Any]: ...
@@ -73,7 +76,9 @@ class TelloPilot:
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
         self._running = self._aloft = -math.inf  # when the motors' clock last moved, when it was last not low
-        self._began_at = self._sent_at = self._cut_at = self._up_at = -math.inf
+        self._began_at = self._sent_at = self._cut_at = self._up_at = self._ordered_up_at = -math.inf
+        self._rested = 0  # seconds on the motors' clock since the drone rests
+        self._refusals, self._refused_at, self._refusal = 0, -math.inf, ""  # of the sticks: number, last time, answer
         self._send_error = ""
 
     @property
@@ -95,7 +100,12 @@ class TelloPilot:
             if self.silent(now)
             else ""
         )
-        return "; ".join(part for part in (unanswered, self._send_error, silence, self.trouble) if part)
+        refused = (
+            f"refuses the sticks, {self._refusals} times: {self._refusal!r}"
+            if self._refusals >= REFUSALS and now - self._refused_at < REFUSED_S
+            else ""
+        )
+        return "; ".join(part for part in (unanswered, self._send_error, silence, refused, self.trouble) if part)
 
     # ------------------------------------------------------------------ orders
 
@@ -112,6 +122,7 @@ class TelloPilot:
         else:
             self.hold_position = (self.position[0], self.position[1], height)
             self.trouble = ""
+            self._refusals = 0
             self._begin(Duty.RISE, "takeoff", now)
 
     def land(self, now: float, reason: str = "") -> None:
@@ -128,6 +139,12 @@ class TelloPilot:
         self.duty = Duty.CUT
         self._send_and_await("emergency", now)
 
+    def fail(self, error: Exception) -> None:
+        """Note the error of a failed step; a drone in the air is landed from the next step on."""
+        self.trouble = f"cannot be driven: {type(error).__name__}: {error}"
+        if self.duty in (Duty.RISE, Duty.HOLD, Duty.FLY):
+            self.duty, self._sent_at = Duty.LAND, -math.inf
+
     def leave(self) -> None:
         """End the pilot: land or stop a drone in the air, and release the library's object."""
         last = "emergency" if self.duty is Duty.CUT else "land" if self.flying else ""
@@ -142,22 +159,31 @@ class TelloPilot:
 
     def step(self, now: float, last_read: float) -> None:
         """Process received state and answers, send due commands; `last_read`: the process's last read of the state."""
-        self._receive(now)
+        try:
+            self._receive(now)
+        finally:
+            self._act(now, last_read)
+
+    def _act(self, now: float, last_read: float) -> None:
+        """Send due commands."""
         if self.duty is Duty.REST:
             if self.silent(now) and now - self._sent_at >= SDK_RETRY_S:
                 self._send_and_await("command", now)
+            elif self._rested >= UNORDERED and self._height >= LOW:
+                self.trouble = "landing: it flew without an order"
+                self._begin(Duty.LAND, "land", now)
         elif now - self.state_received > LANDED_ALONE_S:
-            self.duty, self.trouble = Duty.REST, "silent: must have landed by itself"
+            self._rest("silent: must have landed by itself")
         elif self.duty is Duty.CUT:
             if self._motors_stopped():
-                self.duty = Duty.REST
+                self._rest(self.trouble)
             else:
                 self._send("emergency")
         elif self.duty is Duty.RISE:
             self._take_off(now, last_read)
         elif self.duty is Duty.LAND:
             if self._on_ground(now):  # the answer was lost
-                self.duty = Duty.REST
+                self._rest(self.trouble)
             elif now - self._sent_at >= LAND_RETRY_S:
                 self._send_and_await("land", now)
         else:
@@ -172,8 +198,11 @@ class TelloPilot:
         return self.state_received - max(ran, self._cut_at) > MOTORS_STOPPED_S
 
     def _on_ground(self, now: float) -> bool:
-        """Whether the drone's state proves that it is on the ground."""
-        return not self.silent(now) and now - max(self._aloft, self._running) > ON_GROUND_S
+        """Whether the drone's state proves that it is on the ground, and has not begun a take-off."""
+        return not self.silent(now) and now - max(self._aloft, self._running, self._ordered_up_at) > ON_GROUND_S
+
+    def _rest(self, trouble: str) -> None:
+        self.duty, self.trouble, self._rested = Duty.REST, trouble, 0
 
     def _send_sticks(self, now: float, last_read: float) -> None:
         if now - last_read > UNREAD_S:
@@ -181,15 +210,11 @@ class TelloPilot:
         elif self.battery < self._settings.low_battery:
             self.land(now, f"landing: battery at {self.battery:.0%}")
         elif self._on_ground(now):
-            self.duty, self.trouble = Duty.REST, f"landed by itself, battery at {self.battery:.0%}"
+            self._rest(f"landed by itself, battery at {self.battery:.0%}")
         else:
-            sticks = self._sticks(now, last_read)
-            if self._clock() - now > FRESH_S:  # the process stood still meanwhile
-                return
-            try:
-                self._drone.send_rc_control(*sticks)
-            except OSError as error:
-                self._send_error = f"cannot send: {error.strerror}"
+            right, forward, up, clockwise = self._sticks(now, last_read)
+            if self._clock() - now <= FRESH_S:  # else the process stood still meanwhile
+                self._send(f"rc {right} {forward} {up} {clockwise}")
 
     def _land_unattended(self, now: float) -> None:
         self.land(now, f"landing: its process did nothing for {UNREAD_S:.0f} s")
@@ -248,6 +273,7 @@ class TelloPilot:
             if height >= LOW:
                 self._aloft = now
         if isinstance(motors, int) and motors != self._motors:
+            self._rested += self._motors >= 0
             self._motors, self._running = motors, now
 
     def _process_answer(self, answer: str, now: float) -> None:
@@ -259,9 +285,12 @@ class TelloPilot:
             ):
                 self._airborne(now)  # a drone in the air refuses the second of two commands
             elif refused:
-                self.duty, self.trouble = Duty.REST, f"refuses to take off: {answer!r}, battery at {self.battery:.0%}"
-        elif self.duty is Duty.LAND and (answer == "ok" or refused) and self._height < LOW:
-            self.duty = Duty.REST
+                self._rest(f"refuses to take off: {answer!r}, battery at {self.battery:.0%}")
+        elif self.duty is Duty.LAND:
+            if answer == "ok" and self._height < LOW and now - self._ordered_up_at > ON_GROUND_S:
+                self._rest(self.trouble)
+        elif self.duty in (Duty.HOLD, Duty.FLY) and refused:
+            self._refusals, self._refused_at, self._refusal = self._refusals + 1, now, answer
 
     def _begin(self, duty: Duty, command: str, now: float) -> None:
         self.duty, self._began_at = duty, now
@@ -270,8 +299,10 @@ class TelloPilot:
     def _send_and_await(self, command: str, now: float) -> None:
         """Send a command whose answer is used; discard earlier answers."""
         self._sent_at = now
-        self._drone.get_own_udp_object()["responses"].clear()
+        if command == "takeoff":
+            self._ordered_up_at = now
         self._send(command)
+        self._drone.get_own_udp_object()["responses"].clear()
 
     def _send(self, command: str) -> None:
         try:

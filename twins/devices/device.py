@@ -32,6 +32,7 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     battery: float = 1.0  # charge at the start, 0 to 1
     drain: float = 1.0  # battery drain as a multiple of the maker's figure
     refuse_arming: bool = False
+    refuse_landing_s: float = 0.0  # [s] for which a Tello answers `land` with "error", from the first one
     exchanges_hz: float = 500.0  # [1/s] exchanges of a software radio, 300 to 1000 by dongle and computer
     tumbled_from_s: float | None = None  # [s] begin of lying on its side, as after a collision
     tumbled_for_s: float = 1e9  # [s] until it is put upright

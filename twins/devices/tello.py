@@ -89,6 +89,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         self.motors_s = 0.0
         self.charge = faults.battery
         self.state_due = 0.0
+        self.landing_due = math.inf  # before this time `land` is refused
 
     @property
     def aloft(self) -> bool:
@@ -264,8 +265,9 @@ class TelloDevice:
             self._model.takeoff(rows, np.array([protocol.TAKEOFF_HEIGHT]))
             drone.mode, drone.answer_to, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
             return ""
-        if drone.mode in (Mode.GROUND, Mode.FALL):
-            return "error"
+        drone.landing_due = min(drone.landing_due, drone.t + drone.faults.refuse_landing_s)
+        if drone.mode in (Mode.GROUND, Mode.CLIMB, Mode.FALL) or drone.t < drone.landing_due:
+            return "error"  # busy with its take-off it obeys `emergency` only
         if drone.mode is not Mode.LAND:  # a repeated command changes nothing
             self._model.land(rows)
         drone.mode, drone.answer_to = Mode.LAND, sender

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import UNANSWERED, BodyError, settings
-from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
 from bridges.tello.body import TelloBody
-from bridges.tello.pilot import Duty, TelloPilot
+from bridges.tello.pilot import Duty
+from tests.bridges.tello.cockpit import Cockpit
 from tests.twins.loopback import request
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,62 +36,6 @@ def test_sticks_by_hand():
     assert protocol.sticks((0.0, 0.5, 0.2), np.radians(30.0), 0.0) == (-50, 0, 20, -30)
     assert protocol.sticks((0.0, 0.5, 0.0), 0.0, np.pi / 2) == (0, 50, 0, 0)
     assert protocol.sticks((9.0, 0.0, -9.0), 9.0, 0.0) == (0, 100, -100, -100)
-
-
-class Paper:
-    """A drone that notes what it is told, and says what the test lets it say."""
-
-    def __init__(self):
-        self.said, self.sticks, self.state, self.responses, self.broken = [], [], {}, [], False
-
-    def send_rc_control(self, *sticks):
-        if self.broken:
-            raise OSError(101, "Network is unreachable")
-        self.sticks.append(sticks)
-
-    def send_command_without_return(self, command):
-        if self.broken:
-            raise OSError(101, "Network is unreachable")
-        self.said.append(command)
-
-    def get_current_state(self):
-        return self.state
-
-    def get_own_udp_object(self):
-        return {"responses": self.responses}
-
-    def end(self):
-        self.said.append("(end)")
-
-
-class Cockpit:
-    """A pilot, its paper drone, and a clock."""
-
-    def __init__(self, **chosen):
-        self.drone, self.now = Paper(), 100.0
-        self.pilot = TelloPilot(self.drone, TELLO, protocol.TelloSettings(**chosen), lambda: self.now)
-        self.report = {"bat": 80, "yaw": 20, "h": 0, "time": 0}
-        self.speaks = self.attended = True
-
-    def pass_(self, seconds, **report):
-        self.report.update(report)
-        for _ in range(round(seconds / 0.05)):
-            self.now = round(self.now + 0.05, 6)
-            if self.speaks and round(self.now * 20) % 2 == 0:
-                self.drone.state = dict(self.report)
-            self.pilot.step(self.now, self.now if self.attended else 100.0)
-        return self
-
-    def fly(self):
-        """In the air, at its place, its motors' clock running."""
-        self.pass_(0.2)
-        self.pilot.position = (1.0, 2.0, 0.0)
-        self.pilot.take_off(0.6, self.now)
-        self.pass_(3.0, h=80, time=3)
-        self.drone.responses.append(b"ok")
-        self.pass_(0.05)
-        assert self.pilot.duty is Duty.HOLD
-        return self
 
 
 def test_a_take_off_is_said_once_and_answered_when_it_is_up():
@@ -255,6 +199,7 @@ def test_a_drone_that_never_gets_up_is_landed():
     cockpit.pilot.take_off(0.6, cockpit.now)
     cockpit.pass_(20.2)
     assert cockpit.drone.said[-1] == "land"
+    cockpit.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
     assert not cockpit.pilot.flying
     assert "did not take off in 20 s" in cockpit.pilot.note(cockpit.now)
 

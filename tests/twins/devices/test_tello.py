@@ -114,6 +114,28 @@ def test_take_off_and_landing_are_answered_when_they_are_over(talk):
     assert drone.ask("land") == "error"
 
 
+def test_landing_is_refused_while_it_takes_off(talk):
+    drone = talk()
+    assert drone.ask("command") == "ok"
+    drone.say("takeoff")
+    drone.wait(1.0)
+    assert drone.ask("land") == "error"
+    assert [answer for answer, _ in drone.wait(7.0)] == ["ok"]  # of the take-off
+    assert drone.place()[2] == pytest.approx(0.8, abs=0.01)
+
+
+def test_landing_is_refused_for_some_time(talk):
+    drone = talk(faults={"refuse_landing_s": 2.0})
+    drone.up()
+    assert drone.ask("land") == "error"
+    drone.wait(1.9)
+    assert drone.ask("land") == "error"
+    drone.wait(0.2)
+    assert drone.ask("land") is None
+    assert [answer for answer, _ in drone.wait(8.0)] == ["ok"]
+    assert drone.place()[2] == 0.0
+
+
 def test_sticks_are_velocities_in_its_own_frame_until_they_change(talk):
     drone = talk(yaw=np.pi / 2)  # its nose points along y
     drone.up()
