@@ -112,6 +112,11 @@ def yaw_of(q: Message) -> float:
     return atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
 
 
+def stamp_of(header: Message) -> float:
+    """Time [s] of a std_msgs/Header, on the clock of its sender."""
+    return float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)
+
+
 @cache
 def types(distro: Distro) -> Types:
     """The types of a distribution; cached, since that takes 0.1 s."""

@@ -1,7 +1,11 @@
-"""Body of several TurtleBot3 over Zenoh: zenoh-bridge-ros2dds (`ros2dds://`) or rmw_zenoh (`rmw://`)."""
+"""Body of several TurtleBot3 over Zenoh: zenoh-bridge-ros2dds (`ros2dds://`) or rmw_zenoh (`rmw://`).
+
+A thread sends zeros while the loop sends nothing: it hangs, or waits until the robot's name is its own again.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +26,7 @@ from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
-from bridges.turtlebot3.robot import SILENCE_S, Robot
+from bridges.turtlebot3.robot import REPEAT_S, SILENCE_S, Robot
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
 DIAGNOSIS_S: Final = 0.3  # how long a failing `open` looks for other robots, to name them in the error
@@ -33,7 +37,7 @@ Clock = Callable[[], float]
 
 
 class TurtleBot3:
-    """TurtleBot3 robots; implements `agents.body.interface.Body`. All topics are polled: no threads.
+    """TurtleBot3 robots; implements `agents.body.interface.Body`. All topics are polled.
 
     Args:
         clock: Monotonic [s]; commands from before a suspension of the machine are old by it.
@@ -50,6 +54,8 @@ class TurtleBot3:
         self._external_rows = np.flatnonzero(request.external)
         self._external = External(len(self._robots))
         self._read_at = -np.inf  # [s] the state on which the next command is decided
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
 
     def open(self) -> None:
         """See `Body.open`: returns after the first odometry of every robot."""
@@ -75,6 +81,9 @@ class TurtleBot3:
         except BaseException:
             self._close()
             raise
+        self._ending.clear()
+        self._thread = threading.Thread(target=self._stop_stale, name="turtlebot3 zeros", daemon=True)
+        self._thread.start()
 
     def _session(self, robot: Robot, deadline: float) -> zenoh.Session:
         if robot.endpoints not in self._sessions:
@@ -193,7 +202,22 @@ class TurtleBot3:
         finally:
             self._close()
 
+    def _stop_stale(self) -> None:
+        """Send zeros to robots whose last command is stale, as `command` does while the loop runs."""
+        while not self._ending.wait(REPEAT_S):
+            now = self._clock()
+            for robot in self._robots:
+                try:
+                    if robot.stale(now):
+                        robot.send_command(now)
+                except Exception:  # noqa: BLE001 - of any kind: the others are stopped; the loop meets it as well
+                    continue
+
     def _close(self) -> None:
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
         for session in self._sessions.values():
             leave(session, self)
         self._sessions.clear()

@@ -1,7 +1,7 @@
 """One TurtleBot3: odometry becomes a pose in the arena, velocity commands are repeated.
 
 The robot has no watchdog for this connection: the OpenCR board stops the wheels when the ROS node on the robot is
-silent, not when we are. So every end sends zeros on cmd_vel, and every command is repeated.
+silent, not when we are. So every end sends zeros on cmd_vel, and every command is repeated until it is stale.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant
+from bridges.turtlebot3.stamp_age import StampAge
 
 SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets zeros
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
@@ -51,12 +52,14 @@ class Robot:
         self.scan: RangeScan | None = None  # the newest
         self.odometry_received = -np.inf  # time of the last odometry, monotonic [s]
         self.time = -np.inf  # time of measurement of the pose, on the clock of `Body.read` [s]
+        self.age = 0.0  # of the last odometry when it arrived, by its stamp [s]
         x, y, _ = request.start[row].tolist()
         self._start = (x, y, float(request.yaw[row]))
         self._top = (kind.speed, kind.turn_rate)
         self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame
         self._frame: Planar | None = None  # origin of odometry in the arena
         self._restarted = False
+        self._odometry_age, self._scan_age = StampAge(), StampAge()
         self._twist = self._sent_twist = (0.0, 0.0)
         self._commanded = self._sent_at = self._still_since = -np.inf
         self._halted_since = np.inf  # monotonic [s]; infinity while the robot may move
@@ -94,9 +97,10 @@ class Robot:
         """Process received messages at `t` on the clock of `Body.read` and `now` on the monotonic clock [s]."""
         for message in self._odometry.received():
             if self._integrate(message, now):
-                self.odometry_received, self.time = now, t
+                self.age = self._odometry_age.age(now, ros2.stamp_of(message.header))
+                self.odometry_received, self.time = now, t - self.age
         if (scan := self._scan.newest()) is not None:
-            self.scan = ranges(scan, t)
+            self.scan = ranges(scan, t - self._scan_age.age(now, ros2.stamp_of(scan.header)))
         if (battery := self._battery.newest()) is not None:
             self.battery = turtlebot3.charge(battery.voltage, battery.percentage)
             self.volts = float(battery.voltage)
@@ -156,6 +160,10 @@ class Robot:
             self._halted_since = np.inf
         self._set_twist((turtlebot3.whole(v, self._top[0]), turtlebot3.whole(w, self._top[1])), now)
 
+    def stale(self, now: float) -> bool:
+        """Whether the last command is too old to be driven by."""
+        return now - self._commanded > FRESH_S
+
     def halt(self, now: float) -> None:
         """Stop the robot: send zeros at once and repeat them."""
         self._halted_since = min(self._halted_since, now)
@@ -174,7 +182,7 @@ class Robot:
 
     def send_command(self, now: float) -> None:
         """Send the current command, if due."""
-        if self._twist != (0.0, 0.0) and (now - self._commanded > FRESH_S or now - self.odometry_received > SILENCE_S):
+        if self._twist != (0.0, 0.0) and (self.stale(now) or now - self.odometry_received > SILENCE_S):
             self._set_twist((0.0, 0.0), now)
         twist = self._twist
         moving = twist != (0.0, 0.0)
@@ -206,6 +214,8 @@ class Robot:
                 if self.odometry_received > -np.inf
                 else "no odometry"
             )
+        if self.age > SILENCE_S:
+            return f"odometry is {self.age:.1f} s old by its stamps: its link holds it back, or its clock was set"
         mine = (self._command_type, self._types.hash(self._command_type) if self.address.style == "rmw" else "")
         types = set(self._command_receivers.values())
         if types and mine not in types:
@@ -242,8 +252,14 @@ def _frame(arena: Planar, pose: Planar) -> Planar:
 
 
 def ranges(scan: Message, t: float) -> RangeScan:
-    """A LaserScan received at `t` [s]; rays without a hit inside the sensor's range are NaN."""
+    """A LaserScan taken at `t` [s]; rays without a hit inside the sensor's range, or without a bearing, are NaN."""
     distance = scan.ranges.astype(float)
-    valid = (distance >= scan.range_min) & (distance <= scan.range_max)
     bearing = scan.angle_min + scan.angle_increment * np.arange(len(distance))
-    return RangeScan(t, bearing, np.zeros(len(distance)), np.where(valid, distance, nan))
+    valid = (distance >= scan.range_min) & (distance <= scan.range_max) & (distance > 0.0)
+    valid &= np.isfinite(distance) & np.isfinite(bearing)
+    return RangeScan(
+        t,
+        np.nan_to_num(bearing, nan=0.0, posinf=0.0, neginf=0.0),
+        np.zeros(len(distance)),
+        np.where(valid, distance, nan),
+    )

@@ -27,7 +27,8 @@ from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3 import body as bridge
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
 from bridges.turtlebot3.robot import Robot, ranges
-from tests.bridges.turtlebots import Stage, clock, request
+from bridges.turtlebot3.stamp_age import StampAge
+from tests.bridges.turtlebots import FastClock, Stage, clock, request
 from tests.conftest import RouterProcess
 from tests.waiting import until
 from twins.devices.device import Faults
@@ -133,6 +134,35 @@ def test_rays_that_saw_nothing_are_nan():
     np.testing.assert_allclose(found.distance, [1.0, np.nan, np.nan, np.nan, 3.5, np.nan, np.nan])
 
 
+@pytest.mark.parametrize(
+    ("first", "increment", "farthest", "seen"),
+    [(-0.5, 0.1, np.inf, 1.0), (-0.5, np.nan, 3.5, np.nan), (np.inf, 0.1, 3.5, np.nan), (-0.5, 0.1, np.nan, np.nan)],
+)
+def test_rays_are_finite_or_nothing(first, increment, farthest, seen):
+    scan = SimpleNamespace(
+        angle_min=first, angle_increment=increment, range_min=0.0, range_max=farthest,
+        ranges=np.array([0.0, 1.0, np.inf, -np.inf], np.float32),
+    )  # fmt: skip
+    found = ranges(scan, 7.0)
+    assert np.isfinite(found.bearing).all()
+    np.testing.assert_array_equal(found.distance, [np.nan, seen, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("arrivals", "stamps", "ages"),
+    [
+        ([10.0, 10.1, 12.2, 12.2, 12.3], [5.0, 5.1, 5.2, 7.1, 7.3], [0.0, 0.0, 2.0, 0.1, 0.0]),  # a link held it back
+        ([10.0, 10.1, 10.2], [5.0, 2.1, 2.2], [0.0, 0.0, 0.0]),  # its clock was set back
+        ([10.0, 10.1, 10.2], [5.0, 9999.1, 9999.2], [0.0, 0.0, 0.0]),  # or ahead
+        ([10.0, 99.0, 999.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),  # it has none
+        ([1000.0, 3000.0], [0.0, 1999.0], [0.0, 0.0]),  # it goes slower than ours
+    ],
+)
+def test_age_by_stamps_of_another_clock(arrivals, stamps, ages):
+    stamped = StampAge()
+    assert [stamped.age(*pair) for pair in zip(arrivals, stamps, strict=True)] == pytest.approx(ages, abs=0.005)
+
+
 # ---------------------------------------------------------------------- driving
 
 
@@ -233,7 +263,7 @@ def test_what_it_sends_is_what_rmw_zenoh_sends(hub, eventually):
         )
         assert int(twist.twist.linear.x * 100) == 10
         assert int(twist.twist.angular.z * 100) == -50
-        assert abs(twist.header.stamp.sec - time.time()) < 10
+        assert abs(twist.header.stamp.sec - FastClock().utc()) < 10
         assert sum(token.endswith("/NN/%/%TB0/zenpark_TB0") for token in announced) == 1
         assert any("/MS/" in token and "%TB0%odom" in token for token in announced)
 
@@ -257,6 +287,28 @@ def test_nobody_commands_and_it_stands(hub):
         assert stage.moved(1.0, stage.constant(0.2))[0] > 0.1
         stage.run(1.0)  # rows of NaN: the robot itself would go on for ever
         assert stage.moved(0.5)[0] == 0.0
+
+
+@pytest.mark.system
+def test_loop_that_hangs_leaves_it_standing(hub):
+    """Nothing is read nor commanded any more, while the robot's router answers all the time."""
+    with Stage(request(hub.endpoint)) as stage:
+        stage.body.open()
+        stage.run(1.0, stage.constant(0.2))
+        before = stage.place
+        until(lambda: not stage.twin._twist.any(), "it stands")
+        assert np.linalg.norm(stage.place - before) < 0.5
+        until(lambda: stage.moved(0.5, stage.constant(0.2))[0] > 0.05, "and drives on when it is told to")
+
+
+@pytest.mark.system
+def test_odometry_held_back_is_old(hub):
+    with Stage(request(hub.endpoint)) as stage:
+        stage.body.open()
+        stage.run(1.0, stage.constant(0.2))
+        stage.twin._link.faults = Faults(delay_s=2.0)
+        until(lambda: "old by its stamps" in stage.run(0.1, stage.constant(0.2)).notes[0], "it is noticed")
+        assert stage.t - stage.state.time[0] == pytest.approx(2.0, abs=0.5)
 
 
 @pytest.mark.system
@@ -506,6 +558,37 @@ def test_no_router_is_named_in_time(monkeypatch):
     assert OPEN_S < 5.0
     with pytest.raises(BodyError, match="TB0: 'nonsense' is not an endpoint"):
         TurtleBot3(request("nonsense", addresses=("ros2dds://tb3_0",))).open()
+
+
+def test_stale_commands_are_followed_by_zeros() -> None:
+    """Also when the loop does not run, and when another robot cannot be told."""
+    now = [100.0]
+    body = TurtleBot3(
+        request("tcp/127.0.0.1:1", start=((0.0, 0.0), (1.0, 0.0)), addresses=("rmw://a", "rmw://b")),
+        clock=lambda: now[0],
+    )
+    sent: list[float] = []
+    types = ros2.types("humble")
+
+    def fails(_message):
+        raise StopIteration
+
+    for robot, put in zip(body._robots, (fails, lambda message: sent.append(message.linear.x)), strict=True):
+        robot._types, robot._command_type = types, ros2.TWIST
+        robot._command = SimpleNamespace(put=put)  # type: ignore[assignment]
+        robot.odometry_received = 1e9
+        robot._sent_at = 100.0
+        robot.drive(0.1, 0.0, 100.0)
+
+    class Rounds:
+        def wait(self, period):
+            now[0] += period
+            return now[0] > 101.0
+
+    body._ending = Rounds()  # type: ignore[assignment]
+    body._stop_stale()
+    assert set(sent) == {0.0}
+    assert len(sent) >= 4
 
 
 def test_a_command_from_before_a_suspension_is_sent_as_zeros() -> None:
