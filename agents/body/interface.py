@@ -216,18 +216,6 @@ FRESH_S: Final = 0.5  # an older setpoint is dropped: wheels stop, sticks are at
 
 UNANSWERED: Final = "the emergency stop is not answered"  # note of a robot that was stopped and still moves
 
-# errors of a body that fails, a plug-in too
-TROUBLE: Final = (
-    AttributeError,
-    TypeError,
-    ValueError,
-    NameError,
-    LookupError,
-    ArithmeticError,
-    RuntimeError,
-    OSError,
-)
-
 
 def call_all(calls: Iterable[Callable[[], object]]) -> None:
     """Makes every call in the given order, even if others raise; the last error is raised afterwards.

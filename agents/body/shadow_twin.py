@@ -17,7 +17,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from agents.arrays import Array, Index, Mask
-from agents.body.interface import TROUBLE, Body, BodyRequest, BodyState, Disturbance, inspect
+from agents.body.interface import Body, BodyRequest, BodyState, Disturbance, inspect
 from agents.network.messages import Inspection
 from agents.plugins import registry
 
@@ -129,10 +129,10 @@ class Shadowed:
             return
         try:
             act(twin)
-        except TROUBLE as error:
+        except Exception as error:  # noqa: BLE001 - of any kind: without effect on the robot
             self._twin = None
             self._trouble = f"its shadow failed: {type(error).__name__}: {error}"
-            with contextlib.suppress(*TROUBLE):
+            with contextlib.suppress(Exception):
                 twin.close()
 
 

@@ -181,9 +181,9 @@ def _origin(entry: EntryPoint) -> str:
 
 
 # Exceptions from mistakes in a plug-in.
-FAILURES: Final = (AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError)
-# Exceptions from the import of a foreign module.
-_IMPORT_FAILURES: Final = (
-    ImportError, AttributeError, SyntaxError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError,
-    ArithmeticError, AssertionError,
+FAILURES: Final = (
+    AttributeError, TypeError, ValueError, NameError, LookupError, ArithmeticError, AssertionError, RuntimeError,
+    StopIteration, MemoryError,
 )  # fmt: skip
+# Exceptions from the import of a foreign module.
+_IMPORT_FAILURES: Final = (*FAILURES, ImportError, SyntaxError, OSError)

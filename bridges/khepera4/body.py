@@ -18,7 +18,7 @@ from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.link import Address, Khepera4Link
 
-OPEN_S: Final = 3.0  # deadline of the first odometry
+OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and of the first answer
 
 
 class KheperaBody:

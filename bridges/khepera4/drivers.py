@@ -20,6 +20,7 @@ from bridges.khepera4.odometry import Odometer
 NEVER: Final = math.inf
 REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more is not used to complete another
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
+FIRST_ANSWER_S: Final = 3.0  # [s] for the first answer: a late one spends the only client of a server of 2023
 PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
 
 
@@ -278,7 +279,7 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
     time.sleep(protocol.GAP_S)
     wire.send(b"p")
     try:
-        answer = wire.receive(time.monotonic() + chosen.silence_s)
+        answer = wire.receive(time.monotonic() + max(FIRST_ANSWER_S, chosen.silence_s))
     except TimeoutError as error:
         raise TimeoutError(
             "no answer to p; a server of 2023 serves one client in its life: start it anew on the robot, for each case"

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from agents.arrays import Array
 from agents.body.device_locks import numeric
-from agents.body.interface import FRESH_S, TROUBLE, BodyError
+from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from agents.ticks import Ticks
@@ -188,8 +188,8 @@ class Khepera4Link:
         while not self._finished:
             try:
                 wire = self._address.connect()
-            except OSError as error:
-                self.trouble = f"{self._address}: {error.strerror or error}; {self._remedy(error)}"
+            except Exception as error:  # noqa: BLE001 - of any kind: it is tried again
+                self.trouble = f"{self._address}: {_text(error)}; {self._remedy(error)}"
             else:
                 try:
                     if self._address.kteam:
@@ -199,9 +199,8 @@ class Khepera4Link:
                         park = identify(wire, self._settings, self._server)
                         self.server = next(name for name, kind in protocol.PARK.items() if kind is park.server)
                         self._run_connection(park)
-                except TROUBLE as error:  # of any kind: the wheels must stop
-                    why = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-                    self.trouble = f"{self._address}: {why or error}"
+                except Exception as error:  # noqa: BLE001 - of any kind: the wheels must stop
+                    self.trouble = f"{self._address}: {_text(error)}"
                     if isinstance(error, TimeoutError):
                         self.trouble += "; another program may hold it, or the robot uses the other protocol"
                     if isinstance(error, WrongServer):
@@ -220,7 +219,7 @@ class Khepera4Link:
         """Whether the thread may end: asked to, and the wheels stand or the time for that is over."""
         return self._ending.is_set() and (self._stands or time.monotonic() > self._stop_deadline)
 
-    def _remedy(self, error: OSError) -> str:
+    def _remedy(self, error: Exception) -> str:
         if isinstance(error, BlockingIOError):
             return "end it first"
         if self._address.serial:
@@ -290,3 +289,7 @@ class Khepera4Link:
         if self.battery_empty or uptime() > decided + FRESH_S:
             return 0.0, 0.0, math.inf
         return v, turn, decided + FRESH_S
+
+
+def _text(error: Exception) -> str:
+    return error.strerror or str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"

@@ -1,7 +1,7 @@
 """Body of several DJI Tellos through djitellopy: velocity commands, external positions.
 
-Of the library only parser and non-blocking sends are used (reasons in `bridges.tello.library` and `bridges.tello.pilot`);
-one thread runs the pilots of all drones.
+Of the library only parser and non-blocking sends are used, for the reasons in `bridges.tello.library` and
+`bridges.tello.pilot`; one thread runs the pilots of all drones.
 """
 
 from __future__ import annotations

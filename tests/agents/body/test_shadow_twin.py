@@ -24,11 +24,11 @@ class Driven:
         self.t = 0.0
         self.stale = 0.0
         self.flying = np.zeros(rows, dtype=bool)
-        self.broken = ""
+        self.broken, self.failure = "", RuntimeError
 
     def _may(self, what):
         if self.broken == what:
-            raise RuntimeError("no engine")
+            raise self.failure("no engine")
 
     def open(self):
         self._may("open")
@@ -202,6 +202,15 @@ def test_a_twin_that_fails_is_left_alone_and_the_robot_goes_on(what):
     if what != "close":
         assert state.notes == ("its shadow failed: RuntimeError: no engine",)
         assert np.isnan(state.shadow_position).all()
+
+
+@pytest.mark.parametrize("failure", [AssertionError, MemoryError, StopIteration, SystemError, Exception])
+def test_shadow_failures_of_any_kind_stay_without_effect(failure):
+    body, _, twin = beside()
+    twin.broken, twin.failure = "command", failure
+    body.read(0.0)
+    body.command(np.ones((1, 4)))
+    assert body.read(DT).notes == (f"its shadow failed: {failure.__name__}: no engine",)
 
 
 def test_what_the_robot_itself_says_is_kept():

@@ -177,6 +177,7 @@ class Broken(Avoidance, frozen=True):
     def deviate(self, goal, own, near, period):
         if self.way == "deviate fails":
             raise KeyError("goal")
+        assert self.way != "deviate asserts"
         return goal[:1] if self.way == "deviate shape" else goal
 
     def restrain(self, setpoint, own, near):
@@ -195,6 +196,7 @@ class Broken(Avoidance, frozen=True):
     ("way", "says"),
     [
         ("deviate fails", "the avoidance Broken failed: KeyError: 'goal'"),
+        ("deviate asserts", "the avoidance Broken failed: AssertionError"),
         ("deviate shape", r"`deviate` of the avoidance Broken must give a goal per row, \(2, 3\), not \(1, 3\)"),
         ("restrain fails", r"the avoidance Broken failed: ValueError.* \(.*test_avoidance\.py:\d+\)$"),
         (

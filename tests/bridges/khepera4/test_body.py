@@ -12,6 +12,7 @@ import time
 import tty
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
+from bridges.khepera4 import drivers
 from bridges.khepera4.body import OPEN_S, KheperaBody
 from bridges.khepera4.link import Address, Khepera4Link, Odometry
 from bridges.khepera4.odometry import Odometer
@@ -78,8 +80,9 @@ def served():
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Bodies that are given up after a second and not three."""
+    """Bodies that are given up after a second, and servers that have half a second for their first answer."""
     monkeypatch.setattr(khepera4, "OPEN_S", 1.0)
+    monkeypatch.setattr(drivers, "FIRST_ANSWER_S", 0.5)
 
 
 def opened(body):
@@ -190,6 +193,23 @@ def test_nobody_there_is_said_with_the_remedy(impatient):
     assert OPEN_S < 5.0
     assert f"R0: 127.0.0.1:{port}: Connection refused; start the server on the robot" in str(caught.value)
     assert "R1: /dev/ttyNONE: No such file or directory; is the line plugged in" in str(caught.value)
+
+
+@pytest.mark.parametrize("failure", [AssertionError, MemoryError, UnicodeError, StopIteration])
+def test_link_outlives_failures_of_any_kind(failure):
+    link = Khepera4Link("K", Address.parse("K", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0))
+    tried = []
+
+    def connect():
+        tried.append(link.trouble)
+        if len(tried) == 2:
+            link.end()
+        raise failure("broken")
+
+    link._address = SimpleNamespace(connect=connect, serial="")
+    link.start()
+    link.join()
+    assert f"{failure.__name__}: broken" in tried[1]
 
 
 # ---------------------------------------------------------------------- with twins

@@ -144,6 +144,21 @@ def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
     assert set(robot.heard) == {b"stop", b"p"}
 
 
+def test_first_answer_may_take_seconds(lab):
+    """A server of 2023 has one client in its life: one that does not wait for its answer is lost."""
+    robot = lab("2025-05")
+    receive = robot.receive
+
+    def late(until):
+        if until < robot.now + 2.5:
+            raise TimeoutError
+        robot.sleep(2.5)
+        return receive(until)
+
+    robot.receive = late
+    assert drivers.identify(robot, protocol.Khepera4Settings(), None).server == protocol.PARK["2025-05"]
+
+
 def test_way_that_is_reported_late_is_counted_once(lab):
     robot = lab("2023-01-07")
     robot.driver.patience_s = 0.2
