@@ -24,20 +24,15 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
-from agents.safety.detection import SLOWEST
+from bridges.measured_flight import FRESH_S, SETTLED, MeasuredFlight
 
 Action = Literal["drive", "takeoff", "land", "stop"]
 
 OPEN_S: Final = 5.0  # deadline of the router's answer and of the first position of every row
 POLL_S: Final = 0.02  # between looks for them
-STALE_S: Final = 0.5  # older positions are lost; robots tolerate as much
 WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # how long `land` is repeated to a robot on wheels
-LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`, and after a slow descent
-GROUNDED_S: Final = 1.0  # a robot in flight that is measured on the ground for so long has landed by itself
-AWAY_M: Final = 0.05  # [m] above the place of take-off: higher is in the air, lower is down
-SETTLED: Final = 0.1  # [m/s] slower robots stand
 ANSWER_S: Final = 2.5  # the note reports a robot that is not measured to stand so long after a stop
 STANDSTILL_S: Final = 1.0  # how long `close` waits until stopped robots are measured to stand
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -75,10 +70,7 @@ class ExternalBody:
         self._clock_offset = np.inf  # from the caller's clock to this one [s]
         self._poses = External(rows)
         self._yaw = np.array(request.yaw, dtype=float)
-        self._flying = np.zeros(rows, dtype=bool)
-        self._landing_since = np.full(rows, np.inf)
-        self._takeoff_z = np.zeros(rows)
-        self._grounded_since = np.full(rows, np.inf)  # measured on the ground although it should fly
+        self._flight = MeasuredFlight(rows)
         self._stopped = np.zeros(rows, dtype=bool)
         self._stopped_since = np.full(rows, np.inf)
         # sequence numbers grow over restarts: a simulator that outlives this process can tell new orders from old
@@ -127,7 +119,7 @@ class ExternalBody:
             true_position=nothing,
             true_yaw=nothing[:, 0],
             battery=nothing[:, 0],
-            flying=self._flying.copy(),
+            flying=self._flight.flying.copy(),
             notes=self._notes(),
             rays=None if rays is None else msgspec.structs.replace(rays, time=rays.time - self._clock_offset),
             ahead=self._positions.ahead,
@@ -153,16 +145,15 @@ class ExternalBody:
         """See `Body.takeoff`; no effect on ground robots."""
         for row, up in zip(rows.tolist(), height.tolist(), strict=True):
             if self._flies[row]:
-                z = self._poses.position[row, 2]
-                self._takeoff_z[row] = z if isfinite(z) else 0.0
-                self._flying[row], self._landing_since[row], self._stopped[row] = True, np.inf, False
+                self._flight.take_off(row, self._poses.position[row])
+                self._stopped[row] = False
                 self._send_order(row, "takeoff", np.inf, up)
 
     def land(self, rows: Index) -> None:
         """See `Body.land`; no effect after a stop."""
         for row in rows[~self._stopped[rows]].tolist():
-            self._landing_since[row] = self._now()
-            self._send_order(row, "land", LANDING_S if self._flying[row] else HALT_S)
+            self._flight.land(row, self._now())
+            self._send_order(row, "land", np.inf if self._flight.flying[row] else HALT_S)
 
     def stop(self, rows: Index) -> None:
         """See `Body.stop`; repeated as long as this process lives."""
@@ -171,7 +162,7 @@ class ExternalBody:
                 now = self._now()
                 self._stopped[row], self._stopped_since[row] = True, now
                 # from now on the robot counts as flying until it is measured on the ground
-                self._landing_since[row] = min(self._landing_since[row], now)
+                self._flight.land(row, now)
                 self._send_order(row, "stop", np.inf)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -213,7 +204,7 @@ class ExternalBody:
                     else f"{name}: nothing is published on {key}: is {self._source_name(row)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
-            elif age > STALE_S:
+            elif age > FRESH_S:
                 found.append(
                     f"{name}: the position on {key} was measured {age:.1f} s ago by its stamp: stamps are UTC seconds, "
                     "not simulation time; if they are UTC, set the clocks of both computers"
@@ -228,31 +219,17 @@ class ExternalBody:
     def _velocity(self) -> Array:
         """Velocities (n, 3) [m/s]; a robot on wheels without positions stands some time after a halt."""
         now = self._now()
-        stands = ~self._flies & (now - self._landing_since > HALT_S) & (now - self._poses.time > STALE_S)
+        stands = ~self._flies & (now - self._flight.landing_since > HALT_S) & (now - self._poses.time > FRESH_S)
         return np.where(stands[:, None], 0.0, self._poses.velocity)
 
     def _unconfirmed_stops(self) -> Mask:
         """Stopped rows that are not measured to stand."""
-        return self._stopped & (self._flying | (norm(self._velocity()) > SETTLED))
+        return self._stopped & (self._flight.flying | (norm(self._velocity()) > SETTLED))
 
     def _update_flying(self) -> None:
-        """Update which rows fly: completed landings, and landings without an order."""
-        if not some(self._flying):
-            return
-        now = self._now()
-        landing = np.isfinite(self._landing_since)
-        high = self._poses.position[:, 2] - self._takeoff_z > AWAY_M
-        slow = np.abs(self._poses.velocity[:, 2]) < SETTLED
-        aged = now - self._poses.time > STALE_S
-        grounded = ~aged & ~high & slow
+        """Update which rows fly; orders to rows that are down are complete."""
         climbing = np.isin(np.arange(len(self._names)), list(self._repeated))
-        self._grounded_since = np.where(
-            grounded & self._flying & ~climbing, np.minimum(self._grounded_since, now), np.inf
-        )
-        alone = ~landing & (now - self._grounded_since > GROUNDED_S)
-        unseen = now - self._landing_since > np.fmax(LANDING_S, self._poses.position[:, 2] / SLOWEST)
-        down = self._flying & ((landing & np.where(aged, unseen, grounded)) | alone)
-        self._flying &= ~down
+        down = self._flight.update(self._now(), self._poses.time, self._poses.position, self._poses.velocity, climbing)
         with self._lock:
             for row in np.flatnonzero(down).tolist():
                 if not self._stopped[row]:
@@ -261,12 +238,12 @@ class ExternalBody:
     def _notes(self) -> tuple[str, ...]:
         age, positions = self._now() - self._poses.time, self._positions
         unanswered = self._unconfirmed_stops() & (self._now() - self._stopped_since > ANSWER_S)
-        if not ((age > STALE_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
+        if not ((age > FRESH_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
             return ()
         notes = []
         for row, seconds in enumerate(age.tolist()):
             parts = [UNANSWERED] if unanswered[row] else []
-            parts += [f"no position for {seconds:.0f} s"] if seconds > STALE_S else []
+            parts += [f"no position for {seconds:.0f} s"] if seconds > FRESH_S else []
             if positions.malformed[row]:
                 parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
             if self._ranges.malformed:

@@ -31,7 +31,7 @@ class TelloLibrary:
         if "av" not in sys.modules and importlib.util.find_spec("av") is None:
             sys.modules["av"] = types.ModuleType("av")  # only needed by the library's video, which is not used
         try:
-            self._module = importlib.import_module("djitellopy.tello")
+            self._module: Any = importlib.import_module("djitellopy.tello")
         except ModuleNotFoundError as error:
             raise BodyError(
                 f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "

@@ -6,7 +6,7 @@ silent, not when we are. So every end sends zeros on cmd_vel, and every command 
 
 from __future__ import annotations
 
-from math import cos, hypot, nan, pi, sin
+from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,6 @@ from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant
-from bridges.turtlebot3.stamp_age import StampAge
 
 SILENCE_S: Final = 0.5  # with older odometry the robot is out of reach and gets zeros
 REPEAT_S: Final = 0.05  # longest time between commands while the robot shall move,
@@ -28,9 +27,31 @@ ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so 
 BLOCKED_S: Final = 1.5  # the note reports a robot that does not move for so long despite commands
 STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower robots stand
 FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
+DRIFT: Final = 1e-3  # [s/s] largest difference between the robot's clock, which may be slewed, and ours
 ORIGIN: Final = (0.01, 0.02)  # [m, rad] odometry closer to zero is at its origin
 
 Planar = tuple[float, float, float]  # x, y [m], yaw [rad]
+
+
+class StampAge:
+    """Age of messages: arrival less stamp, less the smallest such difference so far, for the clocks are not the same.
+
+    A stamp that does not grow comes from a clock that was set back, or from a sender without stamps: all begins anew.
+    """
+
+    def __init__(self) -> None:
+        self._stamp = self._arrival = -inf
+        self._least = inf
+
+    def age(self, arrival: float, stamp: float) -> float:
+        """Age [s] of a message with this stamp [s] that arrived at `arrival` [s, monotonic]."""
+        if stamp <= self._stamp:
+            self._least = inf
+        crept = DRIFT * max(arrival - self._arrival, 0.0) if isfinite(self._arrival) else 0.0
+        delay = arrival - stamp
+        self._least = min(self._least + crept, delay)
+        self._stamp, self._arrival = stamp, arrival
+        return delay - self._least
 
 
 class Robot:

@@ -18,7 +18,7 @@ from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.safety.detection import SLOWEST
-from bridges import external
+from bridges import external, measured_flight
 from bridges.external import ExternalBody
 from tests.conftest import RouterProcess
 from tests.waiting import until
@@ -372,7 +372,7 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
 def test_a_robot_that_lands_unseen_is_taken_for_down_in_the_end(
     body: ExternalBody, far: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(external, "LANDING_S", 1.0)
+    monkeypatch.setattr(measured_flight, "LANDING_S", 1.0)
     drive = Drive(body)
     far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.0]
     drive.until(lambda: True, "a first look")

@@ -26,8 +26,7 @@ from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3 import body as bridge
 from bridges.turtlebot3.body import DIAGNOSIS_S, OPEN_S, TurtleBot3
-from bridges.turtlebot3.robot import Robot, ranges
-from bridges.turtlebot3.stamp_age import StampAge
+from bridges.turtlebot3.robot import Robot, StampAge, ranges
 from tests.bridges.turtlebots import FastClock, Stage, clock, request
 from tests.conftest import RouterProcess
 from tests.waiting import until
