@@ -28,15 +28,7 @@ class TelloLibrary:
 
     def __init__(self, control_port: int = protocol.CONTROL_PORT, state_port: int = protocol.STATE_PORT) -> None:
         """Raises BodyError if the library is not installed, or a port is taken."""
-        if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-            sys.modules["av"] = types.ModuleType("av")  # only needed by the library's video, which is not used
-        try:
-            self._module: Any = importlib.import_module("djitellopy.tello")
-        except ModuleNotFoundError as error:
-            raise BodyError(
-                f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "
-                "pip install -e '.[tello]'"
-            ) from error
+        self._module = _djitellopy()
         self._module.Tello.LOGGER.setLevel(logging.CRITICAL)  # else it logs every command and every wrong number
         self._answers = _bind(control_port)
         try:
@@ -70,6 +62,18 @@ class TelloLibrary:
         self._answers.close()
         self._states.close()
         self._drones.clear()
+
+
+def _djitellopy() -> Any:  # noqa: ANN401 - the library has no types
+    if "av" not in sys.modules and importlib.util.find_spec("av") is None:
+        sys.modules["av"] = types.ModuleType("av")  # only needed by the library's video, which is not used
+    try:
+        return importlib.import_module("djitellopy.tello")
+    except ModuleNotFoundError as error:
+        raise BodyError(
+            f"flying a Tello needs djitellopy, which is not installed ({error.name} is missing): "
+            "pip install -e '.[tello]'"
+        ) from error
 
 
 def _received(wire: socket.socket) -> Iterator[tuple[bytes, str]]:
