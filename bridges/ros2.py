@@ -10,14 +10,15 @@ import re
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from math import isfinite
+from dataclasses import dataclass, field
+from math import isfinite, isnan, nan
 from typing import Annotated, Final
 
 import msgspec
 import zenoh
 from msgspec import Meta
 
+from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -36,6 +37,29 @@ REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
 
 
+class GoalHeight:
+    """Height of a robot's goals: RViz and nav2 send them in the plane, where z = 0 means "keep your height"."""
+
+    def __init__(self) -> None:
+        # of the last goal that has one; before, where the robot began to run [m]; NaN: not known yet
+        self._kept = nan
+
+    @property
+    def known(self) -> bool:
+        """Whether a state with a position was received."""
+        return not isnan(self._kept)
+
+    def follow(self, phase: str, height: float) -> None:
+        """Note the measured height [m] of the robot in this phase."""
+        if phase != Phase.RUNNING.word or not self.known:
+            self._kept = height
+
+    def of_goal(self, z: float) -> float:
+        """The height [m] meant by the z [m] of a goal."""
+        self._kept = z or self._kept
+        return self._kept
+
+
 @dataclass
 class _Robot:
     """Topics of one robot, and its goal's publisher in the realm."""
@@ -45,6 +69,7 @@ class _Robot:
     goal: Subscriber
     goal_publisher: zenoh.Publisher
     stamp: float = 0.0  # of the last pose published to ROS, UTC [s]
+    height: GoalHeight = field(default_factory=GoalHeight)
 
     def close(self) -> None:
         self.pose.close()
@@ -128,6 +153,7 @@ class Graph:
                 continue
             robot.stamp = state.stamp
             if state.position is not None:
+                robot.height.follow(state.phase, state.position[2])
                 robot.pose.put(pose(self._types, state, state.position))
             if state.velocity is not None:
                 robot.velocity.put(velocity(self._types, state, state.velocity))
@@ -139,14 +165,15 @@ class Graph:
         """Forward a goal from ROS into the realm, unless a central controller sends goals."""
         place, q = message.pose.position, message.pose.orientation
         numbers = (place.x, place.y, place.z, q.x, q.y, q.z, q.w)
-        known = robot.stamp > 0.0 and message.header.frame_id in ("", FRAME)
+        known = robot.height.known and robot.stamp > 0.0 and message.header.frame_id in ("", FRAME)
         if self._centralised or not known or not all(isfinite(number) for number in numbers):
             self.refused += 1
             return
         turned = q.x or q.y or q.z or q.w  # a quaternion of zeros means any yaw
         yaw = ros2.yaw_of(q) if turned else None
         self._seq += 1
-        goal = messages.Goal(name, self._seq, self._clock.utc(), (place.x, place.y, place.z), yaw, robot.stamp)
+        position = place.x, place.y, robot.height.of_goal(place.z)
+        goal = messages.Goal(name, self._seq, self._clock.utc(), position, yaw, robot.stamp)
         robot.goal_publisher.put(messages.encode(goal))
 
 

@@ -34,7 +34,9 @@ class External:
         self.time: Array = np.full(rows, -np.inf)  # (n,) [s], minus infinity before the first pose
         self.position: Array = np.full((rows, 3), np.nan)  # (n, 3) [m], NaN before the first pose
         self.velocity: Array = np.zeros((rows, 3))  # (n, 3) [m/s]
-        self.yaw: Array = np.full(rows, np.nan)  # (n,) [rad]
+        self.yaw: Array = np.full(rows, np.nan)  # (n,) [rad], NaN while the newest pose has none
+        # (n,) last measured yaw less the body's own at that time [rad], NaN before the first; and that time [s]
+        self._turned, self._turned_at = np.full((2, rows), np.nan)
         self.refused = 0  # poses that jumped farther than a robot can move
 
     def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
@@ -51,8 +53,7 @@ class External:
         else:
             self.velocity[row] = 0.0
         self.time[row], self.position[row] = t, position
-        if np.isfinite(yaw):
-            self.yaw[row] = yaw
+        self.yaw[row] = yaw if np.isfinite(yaw) else np.nan
         return True
 
     def estimate(self, t: float, state: BodyState) -> None:
@@ -65,7 +66,16 @@ class External:
         state.velocity[rows] = np.where(fresh[:, None], self.velocity[rows], np.nan)
 
     def fill(self, state: BodyState, rows: Index) -> None:
-        """Replaces the poses of `rows` in a state of their bodies; a yaw that was never measured stays."""
+        """Replaces the poses of `rows` in a state of their bodies.
+
+        While poses come without a yaw, it is the body's own, turned to agree with the last measured one.
+        """
         state.time[rows], state.position[rows] = self.time[rows], self.position[rows]
         state.velocity[rows] = self.velocity[rows]
-        state.yaw[rows] = np.where(np.isfinite(self.yaw[rows]), self.yaw[rows], state.yaw[rows])
+        yaw, own = self.yaw[rows], state.yaw[rows]
+        known = np.isfinite(yaw)
+        new = known & np.isfinite(own) & (self.time[rows] != self._turned_at[rows])
+        self._turned[rows] = np.where(new, yaw - own, self._turned[rows])
+        self._turned_at[rows] = np.where(new, self.time[rows], self._turned_at[rows])
+        turned = self._turned[rows]
+        state.yaw[rows] = np.where(known, yaw, np.where(np.isnan(turned), own, own + turned))

@@ -51,6 +51,8 @@ class Assignment:
     presence: Presence | None = None  # times of all links; None: always
     start: Array | None = None  # (N, 2) where the rows begin [m]; None: anywhere
     start_within: float = 0.0  # farthest from there that a row may take off [m]
+    # (R, 2) where the robots of the experiment begin, in the order of `robots` [m]; None: not known to a row
+    all_starts: Array | None = None
     # (N,) rows that the central controller guides; links of the law, anchors and legs are those of the other rows, and
     # in the assignment of a central controller those of these rows
     guided: Mask | None = None

@@ -122,8 +122,11 @@ class Perception:
 
     def _ends(self, rays: Rays, fresh: Mask, state: BodyState) -> _Points:
         """End points of the fresh readings that hit something near."""
-        hit = fresh & (rays.distance <= REACH)  # NaN: nothing was hit
-        flat = np.cos(rays.elevation)
+        hit = fresh & (rays.distance <= REACH) & (rays.distance >= 0.0)  # NaN: nothing was hit
+        # one point that is not finite would spoil the sum over all things near its row
+        hit &= np.isfinite(rays.bearing) & np.isfinite(rays.elevation)
+        hit &= np.isfinite(state.position).all(axis=1)[rays.row] & np.isfinite(state.yaw)[rays.row]
+        flat = np.cos(np.where(hit, rays.elevation, 0.0))
         ray = np.flatnonzero(hit & (flat > STEEP))
         row, distance, time = rays.row[ray], rays.distance[ray], rays.time[ray]
         then = clamp(state.time[row] - time, 0.0, SCAN_S)[:, None]

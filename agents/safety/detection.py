@@ -80,7 +80,9 @@ class RowStatus(msgspec.Struct, frozen=True):
 class Descent:
     """Progress of N rows that land."""
 
-    def __init__(self, rows: int) -> None:
+    def __init__(self, rows: int, highest: float) -> None:
+        """A row whose height is unknown is given the time for `highest` [m]."""
+        self._highest = highest
         self._landing: Mask = np.zeros(rows, dtype=bool)
         self._due = np.zeros(rows)  # when they are down, at the slowest [s]
         self._lowest, self._lowered_at = np.zeros(rows), np.zeros(rows)  # [m], [s]
@@ -95,7 +97,7 @@ class Descent:
         lower = begins | (valid & (height < self._lowest - STEP))
         self._lowest = np.where(lower, height, self._lowest)
         self._lowered_at = np.where(lower, t, self._lowered_at)
-        self._due = np.where(begins, t + np.where(valid, height, 0.0) / SLOWEST, self._due)
+        self._due = np.where(begins, t + np.where(valid, height, self._highest) / SLOWEST, self._due)
         still = landing & (t - self._lowered_at > STEP / CREEPS)
         level = valid & (height > LOW) & (norm(state.velocity) < SLOW)
         return still & ~level & (t > self._due), still & level
@@ -118,7 +120,7 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
-        self._descent = Descent(len(self._flies))
+        self._descent = Descent(len(self._flies), float(self._limits.high[2]))
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Index, Mask, some
+from agents.arrays import Array, Index, Mask, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.safety.detection import Separation, clock_off, clock_text, tilt_angle, tilted
@@ -20,6 +20,8 @@ FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems 
 REST_M_S: Final = 0.3  # and largest speed
 LEVEL: Final = 0.35  # [rad] and largest tilt
 WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
+ABOVE_M: Final = 0.1  # [m] a robot higher than this is above one that stands,
+BESIDE_M: Final = 0.1  # [m] unless there is more than this between the two, seen from above
 
 Failing = tuple[Mask, Callable[[int], str]]  # rows (N,), and the reason of one
 
@@ -31,6 +33,13 @@ class Preflight:
         self._limits, self._assignment = assignment.limits, assignment
         self._flies = np.array([kind.flies for kind in assignment.kinds])
         self._separation = Separation(assignment)
+        radius = np.array([kind.radius for kind in assignment.kinds])
+        theirs = np.array([kind.radius for kind in assignment.robot_kinds])
+        # (E,) distance of the axes, seen from above, at which a take-off does not pass the sender of a link [m]
+        self._beside = (
+            BESIDE_M + radius[assignment.links.receiver] + (theirs[assignment.links.sender] if len(theirs) else 0.0)
+        )
+        self._other_starts = _other_starts(assignment)
         self._since = np.full(len(self._flies), np.inf)
 
     def check(self, now: Situation, lacking: tuple[Mask, Callable[[int], Sequence[str]]]) -> dict[int, str]:
@@ -39,7 +48,7 @@ class Preflight:
         `lacking`: (N,) rows without a pose of a neighbour, and the names of the missing ones of a row.
         """
         failing: dict[int, str] = {}
-        checks = [self._situation(now, lacking), self._at_start(now.state), self._at_rest(now.state)]
+        checks = [self._situation(now, lacking), self._at_start(now.state), self._at_rest(now.state), self._below(now)]
         if self._limits.separation is not None:
             checks.append(self._too_close(now, self._limits.separation))
         for rows, reason in chain.from_iterable(checks):
@@ -84,6 +93,14 @@ class Preflight:
             away = np.hypot(*(state.position[:, :2] - start).T)  # NaN without a position, which has failed already
             text = "it is {:.2f} m from its start ({:g}, {:g}), more than {:g} m"
             yield away > limit, lambda row: text.format(away[row], *start[row], limit)
+            taken = {
+                row: names[int(apart.argmin())]
+                for row, (names, places) in enumerate(self._other_starts)
+                if len(names) and (apart := np.hypot(*(state.position[row, :2] - places).T)).min() < away[row]
+            }
+            if taken:
+                rows = np.isin(np.arange(len(away)), list(taken))
+                yield rows, lambda row: f"it stands where {taken[row]} begins: addresses or markers are swapped"
 
     def _at_rest(self, state: BodyState) -> Iterator[Failing]:
         flies, height, least = self._flies, state.position[:, 2], self._limits.battery_min
@@ -97,6 +114,21 @@ class Preflight:
         low = state.battery < least
         yield low, lambda row: f"its battery is at {state.battery[row]:.0%}, less than {least:.0%}"
 
+    def _below(self, now: Situation) -> Iterator[Failing]:
+        """Drones with a robot above them, where it was received last: a take-off passes all heights."""
+        links, place = self._assignment.links, now.neighbours.poses.position
+        off = place - now.state.position[links.receiver]
+        near = (off[:, 2] > ABOVE_M) & (np.vecdot(off[:, :2], off[:, :2]) < self._beside**2)
+        if some(near):
+
+            def reason(row: int) -> str:
+                link = int(np.flatnonzero(near & (links.receiver == row))[0])
+                return f"{self._assignment.robots[links.sender[link]]} is {off[link, 2]:.2f} m above it"
+
+            rows = np.zeros(len(self._flies), dtype=bool)
+            rows[links.receiver[near]] = True
+            yield rows & self._flies, reason
+
     def _too_close(self, now: Situation, limit: float) -> Iterator[Failing]:
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)
         near = apart < limit
@@ -109,3 +141,16 @@ class Preflight:
             rows = np.zeros(len(self._flies), dtype=bool)
             rows[self._assignment.links.receiver[near]] = True
             yield rows, reason
+
+
+def _other_starts(assignment: Assignment) -> list[tuple[list[str], Array]]:
+    """Other robots that begin beside each row, not at its own start, and where (K, 2) [m]; none without starts."""
+    starts, names, kinds = assignment.all_starts, assignment.robots, assignment.robot_kinds
+    if starts is None or assignment.start is None:
+        return []
+    found = []
+    for row, here in enumerate(assignment.start):
+        touching = [assignment.kinds[row].radius + kind.radius for kind in kinds[: len(starts)]]
+        others = np.flatnonzero(np.hypot(*(starts - here).T) > touching)
+        found.append(([names[other] for other in others], starts[others]))
+    return found

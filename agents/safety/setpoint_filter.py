@@ -14,6 +14,7 @@ from agents.body.limits import Limits
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
 from agents.plugins.calls import call
 
+FLOOR_M = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
 OUTSIDE_M = 0.25  # [m] outside the arena: no longer under control
 ABSURD = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
 ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
@@ -56,11 +57,13 @@ class SetpointFilter:
         self._closes_s = 1.0 / np.array([kind.response for kind in kinds])
         self._step = np.minimum(limits.goal_step, self._speed * self._closes_s)
         self._turn_rate = np.array([kind.turn_rate for kind in kinds])
-        flies = np.array([kind.flies for kind in kinds])[:, None]
-        inside = np.array([limits.margin, limits.margin, 0.0])
-        floor, ceiling = np.array([0.0, 0.0, np.inf]), np.array([0.0, 0.0, limits.margin])
-        self._low = limits.low + inside - np.where(flies, 0.0, floor)  # heights do not limit ground robots
-        self._high = limits.high - inside - np.where(flies, ceiling, -floor)
+        flies = np.array([kind.flies for kind in kinds])
+        inside = np.full((len(kinds), 3), limits.margin)
+        self._low, self._high = limits.low + inside, limits.high - inside
+        # a goal on the floor would be flown into it
+        height = np.array([kind.height for kind in kinds])
+        self._low[:, 2] = np.where(flies, limits.low[2] + np.maximum(height, FLOOR_M), -np.inf)
+        self._high[~flies, 2] = np.inf  # heights do not limit ground robots
         self._centre = 0.5 * (limits.low + limits.high)
         self._half = 0.5 * (limits.high - limits.low)
         self._no_row: Mask = np.zeros(len(kinds), dtype=bool)

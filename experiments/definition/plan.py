@@ -258,6 +258,9 @@ class Plan:
             awaited=self._waited_for(formation.links, copies),
             start=np.tile(start_poses(experiment, names)[0][:, :2], (copies, 1)) if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,
+            all_starts=start_poses(experiment, all_names)[0][:, :2]
+            if within and not experiment.start.scatter
+            else None,
         )
 
     def _waited_for(self, links: Links, copies: int) -> Mask | None:

@@ -24,7 +24,7 @@ from agents.network.keys import Keys
 from agents.network.pubsub import alive_token, pose_publisher, publisher
 from agents.network.session import open_session, received
 from agents.protocols import ros2
-from bridges.ros2 import main, ros_name
+from bridges.ros2 import GoalHeight, main, ros_name
 
 ROOT = Path(__file__).resolve().parents[2]
 JSON = "application/json"
@@ -354,6 +354,16 @@ def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
         )
         realm.enter("CF01")
         eventually(lambda: node.topics() == wanted)
+
+
+def test_a_goal_without_height_keeps_the_height():
+    height = GoalHeight()
+    assert not height.known
+    for phase, z in (("ready", 0.0), ("airborne", 1.02), ("running", 1.3)):
+        height.follow(phase, z)
+    assert [height.of_goal(z) for z in (0.0, 0.5, 0.0)] == [1.02, 0.5, 0.5]
+    height.follow("done", 0.0)
+    assert height.of_goal(0.0) == 0.0
 
 
 @pytest.mark.system

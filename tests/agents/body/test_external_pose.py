@@ -53,3 +53,21 @@ def test_one_array_of_unknowns_in_several_fields_stays_unknown():
     External(2).estimate(0.0, state)
     assert np.isfinite(state.velocity).all()
     assert np.isnan(state.true_position).all()
+
+
+def test_without_a_measured_yaw_the_own_one_goes_on():
+    external, row = External(1), np.array([0])
+    state = reading(0.0, [[0.0, 0.0, 0.0]] * 2)
+
+    def yaw(t, measured, own):
+        external.update(0, t, np.array([0.1 * t, 0.0, 0.0]), measured)
+        state.yaw = np.array([own, 0.0])
+        external.fill(state, row)
+        return state.yaw[0]
+
+    assert yaw(0.0, np.nan, 0.3) == 0.3  # none was measured yet
+    assert yaw(0.1, 1.0, 0.2) == 1.0
+    assert yaw(0.2, np.nan, 0.7) == pytest.approx(1.5)  # turned by 0.5 since
+    assert yaw(5.0, np.nan, -0.2) == pytest.approx(0.6)
+    assert yaw(5.1, 2.0, -0.2) == 2.0
+    assert np.isnan(yaw(5.2, np.nan, np.nan))

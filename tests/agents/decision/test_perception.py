@@ -191,6 +191,15 @@ def test_a_ray_ends_where_it_points_from_the_pose_of_the_robot():
     assert len(placed(alone(), 0.0, state([0, 0, 0], rays=rays([0], [0.0], [REACH + 0.1])))) == 0
 
 
+@pytest.mark.parametrize("wrong", [{"bearing": np.nan}, {"elevation": np.nan}, {"bearing": np.inf}])
+def test_a_ray_without_direction_is_no_point(wrong):
+    scan = {"bearing": [0.0, 1.0], "elevation": 0.0} | {name: [value, 0.0] for name, value in wrong.items()}
+    seen = rays([0, 0], scan["bearing"], [0.4, 0.9], elevation=scan["elevation"])
+    _, near = alone().sense(0.0, state([0.0, 0.0, 0.0], rays=seen), NeighbourPoses(0))
+    assert near.position.shape == (1, 2)
+    assert np.isfinite(near.position).all()
+
+
 def test_what_was_seen_stays_where_it_is_while_the_robot_turns_and_drives_on():
     sight, scan = alone(), rays([0, 0], [0.0, 1.0], [0.5, 0.6], time=1.0)
     before = placed(sight, 1.0, state([0, 0, 0], time=1.0, rays=scan))

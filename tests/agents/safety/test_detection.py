@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.body.interface import BodyState
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
-from agents.safety.detection import tilt_angle, tilted
+from agents.safety.detection import SLOWEST, Descent, tilt_angle, tilted
 from agents.safety.hazards import Outcome
 from agents.safety.landing import PATIENCE_S
 from agents.safety.situation import LATE_SHARE, ProcessHealth
@@ -295,8 +296,17 @@ def test_a_landing_drone_that_does_no_good_is_cut(values):
     swarm = landing(**values, **({"position": [0.0, 0.0, 0.5]} if "velocity" in values else {}))
     swarm.run(1.9)
     assert swarm.phase("F") == LANDING
-    swarm.run(5.0)
+    # without a position it may be below the ceiling
+    swarm.run(5.0 if np.isfinite(values.get("position", 0.0)).all() else swarm.experiment.arena.size[2] / SLOWEST + 2.0)
     assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (DONE, ["its landing takes too long"])
+
+
+def test_a_blind_drone_gets_the_time_of_its_room():
+    descent, landing = Descent(1, 6.0), np.ones(1, dtype=bool)
+    blind = BodyState(*np.full((8, 1), np.nan))
+    blind.position = blind.velocity = np.full((1, 3), np.nan)
+    cut = [tick for tick in range(400) if descent.update(0.1 * tick, landing, ~landing, blind)[0].any()]
+    assert cut[0] == 301  # 6 m at 0.2 m/s
 
 
 @pytest.mark.slow

@@ -1,13 +1,14 @@
 """Checks before take-off: who fails one is not ready, says why, and is ready when it is mended."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from agents.body.limits import Safety
 from agents.decision.lifecycle import IDLE, READY, RUNNING
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair
 from tests.agents.safety.test_detection import leant, spoiled
 from tests.agents.swarm import Swarm
@@ -54,6 +55,35 @@ def test_and_is_ready_no_more_when_it_lasts(what):
     swarm.run(0.52)
     assert (agent.lifecycle.phase[0], agent.lifecycle.reason[0]) == (IDLE, reason)
     assert not agent.hazards.incidents  # it stands: nothing is unsafe yet
+
+
+def side_by_side(**parts):
+    """Two drones that start 0.25 m apart, and receive each other."""
+    robots = {"F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5)}
+    robots["G"] = Robot(kind="crazyflie", start=[0.25, 0.0], hover=0.5)
+    formation = Formation(links={"F - G": 0.25})
+    return Swarm(pair(robots=robots, formation=formation, **parts), [["F"], ["G"]])
+
+
+def test_subjects_swapped_within_reach_of_start():
+    swarm = side_by_side()
+    for group, x in zip(swarm.groups, (0.25, 0.0), strict=True):
+        group.spoil = lambda t, state, x=x: replace(state, position=np.array([[x, 0.0, 0.0]]))
+    swarm.run(0.2)
+    assert [swarm.phase(name) for name in "FG"] == [IDLE, IDLE]
+    assert swarm.agent("F").lifecycle.reason == ["it stands where G begins: addresses or markers are swapped"]
+    anywhere = side_by_side(safety=Safety(start_within=0.0))
+    for group, x in zip(anywhere.groups, (0.25, 0.0), strict=True):
+        group.spoil = lambda t, state, x=x: replace(state, position=np.array([[x, 0.0, 0.0]]))
+    assert [anywhere.run(0.2).phase(name) for name in "FG"] == [READY, READY]
+
+
+@pytest.mark.parametrize(("x", "z", "phase"), [(0.18, 0.6, IDLE), (0.18, 0.05, READY), (0.25, 0.6, READY)])
+def test_nothing_takes_off_below_another(x, z, phase):
+    swarm = side_by_side()
+    swarm.groups[1].spoil = lambda t, state: replace(state, position=np.array([[x, 0.0, z]]))
+    swarm.run(0.2)
+    assert swarm.phase("F") == phase
 
 
 def test_what_is_not_known_is_allowed():

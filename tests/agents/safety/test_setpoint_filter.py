@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
 from agents.body.limits import Limits
-from agents.safety.setpoint_filter import OUTSIDE_M, SetpointFilter
+from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
 
 FEW = settings(max_examples=60)
 ALL = tuple(KINDS.values())
@@ -31,6 +31,7 @@ def bounds(limits=LIMITS):
     low[:, :2] += limits.margin
     high[:, :2] -= limits.margin
     high[:, 2] -= limits.margin
+    low[:, 2] += [max(kind.height, FLOOR_M) for kind in ALL]
     low[~FLIES, 2], high[~FLIES, 2] = -np.inf, np.inf
     return low, high
 
