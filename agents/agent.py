@@ -26,9 +26,9 @@ from agents.decision.transmission import Transmission, Transmitter
 from agents.network.messages import Setpoint
 from agents.plugins.calls import call
 from agents.safety.detection import Detector, RowStatus
-from agents.safety.hazards import Hazards, Outcome
+from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.landing import Landing
-from agents.safety.obedience import Continuity
+from agents.safety.positions import Continuity, ExternalPositions
 from agents.safety.preflight import Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.safety.situation import ProcessHealth, Situation
@@ -86,6 +86,7 @@ class Agent:
         self._commands: BodyCommands | None = None
         self._ordered = np.zeros(rows, dtype=bool)
         self._controller, self._continuity = PositionController(assignment.kinds), Continuity(assignment.kinds)
+        self._external = ExternalPositions(assignment.kinds)
         self._safety = SetpointFilter(assignment.kinds, assignment.limits)
         self._perception = None if assignment.avoidance is None else Perception(assignment)
         self.landing = Landing(assignment)
@@ -108,6 +109,14 @@ class Agent:
         """Order to go on after a hold, from where the row is now."""
         self._ordered[row] = False
         self._continuity.forget(row)
+        self._external.forget(row)
+
+    def believes(self, row: int, t: float, position: Array) -> bool:
+        """Whether a `position` (3,) [m] that was measured from outside at `t` [s] may be used; ask for each one.
+
+        One that is not believed must not reach the body either: an estimator on board would fly by it.
+        """
+        return self._external.believes(row, t, position, watched=self.lifecycle.in_motion(row))
 
     def go(self, row: int, goal: tuple[float, float], t: float) -> str:
         """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
@@ -136,7 +145,10 @@ class Agent:
         waits = self.lifecycle.phase[row] == AIRBORNE
         refusal = self.lifecycle.start(row, at)
         if not refusal:
-            self.resume(row)
+            if waits and self._flies[row]:  # the common start confirms no position that jumped in the air
+                self._ordered[row] = False
+            else:
+                self.resume(row)
             if origin is not None and waits:
                 x, y, z, yaw = origin
                 self.origins[row] = origin
@@ -188,8 +200,11 @@ class Agent:
         life = self.lifecycle
         watched = self._every_row if life.all_running else life.active | (life.phase == LANDING)
         jump = self._continuity.jumps(state.time, state.position, watched)
+        if self._external.doubted:
+            jump = self._external.jump if jump is None else np.fmax(jump, self._external.jump)
         if jump is not None:
-            state = replace(state, position=np.where(np.isnan(jump)[:, None], state.position, np.nan))
+            unknown = ~np.isnan(jump) | self._external.deceived
+            state = replace(state, position=np.where(unknown[:, None], np.nan, state.position))
         where = self._safety.validate_poses(state.position, state.yaw, t - state.time)
         self._now = Situation(t, state, where, self.neighbours, self.health, jump)
         ready = self._ready(self._now) if life.waiting else self._no_row  # all rows have taken off
@@ -306,6 +321,9 @@ class Agent:
         for incident in self.hazards.update(now.t, self._detector.detect(now, rows), active, landing):
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.row, incident.cause.rule.words)
+            jumped = now.jump is not None and np.isfinite(now.jump[incident.row])
+            if self._flies[incident.row] and (jumped or incident.cause in (Cause.STILL, Cause.STRAYING)):
+                self._external.disbelieve(incident.row)  # it lands by what it knows itself
 
     def _decide(self, t: float, state: BodyState) -> None:
         """New goals for running rows that decide for themselves; the others may have to stay."""

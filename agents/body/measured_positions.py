@@ -5,28 +5,52 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import nan
+from typing import Final
 
 import numpy as np
 import zenoh
 
 from agents.arrays import Array
+from agents.body.interface import BodyState
 from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 
 
+REPEATED_S: Final = 0.3  # [s] without a new pose: the note says so
+FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
+
+
 class MeasuredPositions:
-    """Subscriptions to the keys `position` of some rows; polled."""
+    """Subscriptions to the keys `position` of some rows; polled.
+
+    A pose that is equal to the one before to the last bit was not measured: its source is frozen, and it is left out.
+    """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, names: Sequence[str], rows: Sequence[int], reach: messages.Vector
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        names: Sequence[str],
+        rows: Sequence[int],
+        reach: messages.Vector,
+        *,
+        exact: Sequence[int] = (),
     ) -> None:
-        """Subscribes for `rows` of the robots `names`; positions beyond `reach` [m] are refused."""
+        """Subscribe for `rows` of the robots `names`; positions beyond `reach` [m] are refused.
+
+        Args:
+            exact: Rows whose positions a simulation knows without noise; theirs may repeat.
+        """
         self._names, self._reach = tuple(names), reach
         # (N,) [s] stamp of the last position of each row less the time of its arrival: the clock of its source is ahead
         # by at least so much, or, where negative, behind or late; NaN before the first
         self.ahead: Array = np.full(len(self._names), nan)
         self.malformed = [0] * len(self._names)  # (N,) refused positions
         self.trouble = [""] * len(self._names)  # (N,) reason of the last refusal
+        self._exact = frozenset(exact)
+        self._last: dict[int, tuple[messages.Vector, float | None]] = {}
+        self._new_at: dict[int, float] = {}  # arrival of the last pose that was new [s],
+        self._repeats: dict[int, bool] = {}  # and whether others came since
         self._inboxes = {
             row: pubsub.Inbox(
                 pubsub.subscriber(session, keys.position(self._names[row]), 32),
@@ -44,8 +68,31 @@ class MeasuredPositions:
         """
         for row, inbox in self._inboxes.items():
             for measured in inbox.read(partial(self._check, row, utc, now)):
+                if not self._is_new(row, (measured.position, measured.yaw), now):
+                    continue
                 yaw = nan if measured.yaw is None else measured.yaw
                 yield row, validation.taken(measured.stamp - utc, now), np.array(measured.position), yaw
+
+    def _is_new(self, row: int, pose: tuple[messages.Vector, float | None], now: float) -> bool:
+        """Whether a pose was measured; of the first one that is known when the next one differs."""
+        if row in self._exact:
+            return True
+        before, self._last[row] = self._last.get(row), pose
+        self._repeats[row] = pose == before
+        if not self._repeats[row]:
+            self._new_at[row] = now
+        return before is not None and not self._repeats[row]
+
+    def annotate(self, state: BodyState, now: float) -> None:
+        """Write to the state of the bodies at `now` [s] how far stamps are ahead, and which sources are frozen."""
+        known = np.isfinite(self.ahead)
+        state.ahead = self.ahead if state.ahead is None else np.where(known, self.ahead, state.ahead)
+        frozen = [row for row, repeats in self._repeats.items() if repeats and now - self._new_at[row] > REPEATED_S]
+        if frozen:
+            notes = list(state.notes) or [""] * len(self._names)
+            for row in frozen:
+                notes[row] = "; ".join(filter(None, (FROZEN, notes[row])))
+            state.notes = tuple(notes)
 
     def _check(self, row: int, utc: float, now: float, measured: messages.Position) -> None:
         self.ahead[row] = measured.stamp - utc - now  # also of a stamp that is refused

@@ -114,6 +114,10 @@ class Lifecycle:
         """Rows (N,) that climb, wait in the air, or run."""
         return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
 
+    def in_motion(self, row: int) -> bool:
+        """Whether a row climbs, waits in the air, runs, or lands."""
+        return bool(self._climbing[row] or AIRBORNE <= self.phase[row] <= LANDING)
+
     @property
     def waiting(self) -> bool:
         """Whether a row has yet to take off."""

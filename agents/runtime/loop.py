@@ -67,6 +67,8 @@ class Setup:
     # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
     # key, received by the body itself ("far"). Left out: the bodies.
     ranging: Sequence[Ranging] = ()
+    # located rows whose positions a simulation knows without noise: they may repeat. Left out: none
+    exact: Sequence[bool] = ()
     # effects of the modelled channel on received poses, by link; None: none
     conditions: Conditions | None = None
     goal_conditions: Conditions | None = None  # on received goals, by guided row
@@ -271,7 +273,8 @@ class Runtime:
         self._estop = pubsub.ImmediateSubscriber(session, keys.estop, self._cut)
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = np.flatnonzero(self._setup.located).tolist()
-        self._located = MeasuredPositions(session, keys, names, located, self._reach) if located else None
+        exact = np.flatnonzero(self._setup.exact).tolist()
+        self._located = MeasuredPositions(session, keys, names, located, self._reach, exact=exact) if located else None
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._from_world = np.array(seen_by_world, dtype=np.intp)
@@ -340,7 +343,8 @@ class Runtime:
             self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
-                self._body.locate(row, taken, position, yaw)
+                if agent.believes(row, taken, position):
+                    self._body.locate(row, taken, position, yaw)
         for row, orders in enumerate(self._orders):
             for query, order in orders.read() if orders.waiting else ():
                 self._obey(row, query, order, t)
@@ -472,8 +476,7 @@ class Runtime:
         if not isfinite(state.velocity.sum()):
             self._estimator.estimate(t, state)
         if (located := self._located) is not None:
-            known = np.isfinite(located.ahead)
-            state.ahead = located.ahead if state.ahead is None else np.where(known, located.ahead, state.ahead)
+            located.annotate(state, t)
         self._state = state
         if self._ranges is not None:
             state = replace(state, rays=replace_rows(state.rays, self._ranges.read(self._utc, t), self._from_world))

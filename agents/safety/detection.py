@@ -137,9 +137,8 @@ class Detector:
             found.append(self._orders(rows))
         if state.heard is not None:
             found.append(self._silent_devices(now.t, state.heard))
-        if self._obedience.due(now.t):
-            watched = rows.cruising & ~now.where.invalid
-            self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
+        watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
+        self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
         if some(self._obedience.still) or some(self._obedience.strays):
             found.append(self._disobedient(self._obedience))
         if not now.where.all_valid:

@@ -92,7 +92,8 @@ class Cause(IntEnum):
     BEHIND = Rule("a neighbour's clock is behind", Outcome.WARN)
     REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
     STANDSTILL = Rule("its process stood still", Outcome.HOLD)
-    STILL = Rule("it is told to move and does not", Outcome.WARN)
+    # in the air a position that does not follow is a wrong one, by which the robot would fly away
+    STILL = Rule("it is told to move and does not", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded=Outcome.WARN)
     STRAYING = Rule("it moves and is not told to", Outcome.LAND)
     UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
     HOVERING = Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True)

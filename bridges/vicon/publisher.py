@@ -1,6 +1,6 @@
 """Positions from a Vicon for robots with external positions: `python -m bridges.vicon.publisher HOST --map CF01=cf_1`.
 
-Occluded and implausible poses are not published: a robot notices silence, but would fly by a wrong pose.
+Occluded, implausible and repeated poses are not published: a robot notices silence, but would fly by a wrong pose.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ ATTEMPT_S: Final = 2.0  # deadline of each attempt to connect
 PAUSE_S: Final = 0.5  # between attempts
 SILENCE_S: Final = 2.0  # without a frame for so long, reconnect
 LOST_S: Final = 0.5  # occlusions of so long are reported; robots hold on for half a second as well
+REPEATED_S: Final = 0.3  # a pose that is the same to the last bit for so long is not measured any more
 POLL_S: Final = 0.2  # how soon the end of the process is noticed
 SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality
 
@@ -62,6 +63,8 @@ class PoseFilter:
         self._print_line = print_line
         self._last = External(len(self._subjects))
         self._seen_at = np.full(len(self._subjects), -np.inf)  # time of each robot's last pose [s]
+        self._pose: list[Segment | None] = [None] * len(self._subjects)  # last pose of each robot,
+        self._new_at = np.full(len(self._subjects), -np.inf)  # since when it is the same [s]
         self._reported: list[str | None] = [None] * len(self._subjects)
         self._not_z_up = False
         self._invalid = 0
@@ -84,7 +87,10 @@ class PoseFilter:
         poses = []
         for row, (robot, subject) in enumerate(self._subjects.items()):
             segment = frame.poses.get(subject)
-            if segment is not None and frame.z_up:
+            if segment != self._pose[row]:
+                self._pose[row], self._new_at[row] = segment, arrived
+            frozen = segment is not None and arrived - self._new_at[row] >= REPEATED_S
+            if segment is not None and frame.z_up and not frozen:
                 yaw = heading(segment.rotation)
                 position = np.array(segment.position)
                 if math.isnan(yaw) or not all(map(math.isfinite, segment.position)):
@@ -92,11 +98,13 @@ class PoseFilter:
                 elif self._last.update(row, measured, position, yaw):
                     self._seen_at[row] = arrived
                     poses.append((robot, measured, segment, yaw))
-            self._report(row, robot, subject, frame, arrived)
+            self._report(row, robot, subject, frame, arrived, frozen=frozen)
         return poses
 
-    def _report(self, row: int, robot: str, subject: str, frame: Frame, now: float) -> None:
-        if now - self._seen_at[row] < LOST_S:
+    def _report(self, row: int, robot: str, subject: str, frame: Frame, now: float, *, frozen: bool) -> None:
+        if frozen:
+            state = f"{robot}: the pose of '{subject}' repeats itself to the last bit: the motion capture is frozen"
+        elif now - self._seen_at[row] < LOST_S:
             state = f"{robot} is seen as '{subject}'"
         elif subject not in frame.poses:
             others = ", ".join(sorted(frame.poses)) or "none"
@@ -161,15 +169,15 @@ class Bridge:
         return True
 
     def _pump(self, reader: Reader, over: Callable[[], bool]) -> None:
-        heard = uptime()
+        heard, number = uptime(), None
         while not over():
             frame = reader.newest(POLL_S)
             now = uptime()
-            if frame is None:
+            if frame is None or frame.number == number:
                 if now - heard > SILENCE_S:
-                    raise TimeoutError(f"no frame for {SILENCE_S:g} s (is the system live, and not paused?)")
+                    raise TimeoutError(f"no new frame for {SILENCE_S:g} s (is the system live, and not paused?)")
                 continue
-            heard = now
+            heard, number = now, frame.number
             for robot, measured, segment, yaw in self._filter.filter_poses(frame, now):
                 self._positions.publish(robot, self._clock.at(measured), segment, yaw)
 

@@ -70,6 +70,7 @@ def start_routers(launcher: Launcher, routers: Sequence[Router], rights: Path | 
             raise (error if process.alive else RouterEnded(str(error))) from None
 
 
+LEAST_SIGMA: Final = 1e-5  # [m] noise of simulated motion capture: what repeats itself to the last bit is not believed
 LINGER_S: Final = 15.0  # the router outlives a killed conductor, so that the landing is recorded
 STARTS: Final = 4  # a process that dies more often is not helped by another start
 
@@ -144,7 +145,8 @@ class Servants:
         realm = ["--realm", experiment.network.realm]
         host = experiment.positioning.removeprefix(VICON)
         if experiment.positioning == bodies.VICON_TWIN:
-            sigma = max(bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
+            asked = (bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
+            sigma = max(LEAST_SIGMA, *asked)
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
             arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
             twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)

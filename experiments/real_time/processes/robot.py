@@ -102,6 +102,7 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         state_hz=experiment.rates.state_hz,
         lifeline=launch.lifeline,
         located=[experiment.robots[name].position == "external" for name in names],
+        exact=[name not in Plan(experiment).externally_measured for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=link_conditions.receiver_conditions(experiment, assignment.links, names),
         goal_conditions=link_conditions.conditions_from_centre(experiment, names),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from agents.body.fleet import assemble
-from agents.body.measured_positions import MeasuredPositions
+from agents.body.measured_positions import FROZEN, MeasuredPositions
+from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.loop import Runtime, Setup
@@ -31,7 +32,7 @@ def position(stamp: float, robot: str = "T") -> bytes:
 def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_of_as_well() -> None:
     net = Net()
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0))  # type: ignore[arg-type]
+        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1])  # type: ignore[arg-type]
         assert np.isnan(heard.ahead).all()
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
@@ -51,12 +52,17 @@ def test_the_text_names_robot_and_size() -> None:
     assert clock_text(("CF01",), np.array([-0.4]), 0) == "positions of CF01 are stamped 0.4 s behind"
 
 
-def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runtime, list[tuple[float, str]]]:
-    """A Tello at 100 Hz whose positions are stamped so far ahead of `t` (None: there are none); what was said, when."""
+def flown(
+    ahead: Callable[[float], float | None], seconds: float, frozen_s: float = np.inf
+) -> tuple[Runtime, list[tuple[float, str]]]:
+    """A Tello at 100 Hz whose positions are stamped so far ahead of `t` (None: there are none), and from `frozen_s` on
+    the same; what was said, when.
+    """
     few = pair(
         robots={"T": Robot(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
     )
     said: list[tuple[float, str]] = []
+    measured, noise = [0.0] * 3, np.random.default_rng(1)
     net = Net()
     with net.worn():
         body = assemble(bodies.body_request(few, ("T",), [1]))
@@ -69,9 +75,9 @@ def flown(ahead: Callable[[float], float | None], seconds: float) -> tuple[Runti
         for tick in range(1, round(seconds / DT)):
             t = tick * DT
             if (off := ahead(t)) is not None:
-                place = messages.Position(
-                    "T", UTC + t + off, (0.1, 0.2, 0.5 if agent.lifecycle.phase[0] > 1 else 0.0), 0.0
-                )
+                seen = np.array([0.1, 0.2, 0.0]) if runtime._state is None else runtime._state.true_position[0]
+                measured = (seen + noise.normal(0.0, 1e-4, 3)).tolist() if t < frozen_s else measured
+                place = messages.Position("T", UTC + t + off, tuple(measured), 0.0)
                 net.deliver(sent(KEYS.position("T"), place)[0])
             runtime._tick(t)
             if agent.lifecycle.phase[0] == 1:
@@ -105,3 +111,28 @@ def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
 def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -> None:
     runtime, _ = flown(lambda _: -3600.0, 0.5)
     assert runtime.agent.lifecycle.reason[0] == "no position of its own: positions of T are stamped 3.6e+03 s behind"
+
+
+@pytest.mark.parametrize(("exact", "expected"), [([], [8.3]), ([1], [8.0, 8.1, 8.2, 8.3, 8.4])])
+def test_a_pose_that_repeats_itself_is_none(exact: list[int], expected: list[float]) -> None:
+    net, taken = Net(), []
+    with net.worn():
+        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=exact)  # type: ignore[arg-type]
+        for tick in range(5):
+            t = 8.0 + 0.1 * tick
+            place = messages.Position("T", UTC + t, (0.1, 0.2, 0.0 if tick < 3 else 0.001), 0.3)
+            net.deliver(sent(KEYS.position("T"), place)[0])
+            taken += [when for _, when, *_ in heard.receive(UTC, t)]
+    assert taken == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("frozen_s", "phase"), [(0.0, "idle"), (1.2, "done"), (4.0, "done")])
+def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> None:
+    runtime, said = flown(lambda _: 0.0, frozen_s + 7.0, frozen_s)
+    assert Phase(runtime.agent.lifecycle.phase[0]).word == phase
+    assert runtime._state is not None
+    assert runtime._state.notes == (FROZEN,)
+    if frozen_s:
+        (held, text), (landed, _), *_ = [each for each in said if "its own position is lost" in each[1]]
+        assert text.startswith("hold: its own position is lost: the last is 0.5")
+        assert [held - frozen_s, landed - frozen_s] == pytest.approx([0.5, 0.8], abs=0.03)

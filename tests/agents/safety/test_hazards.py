@@ -66,7 +66,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.BEHIND: [(0, "WARN")],
     Cause.REFUSED: [(0, "WARN")],
     Cause.STANDSTILL: [(0, "HOLD")],
-    Cause.STILL: [(0, "WARN")],
+    Cause.STILL: [(0, "LAND")],
     Cause.STRAYING: [(0, "LAND")],
     Cause.UNREACHABLE: [(50, "WARN")],
     Cause.HOVERING: [(200, "WARN")],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
-from agents.safety.obedience import JUMP_M, REACH, Continuity, Obedience
+from agents.safety.obedience import Obedience
 from tests.agents.few import pair
 from tests.agents.swarm import Swarm
 from twins.models.differential import Differential
@@ -135,31 +135,3 @@ def test_a_run_reports_wheels_that_stand_and_halts_wheels_that_run_away():
             swarm = Swarm(pair()).running().run(8.0)
         texts = [each.text for each in swarm.agent("A").hazards.incidents if each.row == 0]
         assert any(text.startswith(expected) for text in texts), texts
-
-
-def test_a_jump_is_farther_than_a_robot_can_move_between_two_measurements():
-    kinds, watched = [KHEPERA4, CRAZYFLIE], np.ones(2, dtype=bool)
-
-    def jumps(*places):
-        continuity = Continuity(kinds)
-        return [continuity.jumps(np.full(2, t), np.array([[x, 0.0, 0.0]] * 2), watched) for t, x in places][-1]
-
-    assert jumps((0.0, 0.0), (0.01, 0.99 * JUMP_M)) is None
-    assert jumps((0.0, 0.0), (0.01, 1.0)) == pytest.approx([1.0, 1.0])
-    assert jumps((0.0, 0.0), (0.01, 1.0), (9.0, 1.0)) == pytest.approx([1.0, 1.0])  # time does not heal it
-    assert jumps((0.0, 0.0), (0.01, 1.0), (0.02, 0.0)) is None
-    assert jumps((0.0, 0.0), (0.01, 1.0), (0.02, np.nan)) == pytest.approx([np.nan, np.nan], nan_ok=True)
-    assert jumps((0.0, 0.0), (0.01, 1.0), (0.02, np.nan), (0.03, 1.0)) == pytest.approx([1.0, 1.0])
-    far = JUMP_M + REACH * CRAZYFLIE.speed * 0.3  # a gap in the measurements
-    assert jumps((0.0, 0.0), (0.3, far - 0.01)) == pytest.approx([far - 0.01, np.nan], nan_ok=True)
-    assert jumps((0.0, 0.0), (9.0, 5.0)) == pytest.approx([5.0, 5.0])
-
-
-def test_rows_that_are_not_watched_or_forgotten_are_where_their_position_says():
-    continuity, here, there = Continuity([KHEPERA4] * 2), np.zeros((2, 3)), np.ones((2, 3))
-    both, second = np.array([True, True]), np.array([False, True])
-    continuity.jumps(np.zeros(2), here, both)
-    assert continuity.jumps(np.full(2, 0.01), there, second) == pytest.approx([np.nan, math.sqrt(3.0)], nan_ok=True)
-    continuity.forget(1)
-    assert continuity.jumps(np.full(2, 0.02), there, both) is None
-    assert continuity.jumps(np.full(2, 0.03), here, both) == pytest.approx([math.sqrt(3.0)] * 2)

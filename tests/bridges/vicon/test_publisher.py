@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +30,18 @@ from bridges.vicon.publisher import PoseFilter, heading, parse_maps, parse_serve
 from experiments.file import document
 from tests.conftest import ROOT, RouterProcess
 from tests.system.lab import RobotProcess, Watcher, until
-from tests.twins.camera import Camera
+from tests.twins import camera as cameras
 from twins.devices.vicon import upright
 
+Camera = partial(cameras.Camera, sigma=1e-9)  # what repeats itself is not believed
 UPRIGHT = tuple(upright(0.3).ravel().tolist())
 
 
-def frame(*, latency: float = 0.0, z_up: bool = True, **poses: tuple[float, float, float] | Segment | None) -> Frame:
+def frame(
+    number: int = 1, *, latency: float = 0.0, z_up: bool = True, **poses: tuple[float, float, float] | Segment | None
+) -> Frame:
     seen = {name: Segment(0, pose, UPRIGHT) if type(pose) is tuple else pose for name, pose in poses.items()}
-    return Frame(1, latency, seen, z_up)  # type: ignore[arg-type]
+    return Frame(number, latency, seen, z_up)  # type: ignore[arg-type]
 
 
 class Frames:
@@ -49,7 +53,7 @@ class Frames:
     def newest(self, _timeout: float) -> Frame:
         self.number += 1
         Frames.steady += 0.01
-        return frame(CF01=(0.001 * self.number, 0.0, 0.5))
+        return frame(self.number, CF01=(0.001 * self.number, 0.0, 0.5))
 
     def close(self) -> None: ...
 
@@ -136,6 +140,46 @@ def test_a_jump_is_not_believed_until_it_has_lasted() -> None:
     assert pose_filter.refused == 22
     steps = np.diff([x for _, x in believed])
     assert np.sort(steps)[-2:] == pytest.approx([0.01, 1.11], abs=1e-9)
+
+
+def test_a_pose_that_repeats_itself_is_not_published() -> None:
+    said: list[str] = []
+    pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
+    published = [
+        tick
+        for tick in range(200)
+        if pose_filter.filter_poses(frame(CF01=(0.001 * min(max(tick, 49), 150), 0.0, 1.0)), 0.01 * tick)
+    ]
+    assert published == [*range(30), *range(50, 180)]
+    frozen = "CF01: the pose of 'CF01' repeats itself to the last bit: the motion capture is frozen"
+    seen = "CF01 is seen as 'CF01'"
+    assert said == [seen, frozen, seen, frozen]
+
+
+class Frozen(Frames):
+    """The same frame again and again, from the fiftieth on."""
+
+    def newest(self, timeout: float) -> Frame:
+        newest = super().newest(timeout)
+        return frame(min(newest.number, 50), CF01=newest.poses["CF01"])
+
+
+def test_a_frame_that_repeats_its_number_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    Frames.steady = 5.0
+    monkeypatch.setattr(publisher, "Reader", Frozen)
+    monkeypatch.setattr(time, "monotonic", lambda: Frames.steady)
+    published: list[float] = []
+
+    class Ear:
+        def publish(self, _robot: str, _stamp: float, segment: Segment, _yaw: float) -> None:
+            published.append(segment.position[0])
+
+    said: list[str] = []
+    bridge = publisher.Bridge("nowhere", 1, PoseFilter({"CF01": "CF01"}, said.append), Ear(), said.append)  # type: ignore[arg-type]
+    monkeypatch.setattr(publisher, "PAUSE_S", 0.0)
+    assert bridge.run(lambda: any("no new frame" in line for line in said))
+    assert [len(published), published[49]] == [50, pytest.approx(0.05)]
+    assert said[-1].startswith("lost nowhere:1: no new frame for 2 s")
 
 
 def test_frames_that_overtake_each_other_and_axes_that_lie_are_left_out() -> None:

@@ -1,0 +1,103 @@
+"""Belief in measured positions: a robot does not jump. Row-wise.
+
+A position that jumps comes from something else now (swapped markers, another origin), or the robot was put somewhere by
+hand. One that is not believed reaches neither the decision nor, where it is measured from outside, the robot itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from agents.arrays import Array, Mask, every, some
+from agents.body.kinds import Kind
+
+JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
+GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
+REACH: Final = 1.5  # share of a kind's speed: what it can move
+
+
+class Continuity:
+    """Jumps of the measured positions of N rows.
+
+    A row has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
+    """
+
+    def __init__(self, kinds: Sequence[Kind], jump_m: Array | float = JUMP_M) -> None:
+        """A jump is longer than `jump_m`, one number or one for each row [m]."""
+        self._fastest, self._jump = REACH * np.array([kind.speed for kind in kinds]), jump_m
+        self._place, self._time = np.full((len(kinds), 3), np.nan), np.zeros(len(kinds))  # last plausible ones
+        self._out: Mask = np.zeros(len(kinds), dtype=bool)
+
+    def jumps(self, time: Array, position: Array, watched: Mask) -> Array | None:
+        """Lengths (N,) [m] of the jumps of rows, NaN of those that have not; None if no row has.
+
+        The `position` (N, 3) [m] was measured at `time` (N,) [s]. Rows that are not `watched` (N,), not in motion, may
+        be carried, and begin anew unless they have jumped.
+        """
+        moved = position - self._place
+        squared = np.vecdot(moved, moved)
+        if every(watched) and every(squared < self._jump**2):
+            self._place, self._time = position.copy(), time.copy()
+            if some(self._out):
+                self._out = np.zeros(len(time), dtype=bool)
+            return None
+        watched = watched | self._out
+        gap, unknown = np.sqrt(squared), watched & np.isnan(position).any(axis=1)
+        plausible = self._jump + np.where(self._out, 0.0, self._fastest * np.clip(time - self._time, 0.0, GAP_S))
+        self._out = watched & ((gap > plausible) | (unknown & self._out))
+        kept = self._out | unknown
+        self._place = np.where(kept[:, None], self._place, position)
+        self._time = np.where(kept | np.isinf(time), self._time, time)
+        return np.where(self._out, gap, np.nan) if some(self._out) else None
+
+    def forget(self, row: int) -> None:
+        """A row is where its position says, wherever that is."""
+        self._place, self._out = self._place.copy(), self._out.copy()
+        self._place[row], self._out[row] = np.nan, False
+
+
+class ExternalPositions:
+    """Belief in positions that are measured from outside, sample by sample, of N rows.
+
+    In motion a row has jumped if it moved by more than its own size beyond what it can: two robots that are mistaken
+    for each other are at least that far apart. Smaller errors show as disobedience.
+    """
+
+    def __init__(self, kinds: Sequence[Kind]) -> None:
+        self._rows = [Continuity([kind], 2.0 * kind.radius) for kind in kinds]
+        self._time = np.full(len(kinds), -np.inf)
+        self.jump: Array = np.full(len(kinds), np.nan)  # (N,) lengths of the jumps of rows [m], NaN of other rows
+        self.deceived: Mask = np.zeros(len(kinds), dtype=bool)  # (N,) rows whose positions are wrong for good
+        self.doubted = False  # whether a row has a position that is not believed
+
+    def believes(self, row: int, time: float, position: Array, *, watched: bool) -> bool:
+        """Whether a row is at `position` (3,) [m], measured at `time` [s]; older ones than before are left out.
+
+        `watched`: the row is in motion. At rest it may be carried.
+        """
+        if time <= self._time[row]:
+            return False
+        self._time[row] = time
+        if not watched:
+            self.deceived[row] = False
+            self._rows[row].forget(0)
+        jump = self._rows[row].jumps(np.array([time]), position[None], np.array([watched]))
+        self._note(row, np.nan if jump is None else float(jump[0]))
+        return jump is None and not self.deceived[row]
+
+    def disbelieve(self, row: int) -> None:
+        """What a row is told about its position is wrong, for as long as it is in motion."""
+        if self._time[row] > -np.inf:
+            self.deceived[row] = self.doubted = True
+
+    def forget(self, row: int) -> None:
+        """A row is where its position says, wherever that is."""
+        self._rows[row].forget(0)
+        self._note(row, np.nan)
+
+    def _note(self, row: int, jump: float) -> None:
+        self.jump[row] = jump
+        self.doubted = some(self.deceived) or not every(np.isnan(self.jump))
