@@ -15,7 +15,6 @@ from agents.body.interface import BodyState
 from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 
-
 REPEATED_S: Final = 0.3  # [s] without a new pose: the note says so
 FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
 

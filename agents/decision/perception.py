@@ -125,7 +125,7 @@ class Perception:
         hit = fresh & (rays.distance <= REACH) & (rays.distance >= 0.0)  # NaN: nothing was hit
         # one point that is not finite would spoil the sum over all things near its row
         hit &= np.isfinite(rays.bearing) & np.isfinite(rays.elevation)
-        hit &= np.isfinite(state.position).all(axis=1)[rays.row] & np.isfinite(state.yaw)[rays.row]
+        hit &= np.isfinite(state.position[rays.row]).all(axis=1) & np.isfinite(state.yaw[rays.row])
         flat = np.cos(np.where(hit, rays.elevation, 0.0))
         ray = np.flatnonzero(hit & (flat > STEEP))
         row, distance, time = rays.row[ray], rays.distance[ray], rays.time[ray]

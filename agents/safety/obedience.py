@@ -67,7 +67,8 @@ class Obedience:
         measured; `watched` rows (N,) follow their setpoints and have a valid pose.
         """
         since, self._last = t - self._last, t
-        if since < SAMPLE_S:  # no ticks were missed
+        missed = since >= 2.0 * SAMPLE_S  # too many ticks, or it is the first one
+        if not missed:
             told = self._told_motion(setpoint, position, yaw)
             told *= since
             np.copyto(told, 0.0, where=~np.isfinite(told))  # no setpoint, or no pose
@@ -80,7 +81,7 @@ class Obedience:
         here = np.concatenate([position, yaw[:, None]], axis=1)
         watched = watched & np.isfinite(setpoint).all(axis=1) & np.isfinite(here).all(axis=1)
         anew = np.isnan(self._begin[:, 0]) | ~watched
-        if since >= SAMPLE_S or every(anew):
+        if missed or every(anew):
             self._forget(np.ones(len(watched), dtype=bool), here)
             return
         if some(anew):
