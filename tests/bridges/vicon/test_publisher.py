@@ -167,7 +167,7 @@ class Frozen(Frames):
 def test_a_frame_that_repeats_its_number_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     Frames.steady = 5.0
     monkeypatch.setattr(publisher, "Reader", Frozen)
-    monkeypatch.setattr(time, "monotonic", lambda: Frames.steady)
+    monkeypatch.setattr(publisher, "uptime", lambda: Frames.steady)
     published: list[float] = []
 
     class Ear:
