@@ -58,7 +58,7 @@ def _rights(experiment: Experiment) -> Rights:
     keys = Keys(experiment.network.realm)
     senders, guided = senders_by_receiver(experiment), Plan(experiment).guided
     robots: dict[str, Grant] = {}
-    for group in process_groups(experiment):
+    for group in experiment.processes.values():
         others = sorted({sender for name in group for sender in senders[name]})
         if len(others) >= MANY and {*others, *group} == set(experiment.robots):
             others = ["*"]
@@ -144,13 +144,6 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
 
 def _key_per_name(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
     return [key(name) for name in names for key in of]
-
-
-def process_groups(experiment: Experiment) -> list[list[str]]:
-    groups: dict[str, list[str]] = {}
-    for name, robot in experiment.robots.items():
-        groups.setdefault(f"process {robot.process}" if robot.process else name, []).append(name)
-    return list(groups.values())
 
 
 def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:

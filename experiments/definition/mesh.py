@@ -28,7 +28,7 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     found: dict[str, str] = {}
     services: dict[str, None] = {"recorder": None}
     for case in cases:
-        for group in access_rights.process_groups(case):
+        for group in case.processes.values():
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
         if access_rights.has_world(case):

@@ -52,7 +52,9 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
         yield Fault(("on_loss",), message, 'add [spares.NAME], or say on_loss = "restart"')
 
 
-_RESERVED: Final = ("all", "estop", "run", "world", "centre", *KINDS)  # words of keys and of [disturbance]
+_ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
+# words of keys, of [disturbance], of events and of tables of results
+_RESERVED: Final = ("all", "estop", "run", "conductor", "mean", *_ROLES, *KINDS)
 ROUNDED: Final = 1e-3  # [m] heights written with three decimals
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
@@ -160,9 +162,7 @@ def divisor(body: float, wanted: float) -> float:
 
 def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
     name = path[1]
-    if name in _RESERVED:
-        message = f"a robot cannot be called '{name}', which has a meaning of its own"
-        yield Fault(path, message, "rename it", on_key=True)
+    yield from _names(experiment, path, robot)
     body = registry.body_name(robot.body)
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
     if body not in bodies:
@@ -189,6 +189,19 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     if len(robot.start) == 3 and abs(robot.start[2]) > 2 * math.pi:
         radians = math.remainder(math.radians(robot.start[2]), 2 * math.pi)
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
+
+
+def _names(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    """Faults of the name of a robot, and of that of its process."""
+    name = path[1]
+    if name in _RESERVED:
+        message = f"a robot cannot be called '{name}', which has a meaning of its own"
+        yield Fault(path, message, "rename it", on_key=True)
+    if robot.process in _ROLES:
+        yield Fault((*path, "process"), f"'{robot.process}' is a process of every run", "rename it")
+    elif robot.process in experiment.robots:
+        message = f"'{robot.process}' is the name of a robot, so that its own process would be shared unasked"
+        yield Fault((*path, "process"), message, "rename the process, and name it at each robot that shares it")
 
 
 def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:

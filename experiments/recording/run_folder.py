@@ -49,7 +49,7 @@ def read_origin(folder: Path) -> RunOrigin | None:
     """Origin of the run in a folder; None if the folder has none, or another file of that name."""
     try:
         return msgspec.json.decode((folder / ORIGIN).read_bytes(), type=RunOrigin)
-    except (OSError, ValueError, RecursionError):  # a case may be called "run"
+    except (OSError, ValueError, RecursionError):
         return None
 
 

@@ -30,7 +30,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     children = flight.children()
     bodies = {name: line for name in children for line in [children[name].cmdline()]}
     assert bodies["CF01"] == bodies["CF02"] == bodies["CF03"], "one radio, one process"
-    addressed = json.loads((folder / "event-addressed.json").read_text())["robots"]
+    addressed = json.loads((folder / "cases" / "event" / "addressed.json").read_text())["robots"]
     assert addressed["CF01"]["body"].startswith("radio://0/80/2M/E7E7E7E701?software=127.0.0.1:")
     assert addressed["KH01"]["body"].startswith("khepera4://127.0.0.1:")
     assert addressed["TB01"]["body"].startswith(("ros2dds://", "rmw://"))
@@ -88,8 +88,8 @@ def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) ->
     assert Flight(twins, "triangle", *short).finish()[0] == 0
     one_word = ("--set", "robots.CF01.body=crazyflie-twin")
     assert Flight(protocol, "triangle", *short, *one_word).finish()[0] == 0
-    addressed = json.loads((protocol / "periodic-addressed.json").read_text())["robots"]
-    plain = json.loads((protocol / "periodic.json").read_text())["robots"]
+    addressed = json.loads((protocol / "cases" / "periodic" / "addressed.json").read_text())["robots"]
+    plain = json.loads((protocol / "cases" / "periodic" / "experiment.json").read_text())["robots"]
     assert addressed["CF01"].pop("body").startswith("udp://127.0.0.1:")
     assert plain["CF01"].pop("body") == "crazyflie-twin"
     assert addressed == plain, "only the address differs"

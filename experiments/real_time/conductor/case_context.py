@@ -30,7 +30,12 @@ class CaseContext:
 
     @property
     def file(self) -> Path:
-        return self.folder / f"{self.case}.json"
+        """The case as its processes read it."""
+        return self.variant("experiment")
+
+    def variant(self, word: str) -> Path:
+        """File of a variant of the case, in a folder that no other file of the run can share, however it is called."""
+        return self.folder / "cases" / self.case / f"{word}.json"
 
     @property
     def recording(self) -> Path:

@@ -51,7 +51,7 @@ class CaseProcesses:
         # hosts without address, by the robots that are started there
         self.away = standby.robots_without_address(context.experiment)
         self._addressed, self._reached = context.file, context.experiment
-        self._joining = context.folder / f"{context.case}-joining.json"
+        self._joining = context.variant("joining")
         self._abroad: dict[str, Process] = {}  # by host and group
 
     def prepare(self, *, recorder: bool = True) -> None:
@@ -63,7 +63,7 @@ class CaseProcesses:
             context.start("recorder", module, *files, "--name", context.case, "--source", str(context.source))
         self._reached = self._servants.start()
         if self._servants.standins:
-            self._addressed = context.folder / f"{context.case}-addressed.json"
+            self._addressed = context.variant("addressed")
             self._addressed.write_bytes(write_json(self._reached))
 
     def adopt(self, there: Iterable[str]) -> list[str]:
@@ -79,7 +79,7 @@ class CaseProcesses:
         robots, file, experiment = self._context.experiment.robots, self._addressed, self._reached
         if changed:
             experiment = msgspec.structs.replace(experiment, robots={**experiment.robots, **changed})
-            file = self._context.folder / f"{self._context.case}-changed.json"
+            file = self._context.variant("changed")
             file.write_bytes(write_json(experiment))
         for names in self._groups.values():
             wanted = names if only is None else [name for name in names if name in only]

@@ -63,6 +63,7 @@ class CaseRun:
         """Write the case as a file for its processes; nothing is started yet."""
         self._context, self._show = context, show
         self._experiment = experiment = context.experiment
+        context.file.parent.mkdir(parents=True, exist_ok=True)
         context.file.write_bytes(write_json(experiment))
         self._keys = Keys(experiment.network.realm)
         # of each case, for all its processes here, however late they start

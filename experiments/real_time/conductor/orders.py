@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import zenoh
@@ -41,20 +42,18 @@ def send_order(
 
     A robot that hangs costs the others no time: each has the order before the first answer is waited for.
     """
-    payload = messages.encode(order)
-    asked = {robot: session.get(keys.order(robot), payload=payload, encoding=messages.JSON, timeout=wait_s)
-             for robot in robots}  # fmt: skip
+    asked = {robot: _ask(session, keys.order(robot), order, wait_s) for robot in robots}
     replies = {}
     for robot, answers in asked.items():
-        reply, why = _read(answers, messages.Reply)
+        reply, why = _read(answers, keys.order(robot), messages.Reply, partial(_is_of, robot))
         replies[robot] = reply or messages.Reply(robot, ok=False, phase="unknown", reason=why or "no answer")
     return replies
 
 
 def send_world_order(session: zenoh.Session, keys: Keys, order: messages.WorldOrder) -> messages.WorldReply:
     """Give an order to the world and return its reply; one that says no, and why, when it does not answer."""
-    asked = session.get(keys.world_order, payload=messages.encode(order), encoding=messages.JSON, timeout=REPLY_S)
-    reply, why = _read(asked, messages.WorldReply)
+    asked = _ask(session, keys.world_order, order, REPLY_S)
+    reply, why = _read(asked, keys.world_order, messages.WorldReply)
     nobody = "no world answers: is `./zenpark world serve` running in this realm?"
     return reply or messages.WorldReply(ok=False, paused=False, time=0.0, reason=why or nobody)
 
@@ -63,8 +62,8 @@ def send_run_order(
     session: zenoh.Session, keys: Keys, order: messages.RunOrder, wait_s: float = CHANGE_S
 ) -> messages.RunReply:
     """Give an order to the conductor and return its reply when all is done, or that no conductor answers."""
-    asked = session.get(keys.run_order, payload=messages.encode(order), encoding=messages.JSON, timeout=wait_s)
-    reply, why = _read(asked, messages.RunReply)
+    asked = _ask(session, keys.run_order, order, wait_s)
+    reply, why = _read(asked, keys.run_order, messages.RunReply)
     nobody = (
         "no conductor answers: is `./zenpark run` running in this realm, at this router (--connect), and is this an "
         "operator (--as)?"
@@ -72,15 +71,42 @@ def send_run_order(
     return reply or messages.RunReply(reason=why or nobody)
 
 
-def _read(asked: Iterable[zenoh.Reply], kind: type[R]) -> tuple[R | None, str]:
-    """The reply, or the reason why there is none; empty without any answer."""
+def _ask(
+    session: zenoh.Session, key: str, order: messages.Order | messages.WorldOrder | messages.RunOrder, wait_s: float
+) -> Iterable[zenoh.Reply]:
+    """Replies to an order, of all that answer on its key.
+
+    A storage of the network may answer as well. By default Zenoh asks the nearest complete queryable alone, and merges
+    the replies on one key.
+    """
+    return session.get(
+        key,
+        payload=messages.encode(order),
+        encoding=messages.JSON,
+        timeout=wait_s,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+    )
+
+
+def _is_of(robot: str, reply: messages.Reply) -> bool:
+    return reply.robot == robot
+
+
+def _read(
+    asked: Iterable[zenoh.Reply], key: str, kind: type[R], wanted: Callable[[R], bool] = lambda _: True
+) -> tuple[R | None, str]:
+    """The first wanted reply on the key, or the reason why there is none; empty without any answer."""
     why = ""
     for reply in asked:
-        if reply.ok is not None:
+        if reply.ok is not None and str(reply.ok.key_expr) == key:
             try:
-                return messages.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), kind), ""
+                found = messages.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), kind)
             except messages.Malformed as error:
-                why = f"malformed reply: {error}"
+                why = why or f"malformed reply: {error}"
+            else:
+                if wanted(found):
+                    return found, ""
         elif reply.err is not None:
             why = reply.err.payload.to_bytes().decode(errors="replace")
     return None, why

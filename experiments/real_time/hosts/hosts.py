@@ -36,7 +36,7 @@ ANSWER_S: Final = 5.0
 SAMPLES: Final = 24
 HANDSHAKES: Final = 6  # at once with one machine: sshd refuses some of more than ten (MaxStartups)
 POLL_S: Final = 0.02
-STATION: Final = "host-"  # prefix of the process of the connection to a host
+STATION: Final = "host@"  # prefix of the process of the connection to a host: no name of a case has this sign
 
 
 class HostError(ExplainedError):

@@ -72,6 +72,8 @@ EXPECTED = [
     ("parameter-of-another", 3, 32, "unknown parameter 'threshold' of 'periodic'", "it is a parameter of 'pred"),
     ("plan-missing", 11, 8, "'radius' is missing in 'plan'", "add radius ="),
     ("plan-own-check", 11, 52, "`radius` must be a number other than 0", ""),
+    ("process-like-robot", 7, 11, "'KH02' is the name of a robot", "rename the process"),
+    ("process-of-a-role", 7, 11, "'recorder' is a process of every run", "rename it"),
     ("rate-not-dividing", 10, 11, "pose_hz = 40 does not divide body_hz = 100", "pose_hz = 50"),
     ("reserved-name", 4, 9, "a robot cannot be called 'run'", "rename it"),
     ("robot-twice", 13, 1, "[robots.KH01] stands here a second time, first in line 4", "rename or remove"),
@@ -133,6 +135,12 @@ def test_a_malformed_file_is_refused_where_it_is_wrong_with_a_remedy(name):
         assert remedy in problem.hint
         assert problem.message in str(error)
         assert problem.hint in str(error)
+
+
+@pytest.mark.parametrize("name", ["recorder", "world", "centre", "vicon", "conductor", "mean"])
+def test_roles_of_a_run_name_no_robot(write, name):
+    (problem,) = refused(write(MINIMAL.replace("KH01", name))).problems
+    assert (problem.line, problem.column) == (3, 9)
 
 
 def test_every_malformed_file_is_expected_and_there():

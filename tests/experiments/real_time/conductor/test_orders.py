@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import msgspec
 import pytest
+import zenoh
 
 from agents.clock import Clock
 from agents.network import messages, pubsub
@@ -23,7 +25,10 @@ KEYS = Keys()
 @pytest.mark.mechanism("orders to several robots at once")
 @pytest.mark.system
 def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProcess) -> None:
-    """The first answers only when the last has the order: whoever is asked one after the other waits in vain."""
+    """The first answers only when the last has the order: whoever is asked one after the other waits in vain.
+
+    A storage of the network, nearer and complete, answers with what was put there by mistake.
+    """
     names = ["A", "B", "C"]
     over = threading.Event()
 
@@ -40,10 +45,16 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
                         query.reply(KEYS.order(name), messages.encode(reply), encoding=messages.JSON)
                 waiting = {}
 
+    def recall(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, b'{"order": "land"}', encoding=messages.JSON)
+
     with (
+        network.open_session([router.endpoint], name="storage") as storage,
         network.open_session([router.endpoint], name="robots") as robots,
         network.open_session([router.endpoint], name="conductor") as conductor,
     ):
+        storage.declare_queryable(KEYS.everything, recall, complete=True)
         told = {name: pubsub.Orders(robots, KEYS.order(name), messages.Order) for name in names}
         thread = threading.Thread(target=answer)
         thread.start()
@@ -52,9 +63,32 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
         finally:
             over.set()
             thread.join()
+    unread = "malformed reply: not a Reply: Object contains unknown field `order`"
     assert [(name, reply.ok, reply.reason) for name, reply in replies.items()] == [
-        ("A", True, ""), ("B", False, "no"), ("C", True, ""), ("D", False, "no answer"),
+        ("A", True, ""), ("B", False, "no"), ("C", True, ""), ("D", False, unread),
     ]  # fmt: skip
+
+
+class Replies:
+    """Stands for a session, and replies to each query with the same samples."""
+
+    def __init__(self, *said: tuple[str, messages.Reply]) -> None:
+        self._said = said
+
+    def get(self, *_: object, **__: object) -> list[SimpleNamespace]:
+        return [
+            SimpleNamespace(ok=SimpleNamespace(key_expr=key, payload=zenoh.ZBytes(messages.encode(reply)),
+                                               encoding=messages.JSON), err=None)
+            for key, reply in self._said
+        ]  # fmt: skip
+
+
+def test_replies_of_another_key_or_robot_are_none() -> None:
+    good = messages.Reply("A", ok=False, phase="ready", reason="not now")
+    late = messages.Reply("A", ok=True, phase="ready", reason="")
+    others = messages.Reply("B", ok=True, phase="ready", reason="")
+    session = Replies((KEYS.order("A"), others), (KEYS.order("B"), late), (KEYS.order("A"), good))
+    assert orders.send_order(session, KEYS, ["A"], messages.Order("hold")) == {"A": good}  # type: ignore[arg-type]
 
 
 def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:

@@ -70,3 +70,16 @@ def test_a_launcher_that_stood_still_knows_when_its_robots_have_landed(tmp_path,
         with monkeypatch.context() as patched:
             patched.setattr(time, "monotonic", lambda at=zero + since: at)
             assert launcher.last_silence == silence
+
+
+@pytest.mark.parametrize("word", ["experiment", "joining", "changed", "addressed"])
+def test_no_name_of_a_case_shares_a_file(tmp_path, word):
+    hosts, experiment = Hosts(Starts(), []), document.read("triangle").experiment
+    names = ["rights", "run", "metrics", "x", "x-joining", "x-changed", "cases"]
+    files = [
+        CaseContext(experiment, name, tmp_path, tmp_path / "a.toml", [], Starts(), hosts).variant(word)
+        for name in names
+    ]
+    assert len(set(files)) == len(names)
+    assert all(file.relative_to(tmp_path).parts[0] == "cases" for file in files)
+    assert all(len(file.relative_to(tmp_path).parts) == 3 for file in files)
