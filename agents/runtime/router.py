@@ -20,7 +20,7 @@ from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
-from agents.network.session import deserted, prompt_threads
+from agents.network.session import deserted, forbid_lingering, prompt_threads
 from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
@@ -31,8 +31,8 @@ EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connecti
 LOOK_S: Final = 0.1
 PORT_FREE_S: Final = 10.0  # limit for the port of a router that restarts to become free
 AGAIN_S: Final = 0.1
-# Period of the checks for revoked certificates and for signals: a signal that the kernel delivers to another thread, as
-# after a SIGCONT, does not wake the waiting one.
+# Period of the checks for new connections, for revoked certificates and for signals: a signal that the kernel delivers
+# to another thread, as after a SIGCONT, does not wake the waiting one.
 LOOK_AGAIN_S: Final = 0.5
 
 
@@ -105,6 +105,7 @@ def serve_router(
             ready(session)
             patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
+                forbid_lingering()
                 if (now := _stamp(register)) == read:
                     continue
                 read = now

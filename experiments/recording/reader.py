@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -24,10 +25,13 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from agents.errors import ExplainedError
+from agents.network.messages import Event
 from experiments.recording.topics import CHUNK_BYTES, TOPICS
 
 _RECORD: Final = struct.Struct("<BQ")  # operation code, length of what follows
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # the same, and channel, sequence, log time, publish time of a message
+EVENTS: Final = next(topic.name for topic in TOPICS if topic.message is Event)
+PARTS: Final = "cases"  # folder beside a recording: in that of its case are its later parts
 HEAD: Final = np.dtype([("", "u1"), ("length", "<u8"), ("channel", "<u2"), ("", "<u4, <u8"), ("published", "<u8")])
 _DAMAGE: Final = (McapError, struct.error, zstandard.ZstdError, ValueError, RuntimeError, OverflowError, MemoryError)
 
@@ -154,24 +158,42 @@ class Recovered:
     complete: bool  # the source was whole already, and no target was written
 
 
-def recover(source: Path, target: Path) -> Recovered:
-    """Writes every whole record of an unfinished recording into a new, finished one. The source stays as it is.
+def later_parts(recording: Path) -> list[Path]:
+    """Parts of a recording by recorders that took over in its run, and that nobody has joined to it."""
+    folder = recording.parent / PARTS / recording.stem
+    return sorted(folder.glob("part*.mcap"), key=lambda file: (len(file.name), file.name))
 
-    Raises RecordingError if the source is no recording, or the target exists or cannot be written.
+
+def recover(source: Path, target: Path, later: Sequence[Path] = ()) -> Recovered:
+    """Writes every whole record of an unfinished recording into a new, finished one. The sources stay as they are.
+
+    Args:
+        later: Further parts of the same recording, by recorders that took over. What they repeat is left out, and those
+            without a record as well.
+
+    Raises:
+        RecordingError: If the source is no recording, or the target exists or cannot be written.
     """
-    records = Records(source)
-    messages = sum(1 for _ in records.messages())
-    robots = tuple(dict.fromkeys(_robot(channel) for channel in records.channels.values()))
-    if not records.complete:
-        _write(records, target)
-    return Recovered(messages, tuple(robot for robot in robots if robot), records.complete)
+    parts = [Records(source)]
+    messages = sum(1 for _ in parts[0].messages())
+    for path in later:
+        part = Records(path)
+        with suppress(RecordingError):  # killed before its first record
+            messages += sum(1 for _ in part.messages())
+            parts.append(part)
+    channels = [channel for part in parts for channel in part.channels.values()]
+    robots = tuple(dict.fromkeys(filter(None, map(_robot, channels))))
+    complete = parts[0].complete and len(parts) == 1
+    if not complete:
+        _write(parts, target)
+    return Recovered(messages, robots, complete)
 
 
-def _write(records: Records, target: Path) -> None:
+def _write(parts: Sequence[Records], target: Path) -> None:
     """Write all that was read."""
     try:
         with target.open("xb") as file:
-            _copy(records, Writer(file, chunk_size=CHUNK_BYTES))
+            _copy(parts, Writer(file, chunk_size=CHUNK_BYTES))
     except FileExistsError:
         raise RecordingError(f"{target}: exists already; recover under another name") from None
     except RecordingError:
@@ -182,26 +204,58 @@ def _write(records: Records, target: Path) -> None:
         raise RecordingError(f"{target}: cannot be written: {error.strerror}; recover to somewhere else") from error
 
 
-def _copy(records: Records, writer: Writer) -> None:
-    header = records.header
+def _copy(parts: Sequence[Records], writer: Writer) -> None:
+    first = parts[0]
+    header = first.header
     writer.start(header.profile if header else "", header.library if header else "zenpark")
-    schemas = {0: 0}  # MCAP's own mark for: none
-    for old, schema in records.schemas.items():
-        schemas[old] = writer.register_schema(schema.name, schema.encoding, schema.data)
-    channels = {
-        old: writer.register_channel(each.topic, each.message_encoding, schemas.get(each.schema_id, 0), each.metadata)
-        for old, each in records.channels.items()
-    }
-    for message in Records(records.path).messages():
-        channel = channels[message.channel]
-        writer.add_message(channel, message.logged, message.data, message.published, message.sequence)
-    for attachment in records.attachments:
+    schemas: dict[tuple[str, str, bytes], int] = {}
+    channels: dict[tuple[str, int], int] = {}
+    repeats = _Repeats()
+    for part in parts:
+        made = {0: 0}  # MCAP's own mark for: none
+        for old, schema in part.schemas.items():
+            about = (schema.name, schema.encoding, schema.data)
+            made[old] = schemas.get(about) or schemas.setdefault(about, writer.register_schema(*about))
+        places: dict[int, int] = {}
+        for old, each in part.channels.items():
+            named = (each.topic, made.get(each.schema_id, 0))
+            if named not in channels:
+                channels[named] = writer.register_channel(each.topic, each.message_encoding, named[1], each.metadata)
+            places[old] = channels[named]
+        for message in Records(part.path).messages():
+            channel = places[message.channel]
+            if part is first or not repeats.has(channel, message):
+                writer.add_message(channel, message.logged, message.data, message.published, message.sequence)
+            if len(parts) > 1:
+                repeats.keep(channel, message, part.channels[message.channel].topic)
+    for attachment in first.attachments:
         writer.add_attachment(
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
         )
-    for metadata in records.metadata:
+    for metadata in first.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     writer.finish()  # type: ignore[no-untyped-call]
+
+
+class _Repeats:
+    """Last values that publishers repeat to a recorder that took over."""
+
+    def __init__(self) -> None:
+        self._events: set[tuple[int, bytes]] = set()  # few, and not in the order of their stamps
+        self._latest: dict[int, int] = {}  # [ns] stamp of all other messages, by channel
+        self._unordered: set[int] = set()
+
+    def has(self, channel: int, message: Message) -> bool:
+        if channel in self._unordered:
+            return (message.published, message.data) in self._events
+        return message.published <= self._latest.get(channel, -1)
+
+    def keep(self, channel: int, message: Message, topic: str) -> None:
+        if topic == EVENTS:
+            self._unordered.add(channel)
+            self._events.add((message.published, message.data))
+        else:
+            self._latest[channel] = max(self._latest.get(channel, -1), message.published)
 
 
 def _robot(channel: Channel) -> str:

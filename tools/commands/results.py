@@ -336,11 +336,12 @@ def recover(
     as_json: AsJson = False,
 ) -> None:
     """Repair a recording whose writer was killed."""
+    from experiments.recording.reader import later_parts
     from experiments.recording.reader import recover as repair
 
     source = Path(file)
     chosen = Path(target) if target else source.with_name(f"{source.stem}-recovered.mcap")
-    found = repair(source, chosen)
+    found = repair(source, chosen, later_parts(source))
     made = f"{source} is whole already" if found.complete else str(chosen)
     shown = {"file": source if found.complete else chosen, "was_whole": found.complete}
     print_result(

@@ -143,13 +143,14 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         if not runs[0].traces:
             why = stopped or "interrupted"
             print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
-            return code or 130
+            return code or (FAILED if stopped else 130)
         _write(runs, folder, show)
         if stopped:
             print(f"zenpark: {stopped}", file=sys.stderr)
-        if not code and (failures := verdict.failures([case for each in runs for case in each.metrics.values()])):
+        if not code:
+            failures = verdict.failures([case for each in runs for case in each.metrics.values()])
             warn([finding.text for finding in failures])
-            code = FAILED
+            code = FAILED if failures or stopped else 0
         return code if former is None else max(code, _print_differences(folder, former))
     finally:
         remove_unused(folder)
@@ -255,7 +256,8 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     """Run in real time.
 
     Returns:
-        The run, none if it was ended at once; the reason of an emergency stop, else empty; the exit code.
+        The run, none if it was ended at once; the reason of an emergency stop or of a failure, else empty; the exit
+        code.
     """
     from agents.runtime.command_line import interrupts
     from experiments.real_time.conductor.conduct import Supervision, conduct
@@ -267,11 +269,13 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
     with interrupts() as interrupted:
         try:
             user = Supervision(shown(quiet=quiet), interrupted, emergency, tell=warn)
-            runs = [read_back(folder, *conduct(read, folder, options, user))]
+            ended = conduct(read, folder, options, user)
+            runs = [read_back(folder, ended.recordings, ended.notes)]
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
-    return runs, emergency.words, STOPPED if emergency else 130 if interrupted() else 0
+    failed = f"failed: {'; '.join(ended.failures)}" if ended.failures and not interrupted() else ""
+    return runs, emergency.words or failed, STOPPED if emergency else 130 if interrupted() else 0
 
 
 def _write(runs: Sequence[Run], folder: Path, show: _Shown) -> None:

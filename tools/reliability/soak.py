@@ -30,6 +30,7 @@ def soak(
     from agents.runtime.command_line import interrupts
     from experiments.file.document import chosen, load
     from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
+    from experiments.real_time.conductor.run_view import RunFailed
     from experiments.recording.run_folder import new_folder
     from tools.progress import finding_lines
     from tools.reliability import soak_verdict
@@ -42,7 +43,9 @@ def soak(
     with interrupts() as interrupted:
         user = Supervision(sampler, interrupted)
         try:
-            conduct(read, folder, RunOptions([name], bodies, here=True), user)
+            ended = conduct(read, folder, RunOptions([name], bodies, here=True), user)
+            if ended.failures and not interrupted():
+                sampler.end_early(RunFailed("; ".join(ended.failures)))
         except ExplainedError as error:
             sampler.end_early(error)
         soaked = sampler.result(interrupted=interrupted() or bool(user.emergency))

@@ -10,6 +10,7 @@ from experiments.definition.experiment import Experiment
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher, Process
+from experiments.recording.reader import PARTS
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,11 @@ class CaseContext:
 
     def variant(self, word: str) -> Path:
         """File of a variant of the case, in a folder that no other file of the run can share, however it is called."""
-        return self.folder / "cases" / self.case / f"{word}.json"
+        return self.folder / PARTS / self.case / f"{word}.json"
 
     @property
     def recording(self) -> Path:
-        """The file of the recorder."""
+        """The file of the recorder; a recorder that is started again writes another, see `CaseProcesses.join_parts`."""
         return self.folder / f"{self.case}.mcap"
 
     def ended(self) -> bool:

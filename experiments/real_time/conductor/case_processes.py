@@ -23,6 +23,7 @@ from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.support import Servants
 from experiments.real_time.hosts.hosts import STATION
 from experiments.real_time.hosts.launcher import LAND_S, Process
+from experiments.recording.reader import RecordingError, recover
 
 ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
 
@@ -31,7 +32,7 @@ ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for
 class Death:
     """Unexpected end of a process."""
 
-    # "recorder", "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or the role of
+    # "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or the role of
     # a process that was started again
     kind: str
     source: str  # robot or host concerned, or "conductor"
@@ -52,19 +53,52 @@ class CaseProcesses:
         self.away = standby.robots_without_address(context.experiment)
         self._addressed, self._reached = context.file, context.experiment
         self._joining = context.variant("joining")
+        self._parts: list[Path] = []  # recordings of this case, one of each recorder
         self._abroad: dict[str, Process] = {}  # by host and group
 
     def prepare(self, *, recorder: bool = True) -> None:
         """Start all but router and robots: the recorder, if one is wanted, then what robots need."""
         context = self._context
         if recorder:
-            files = str(context.file), str(context.recording)
-            module = "experiments.real_time.processes.recorder"
-            context.start("recorder", module, *files, "--name", context.case, "--source", str(context.source))
+            missing = ": messages from between are missing in the recording"
+            self._servants.supervise(self._record, missing, ": the recording stops here")
         self._reached = self._servants.start()
         if self._servants.standins:
             self._addressed = context.variant("addressed")
             self._addressed.write_bytes(write_json(self._reached))
+
+    def _record(self) -> Process:
+        """Start a recorder, which writes a file of its own."""
+        context = self._context
+        first = not self._parts
+        self._parts.append(context.recording if first else context.file.with_name(f"part{len(self._parts) + 1}.mcap"))
+        module = "experiments.real_time.processes.recorder"
+        files = str(context.file), str(self._parts[-1])
+        return context.start("recorder", module, *files, "--name", context.case, "--source", str(context.source))
+
+    @property
+    def recording(self) -> bool:
+        """Whether a recorder runs."""
+        return self._launcher.running(self._context.process("recorder"))
+
+    def kill_recorder(self) -> None:
+        """Kill a recorder that stands still; it is started again."""
+        self._launcher.kill(self._context.process("recorder"))
+
+    def join_parts(self) -> str:
+        """Join the files of all recorders of the case, which have ended; return why that failed, else an empty text."""
+        if len(self._parts) < 2:
+            return ""
+        first, *later = self._parts
+        joined = first.with_suffix(".joined")
+        try:
+            recover(first, joined, later)
+            joined.replace(first)
+            for part in later:
+                part.unlink(missing_ok=True)
+        except (RecordingError, OSError) as error:
+            return f"the parts of the recording are not joined: {error}"
+        return ""
 
     def adopt(self, there: Iterable[str]) -> list[str]:
         """Adopt robots that are `there`, and those of hosts without address, which are not started; returns all."""
@@ -157,7 +191,8 @@ class CaseProcesses:
         return [name for process in self._launcher.end(groups, grace_s=LAND_S) for name in groups[process.name]]
 
     def deaths(self) -> Iterator[Death]:
-        """Processes that ended since the last call; router, world, centre and positioning restart, a few times."""
+        """Processes that ended since the last call; recorder, router, world, centre and positioning restart,
+        a few times."""
         for process in self._launcher.died():
             again = self._servants.again(process)
             if again is not None:
@@ -166,8 +201,6 @@ class CaseProcesses:
                 what = process.name.removeprefix(self._context.process(""))
                 text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
                 yield Death("device", "conductor", text)
-            elif process.name == self._context.process("recorder"):
-                yield Death("recorder", "conductor", f"the recorder ended ({process.exit}); the recording stops here")
             elif process.name.startswith(STATION):
                 what = f"the connection to it ended ({process.exit}); without a router robots hold{process.because}"
                 yield Death("host", process.name.removeprefix(STATION), what)

@@ -63,14 +63,20 @@ class Supervision:
     launching: Callable[[Path], Launcher] = Launcher  # makes the launcher of the processes, by the folder of their logs
 
 
-def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision) -> tuple[dict[str, Path], list[str]]:
+@dataclass(frozen=True)
+class Conducted:
+    """End of a run in real time."""
+
+    recordings: dict[str, Path]  # of the cases that have begun, by name
+    notes: list[str]  # for the reader
+    failures: list[str]  # that the recordings may not tell: the run is spoilt
+
+
+def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision) -> Conducted:
     """Run an experiment in real time: a router, a process per robot, a recorder.
 
     Args:
         user: After an interrupt or an emergency stop no further case begins.
-
-    Returns:
-        The recordings of the cases that have begun, and notes for the reader.
 
     Raises:
         LabError: If a certificate is missing.
@@ -91,10 +97,9 @@ def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision
             results[name] = Conductor(stage.context(name), show).run()
     unflown = ", ".join(name for name in embodied if name not in results)
     stopped = [emergency.words + (f"; not run: {unflown}" if unflown else "")] if emergency else []
-    notes = (
-        stopped + [f"{case}: lost {', '.join(result.lost)}" for case, result in results.items() if result.lost]
-    ) + stage.left
-    return {case: result.recording for case, result in results.items() if result.start is not None}, notes
+    failures = [f"{case}: {why}" for case, result in results.items() for why in result.failures]
+    begun = {case: result.recording for case, result in results.items() if result.start is not None}
+    return Conducted(begun, [*stopped, *failures, *stage.left], failures)
 
 
 def embody(read: Document, staging: RunOptions) -> dict[str, Experiment]:

@@ -34,6 +34,7 @@ from experiments.real_time.conductor.run_view import (
 )
 from experiments.real_time.hosts.clock_drift import Drift
 from experiments.real_time.hosts.launcher import LAND_S
+from experiments.recording.playback import EARLY_S
 
 POLL_S: Final = 0.05
 TARDY_S: Final = 0.05  # robots that begin later than this after the common start are reported
@@ -52,6 +53,7 @@ class CaseResult:
     start: float | None
     ready_s: float | None
     lost: tuple[str, ...]
+    failures: tuple[str, ...] = ()  # that its recording may not tell
 
 
 class CaseRun:
@@ -100,6 +102,7 @@ class Conductor(CaseRun):
         self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
         clocks = self._context.hosts.join(self._experiment)
         start = ready = None
+        self._failures: list[str] = []
         try:
             self._processes.prepare()
             with ExitStack() as stack:
@@ -128,8 +131,10 @@ class Conductor(CaseRun):
             raise
         finally:
             self._processes.end()
+            parted = self._processes.join_parts()
         lost = tuple(name for name, view in self._robots.items() if view.left_because == "lost")
-        return CaseResult(self._context.recording, start, ready, lost)
+        failures = [*([f"lost {', '.join(lost)}"] if lost else []), *self._failures, *([parted] if parted else [])]
+        return CaseResult(self._context.recording, start, ready, lost, tuple(failures))
 
     def _join(self, stack: ExitStack) -> None:
         super()._join(stack)
@@ -175,6 +180,8 @@ class Conductor(CaseRun):
             lost = [name for name, view in self._robots.items() if view.left_because == "lost"]
             if lost and self._experiment.start.missing == "abort":
                 raise RunFailed(self._start_failure(lost, "could not start"))
+            if recorder and not self._processes.recording:
+                raise RunFailed("nothing would be recorded: the recorder ended each time; its log says why")
             if not late and (not recorder or self._view.recording_begun):
                 return True
             if time.monotonic() > deadline:
@@ -235,6 +242,9 @@ class Conductor(CaseRun):
             busy = self._changes.under_way
             left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
             if all(view.reached("landing") for view in left) and (left or not busy):
+                if now < end - EARLY_S:
+                    what = "all robots had landed" if left else "no robot was left"
+                    self._failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
                 return
             time.sleep(POLL_S)
 
@@ -308,13 +318,17 @@ class Conductor(CaseRun):
                 continue
             report(death.kind, death.source, death.text)
             if death.kind == "recorder":
-                self._view.recording_begun = True  # nothing to wait for
+                self._view.await_recorder()
+                if self._progress.elapsed is not None:
+                    self._failures.append(death.text)
             elif death.kind == "lost":
                 self._robots[death.source].alive = False
                 self._changes.mark_lost(death.source)
         for name, view in self._robots.items():
             if view.left_because == "lost" and view.alive and view.status is not None and now - view.status.stamp < 1.0:
                 self._come_back(name, view)
+        if self._view.recorder_stands_still:
+            self._processes.kill_recorder()
         self._changes.advance()
         self._show_progress()
 

@@ -31,6 +31,7 @@ BEHIND_S: Final = 0.5  # and what always takes this long, from one that is behin
 FROZEN_S: Final = 3.0  # a robot whose status is older than this is shown as silent
 ROUTER_S: Final = 10.0  # limit for a router that was just started to answer
 MISSED_S: Final = 1.0  # a robot that changes from one router to another is back sooner
+STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
 # beginnings of reasons for a landing that a user or the conductor wanted; every other one is a fault
 ASKED: Final = (FINISHED, "ordered to ", messages.EMERGENCY, TOLD_TO_END)
 OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
@@ -148,9 +149,19 @@ class NetworkView:
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self._recorder_watch = pubsub.AliveWatch(session, keys.recorder)
         self.recording_begun = False  # the recorder is there
+        self._recorder_vanished = inf  # [s, monotonic] loss of its token; infinity while it stands, or before its first
         self._cut_off = -inf
         self._router = network.RouterWatch(session, keys.conductor, endpoints)
         self._safety, self._mesh = experiment.safety, topology.is_mesh(endpoints)
+
+    @property
+    def recorder_stands_still(self) -> bool:
+        """Whether the recorder has been out of the network for long, although the router answers."""
+        return time.monotonic() - max(self._recorder_vanished, self._cut_off) > STILL_S
+
+    def await_recorder(self) -> None:
+        """Forget the recorder, which has ended."""
+        self.recording_begun, self._recorder_vanished = False, inf
 
     def refuse_joining(self) -> None:
         """Robots that join from now on wait for the next run."""
@@ -167,7 +178,9 @@ class NetworkView:
                 f"this process stood still for more than {SILENCE_S:g} s; its robots have landed without it, and get "
                 "no further order: robots of these names may belong to another run now"
             )
-        self.recording_begun |= any(there for _, there in self._recorder_watch.changes())
+        for _, there in self._recorder_watch.changes():
+            self.recording_begun |= there
+            self._recorder_vanished = inf if there else time.monotonic()
         for status in self._statuses.read():
             self._receive_status(status)
         self._progress.states = list(self._states.read())

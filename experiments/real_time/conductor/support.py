@@ -104,6 +104,10 @@ class Servants:
             for each in make_routers(context.hosts.routers, count)
         } | {context.process("world"): _Servant(partial(start_world, context))}
 
+    def supervise(self, start: Callable[[], Process], meanwhile: str, given_up: str) -> None:
+        """Start a process of the case, and again when it dies."""
+        self._known[start().name] = _Servant(start, meanwhile, given_up)
+
     def start(self) -> Experiment:
         """Start what the robots of the case need; return its experiment with the addresses of its robots.
 

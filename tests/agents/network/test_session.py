@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from math import inf
 from pathlib import Path
 
@@ -35,9 +37,11 @@ from agents.network.session import (
     Unreachable,
     connected,
     count_links,
+    forbid_lingering,
     open_session,
     received,
 )
+from agents.network.session import _connections as connections
 from agents.network.zenoh_config import LEASE_S, config, settings
 from agents.runtime.router import serve_router
 from tests.conftest import RouterProcess
@@ -543,3 +547,41 @@ def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
     with pytest.raises(OSError, match="cannot be told"):
         net.deliver(b"park/estop\0text/plain\0stop")
     assert alarm.try_recv() == Stop("an unknown sender", "stop")
+
+
+def lingers(connection: socket.socket) -> bool:
+    return bool(struct.unpack("ii", connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0])
+
+
+def test_a_connection_closes_without_lingering() -> None:
+    """A thread of Zenoh that closes the connection to a frozen process serves all others as well."""
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
+        far, _ = server.accept()
+        with far:
+            for each in (near, far):
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 10))
+            assert forbid_lingering() >= 2
+            assert not lingers(near)
+            assert not lingers(far)
+
+
+@pytest.mark.mechanism("router that closes without lingering")
+@pytest.mark.system
+def test_a_router_closes_no_connection_slowly(eventually) -> None:
+    """It serves in this process, so that its ends of the connections can be looked at."""
+    endpoint, stop = free_endpoint(preferred_port=0), threading.Event()
+    thread = threading.Thread(target=serve_router, args=([endpoint], stop))
+    thread.start()
+    try:
+        with open_session([endpoint], name="viewer"):
+            port = int(endpoint.rpartition(":")[2])
+
+            def ends() -> list[bool]:
+                with ExitStack() as opened:
+                    found = [opened.enter_context(each) for each in connections()]
+                    return [lingers(each) for each in found if each.getsockname()[1] == port]
+
+            eventually(lambda: ends() == [False])
+    finally:
+        stop.set()
+        thread.join()

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from agents.network.messages import Event, Pose
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, Recovered, recover
 from tests.experiments.recordings import DOCUMENT, begun, scattered, whole_run, write
@@ -114,6 +115,31 @@ def test_recovery_overwrites_nothing(path, tmp_path):
         recover(path, path)
     assert target.read_text() == "mine"
     assert not read(path).complete
+
+
+def test_a_recorder_that_took_over_completes_the_recording(path, tmp_path, capsys):
+    """Its first messages are the last values and the events that publishers repeat."""
+    run = sorted(whole_run(), key=lambda message: message.stamp)
+    first, rest = run[:50], run[50:]
+    repeated = [each for each in first if isinstance(each, Event)] + [
+        next(each for each in reversed(first) if isinstance(each, Pose))
+    ]
+    write(path, *first)
+    path.write_bytes(path.read_bytes()[:-1])
+    later = path.parent / "cases" / path.stem / "part2.mcap"
+    later.parent.mkdir(parents=True)
+    write(later, *repeated, *rest)
+    (later.parent / "part3.mcap").touch()  # killed before its first record
+    assert repeated
+    commands.recover(str(path), None)
+    whole = tmp_path / "whole.mcap"
+    write(whole, *run)
+    made, wanted = (read(file) for file in (path.with_name("run-recovered.mcap"), whole))
+    assert made.complete
+    assert made.messages == wanted.messages
+    np.testing.assert_array_equal(made.trace.position, wanted.trace.position)
+    np.testing.assert_array_equal(made.trace.sent.stamp, wanted.trace.sent.stamp)
+    assert made.trace.lost.tolist() == wanted.trace.lost.tolist()
 
 
 @pytest.mark.parametrize(

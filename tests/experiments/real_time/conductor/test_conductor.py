@@ -1,0 +1,115 @@
+"""The course of a case without network and processes: when it is over, and what spoils it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from experiments.file import document
+from experiments.real_time.conductor import conductor as module
+from experiments.real_time.conductor.case_processes import Death
+from experiments.real_time.conductor.conductor import Conductor
+from experiments.real_time.conductor.run_view import Progress, RobotView, RunFailed
+from tests.experiments.recordings import START, status
+
+EXPERIMENT = msgspec.structs.replace(document.read("triangle").experiment, duration_s=10.0)
+STEP_S = 0.5  # of the clock, at each look at it
+DEAD = Death("recorder", "conductor", "the recorder ended (killed by SIGKILL); started again")
+
+
+class Clock:
+    now = START
+
+    def utc(self) -> float:
+        self.now += STEP_S
+        return self.now
+
+
+class Course(Conductor):
+    """A conductor whose robots are in `phases`, by the time since the common start."""
+
+    def __init__(self, phases: dict[float, str], deaths: dict[float, Death] | None = None) -> None:
+        self._clock: Any = Clock()
+        self._experiment = EXPERIMENT
+        self._robots = {name: RobotView() for name in EXPERIMENT.robots}
+        self._progress = Progress("only", "", None, 10.0, self._robots)
+        self._phases, self._deaths = phases, deaths or {}
+        self._failures: list[str] = []
+        self._starting: set[str] = set()
+        self.killed = 0
+        nothing: Any = SimpleNamespace(
+            under_way=set(), begin=lambda _: None, advance=lambda: None, news=lambda: ((), ())
+        )
+        self._changes = self._drift = nothing
+        self._context: Any = SimpleNamespace(ended=lambda: False)
+        self._processes: Any = SimpleNamespace(
+            deaths=self._died, recording=True, kill_recorder=lambda: setattr(self, "killed", self.killed + 1)
+        )
+        self._view: Any = SimpleNamespace(
+            update=self._phase, report=lambda *_, **__: None, report_drift=lambda *_: None, order=lambda *_: {},
+            recorder_stands_still=False, recording_begun=True, await_recorder=lambda: None,
+        )  # fmt: skip
+
+    def _show_progress(self) -> None: ...
+
+    def _phase(self) -> list[str]:
+        now = self._clock.now - START
+        phase = next(said for at, said in sorted(self._phases.items(), reverse=True) if now >= at)
+        for name, view in self._robots.items():
+            view.status = msgspec.structs.replace(status(name, at=now), phase=phase)
+        return []
+
+    def _died(self) -> list[Death]:
+        return [self._deaths.pop(at) for at in list(self._deaths) if self._clock.now - START >= at]
+
+
+@pytest.fixture(autouse=True)
+def _without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "time", SimpleNamespace(sleep=lambda _: None, monotonic=lambda: 0.0))
+
+
+@pytest.mark.parametrize(
+    ("landing", "failures"),
+    [(3.0, ["all robots had landed after 3.0 of 10 s"]), (9.6, []), (10.2, [])],
+)
+def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) -> None:
+    course = Course({0.0: "running", landing: "landing"})
+    course._walk(START)
+    assert [text.replace("3.5", "3.0") for text in course._failures] == failures
+
+
+def test_a_run_without_any_robot_left_has_failed() -> None:
+    course = Course({0.0: "running"})
+    for view in course._robots.values():
+        view.left_because = "lost"
+    course._walk(START)
+    assert [text.partition(" after")[0] for text in course._failures] == ["no robot was left"]
+
+
+def test_a_recorder_that_dies_spoils_the_run() -> None:
+    course = Course({0.0: "running", 10.0: "landing"}, {4.0: DEAD})
+    course._walk(START)
+    assert course._failures == [DEAD.text]
+
+
+def test_a_recorder_is_awaited_again_before_the_start() -> None:
+    course = Course({0.0: "ready"}, {0.0: DEAD})
+    assert course._await_phase("ready", 10.0, recorder=True)
+    assert course._failures == []
+
+
+def test_nothing_flies_without_a_recorder() -> None:
+    course = Course({0.0: "ready"})
+    course._processes.recording = False
+    with pytest.raises(RunFailed, match="nothing would be recorded"):
+        course._await_phase("ready", 10.0, recorder=True)
+
+
+def test_a_recorder_that_stands_still_is_killed() -> None:
+    course = Course({0.0: "running"})
+    course._view.recorder_stands_still = True
+    course._update()
+    assert course.killed == 1
