@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from enum import Enum
 from typing import Final
@@ -22,11 +23,11 @@ from bridges.crazyflie.telemetry import Telemetry
 from bridges.crazyflie.trajectory import HOLD_S, SINK, Target
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs
-DESCENT: Final = 0.2  # [m/s] mean speed of landings: never 0.5 m/s
+DESCENT: Final = 0.22  # [m/s] mean speed of landings: never 0.5 m/s
+UNKNOWN: Final = 3.0  # [m] height from which a drone that has reported none is landed
 FLOOR: Final = -0.1  # [m] where they end: the motors stop there, and the drone lags behind
 SHORTEST_S: Final = 1.5  # duration of a take-off or landing
 UPLOAD_S: Final = 3.0  # limit for writing a climb, part by part
-LONGEST_S: Final = 8.0  # duration of a landing, which others wait 15 s for
 REPLY_S: Final = 0.15  # deadline of the reply to a high-level command; then the command is repeated
 TRIES: Final = 12
 ARMING_S: Final = 4.0  # motors that are checked one by one take seconds
@@ -45,6 +46,13 @@ PERIODS: Final = 2.5  # for so many periods of setpoints, and for `HOLD_S`, the 
 MARGIN_S: Final = 2.0  # a drone that nothing reaches is down so long after its trajectory has reached the floor
 HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignored
 AGAIN_S: Final = 3.0  # a landing that takes longer than planned by this is ordered again
+RELEASE_S: Final = 1.0  # period at which setpoints of another client are ended; after 2 s without new ones they lock it
+LAND_S: Final = 0.5  # period at which a landing is ordered again: setpoints of another client end it unnoticed,
+NEAR_S: Final = 1.0  # but not within this time of its end: after it the motors would start again;
+LOW: Final = 0.2  # [m] if the drone is higher then, it flies, or stands on a table:
+LATE_LANDINGS: Final = 3  # so many attempts
+STARTS: Final = 8  # trajectories that may be on board
+TURNED: Final = 0.35  # [rad] largest difference of the yaw on board from that of the external positions
 
 ANSWERS: Final[dict[int, str]] = {Status.BUSY: "not armed, or locked", Status.REFUSED: "its planner is busy"}
 
@@ -81,8 +89,18 @@ class Flight:
         self._begun = math.inf  # begin of the setpoint that is being sent [s]
         self._sent: Target | None = None  # last setpoint,
         self._sent_at = -math.inf  # [s]
+        self._released_at = -math.inf  # last end of other clients' setpoints [s]
         self._down_at = -math.inf  # by then the drone is down, if nothing more reaches it [s]
         self._top: Target | None = None  # end of the climb, held until the first setpoint
+        self._external = (math.nan, math.nan)  # height [m] and yaw [rad] that were measured from outside
+        self._ordered_span = SHORTEST_S  # duration of the last landing that was ordered [s]
+        self._late_landings = 0  # that were ordered and begun after their end
+        self._land_replies = 0  # of the planner to orders to land
+        self._armed_at = -math.inf  # last order to arm [s]
+        self._disarm_at = math.inf  # next order to disarm [s]; infinity: none
+        # heights [m] to which trajectories lead: of the last that is confirmed, and of those that are not
+        self._on_board: deque[float] = deque(maxlen=STARTS)
+        self._start_replies = 0  # of the planner to starts
         self._stream_hz = settings.stream_hz
         self._span = 0.0  # duration of the take-off or landing [s]
 
@@ -96,6 +114,24 @@ class Flight:
         self._commanded_at = now
         if target is not None and self._telemetry.pose_age < HOLD_AGE_S:
             self._target = target
+
+    def note_external(self, height: float, yaw: float) -> None:
+        """Store the height [m] and yaw [rad], or NaN, that were measured from outside. From any thread."""
+        self._external = height, yaw
+
+    @property
+    def turned(self) -> str:
+        """Fault of a drone that is turned otherwise than its estimator believes, for users; empty if none."""
+        yaw = self._telemetry.pose[6] - self._external[1]
+        wrong = abs(math.remainder(yaw, math.tau)) if math.isfinite(yaw) else 0.0
+        if wrong < TURNED:
+            return ""
+        return f"its own yaw is {math.degrees(wrong):.0f}° beside that of its positions: switch it off and on"
+
+    @property
+    def landing_s(self) -> float:
+        """Duration of a landing from here, with one that is ordered again [s]."""
+        return max(self._span, self._highest / DESCENT) + AGAIN_S + SHORTEST_S
 
     def publish_airborne(self) -> None:
         """Write `airborne` to the telemetry."""
@@ -119,21 +155,29 @@ class Flight:
             return
         x, y, z, *_, yaw = self._telemetry.pose
         place = x, y, z, yaw if abs(yaw) > STRAIGHT else 0.0
-        self._span = max(height / CLIMB, SHORTEST_S)
-        self.trouble = self.takeoff_refusal()
-        trajectory = None if self.trouble else self._write_climb(place, (height, self._span))
-        self.trouble = self.trouble or self._arm()
-        if self.trouble or trajectory is None:
+        span = max(height / CLIMB, SHORTEST_S)
+        self.trouble, self._disarm_at = self.takeoff_refusal(), math.inf
+        trajectory = None if self.trouble else self._write_climb(place, (height, span))
+        if trajectory is None:
+            return
+        self._disarm_at = -math.inf  # unless it takes off
+        self.trouble = self._arm()
+        if self.trouble:
             return
         for _ in range(3):  # without answer: low-level setpoints of another program would mute the planner
-            self.link.cf.commander.send_notify_setpoint_stop()
+            self._release()
             self._pause(POLL_S)
-        self._target, self._top = None, (x, y, height, place[3])
+        self._disarm_at = math.inf
+        self._target, self._top, self._sent, self._span = None, (x, y, height, place[3]), None, span
+        self._on_board.clear()
+        self._on_board.append(height)
         self._enter(Phase.CLIMBING)  # from here on a stop cuts the motors
         trajectories = self.link.trajectories
         answer = self._command_planner(
             trajectories.start_command, lambda: trajectories.start(trajectory), Info.PLANNER_ACTIVE
         )
+        replies, _ = self.link.planner_reply(trajectories.start_command)
+        self._start_replies = replies + (answer is None)  # an answer that is not here yet may come
         self._plan_end(time.monotonic() + self._span, height)
         if answer is None or answer == Status.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
@@ -141,20 +185,62 @@ class Flight:
         self.trouble = f"take-off refused: {ANSWERS.get(answer, f'error {answer}')}"
 
     def land(self) -> None:
-        """Descend at the current place, then switch the motors off."""
+        """Descend at the current place, then switch the motors off; disarm on the ground."""
         if self.phase is Phase.GROUND and self._flying:
             self._enter(Phase.FLYING)
-        if self.phase not in (Phase.CLIMBING, Phase.FLYING):
-            return
-        self._land()
+        if self.phase in (Phase.CLIMBING, Phase.FLYING):
+            self._land()
+        elif self.phase is Phase.GROUND:
+            self._disarm_at = -math.inf
 
     def _land(self) -> None:
-        height = self._telemetry.pose[2] - FLOOR
-        span = max(min(LONGEST_S, height / DESCENT), SHORTEST_S)  # an unknown height is a large one
-        planner = self.link.cf.high_level_commander
-        self._command_planner(HighLevel.LAND, lambda: planner.land(FLOOR, span, yaw=None))
+        self._command_planner(HighLevel.LAND, self._order_landing)
+        self._late_landings = 0
+        self._begin_landing()
+
+    def _order_landing(self) -> None:
+        """End other clients' setpoints, and order the landing.
+
+        In this order: one that comes in between mutes the landing, else it would end it, and the motors stopped.
+        """
+        self._ordered_span = max((self._highest - FLOOR) / DESCENT, SHORTEST_S)
+        self._release()
+        self.link.cf.high_level_commander.land(FLOOR, self._ordered_span, yaw=None)
+
+    def _begin_landing(self) -> None:
         self._enter(Phase.LANDING)
-        self._span = span
+        self._span = self._ordered_span
+        self._down_at = self._since + self._span + MARGIN_S
+        self._land_replies, _ = self.link.planner_reply(HighLevel.LAND)
+
+    def _repeat_landing(self, now: float) -> None:
+        """Order a landing again that a gap or another client has ended; a planner that lands refuses the order."""
+        near = now - self._since > self._span - NEAR_S
+        replies, answer = self.link.planner_reply(HighLevel.LAND)
+        if replies > self._land_replies and answer == Status.OK:
+            self._late_landings += near
+            self._begin_landing()
+        high = self._telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
+        if now - self._since > self._span + AGAIN_S:
+            self._land()
+        elif (high or not near) and now - self._released_at > LAND_S:
+            self._order_landing()
+
+    @property
+    def _highest(self) -> float:
+        """Largest height [m] at which the drone can be: as measured, or where trajectories lead that may be on board.
+
+        In a gap it follows them to their ends, and its estimate drifts.
+        """
+        heights = (self._telemetry.pose[2], self._external[0], *self._on_board)
+        return max(filter(math.isfinite, heights), default=UNKNOWN)
+
+    def _confirm_starts(self) -> None:
+        """Forget trajectories that others have replaced on board, as the planner has answered."""
+        replies, _ = self.link.planner_reply(self.link.trajectories.start_command)
+        for _ in range(min(replies - self._start_replies, len(self._on_board) - 1)):
+            self._on_board.popleft()
+        self._start_replies = replies
 
     def stop(self) -> None:
         """Cut the motors; `send_due` repeats the command until the status confirms it.
@@ -163,6 +249,7 @@ class Flight:
         """
         fresh = time.monotonic() - self._telemetry.status_time < FRESH_S
         if not self.airborne and fresh and not self._flying:
+            self._disarm_at = -math.inf
             return
         if self.phase is not Phase.STOPPING:
             self._enter(Phase.STOPPING)
@@ -176,10 +263,13 @@ class Flight:
             if now - self._since > ANSWER_S:
                 self.trouble = UNANSWERED
             self.link.cf.supervisor.send_emergency_stop()
-        if self.phase is Phase.LANDING and now - self._since > self._span + AGAIN_S and self._flying:
-            self._land()  # a gap took the order
+        if now > self._disarm_at:
+            self._disarm()
+        if self.phase is Phase.LANDING and self._flying:
+            self._repeat_landing(now)
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
+        self._confirm_starts()
         if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
             self.trouble = "landed: no commands from the robot's loop"
             self.land()
@@ -200,10 +290,11 @@ class Flight:
         if _same(target, self._sent) and now - self._sent_at < REFRESH_S:
             return
         self._begun = min(self._begun, now)
-        packets = self.link.trajectories.hold(target, self._hold)
+        packets = self.link.trajectories.hold(target, self._hold, self._release_others)
         if packets == 0:
             return
         self._sent, self._sent_at = target, now
+        self._on_board.append(target[2])
         self._due = self._begun + packets / (SETPOINT_PACKETS * self._stream_hz) - 0.5 * POLL_S
         self._begun = math.inf
         self._plan_end(now, target[2])
@@ -211,6 +302,18 @@ class Flight:
     def _plan_end(self, since: float, height: float) -> None:
         """Note when a trajectory that holds a height [m] since a time [s] has reached the floor."""
         self._down_at = since + self._hold + max(height, 0.0) / SINK + MARGIN_S
+
+    def _release(self) -> None:
+        """End the setpoints of other clients, which mute the planner: 2 s after the last one the drone would lock."""
+        self._released_at = time.monotonic()
+        self.link.cf.commander.send_notify_setpoint_stop()
+
+    def _release_others(self) -> None:
+        """End the setpoints of other clients in flight, at once where the drone reports that it follows no plan."""
+        telemetry = self._telemetry
+        stopped = telemetry.reports_plans and Info.PLANNER_ACTIVE not in telemetry.info
+        if stopped or time.monotonic() - self._released_at > RELEASE_S:
+            self._release()
 
     def land_after_gap(self, gap: float) -> None:
         """Land after `gap` [s] in which nothing was received, or the process stood still, if it was long."""
@@ -249,11 +352,10 @@ class Flight:
             self.land()
 
     def mark_out_of_reach(self) -> None:
-        """Link lost; once what lies on board has ended on the floor, the drone counts as landed."""
+        """Note a lost link; the drone counts as flying until it is seen, because its motors may be on on the floor."""
         if self.airborne and self.phase is not Phase.STOPPING:  # a stop is sent when the drone is in reach again
-            self.trouble = "out of reach: it lands by itself"
-            if time.monotonic() > self._down_at:
-                self._enter(Phase.GROUND)
+            down = time.monotonic() > self._down_at
+            self.trouble = "out of reach: " + ("motors may be on: switch it off" if down else "it lands by itself")
 
     def resume(self) -> bool:
         """Continue on a new link after a loss; True if the drone is in the air."""
@@ -262,7 +364,10 @@ class Flight:
         if self._flying and self.phase is not Phase.STOPPED:
             if not self.airborne:
                 self._enter(Phase.FLYING)
+            self._start_replies = 0
             return True
+        if self.airborne:
+            self._enter(Phase.GROUND)
         return False
 
     # ------------------------------------------------------------------ parts of the above
@@ -290,7 +395,7 @@ class Flight:
             return f"no take-off: {telemetry.status_text()}"
         if not telemetry.settled:
             return "no take-off: its position estimate has not settled"
-        return ""
+        return f"no take-off: {self.turned}" if self.turned else ""
 
     def _write_climb(self, place: Target, climb: tuple[float, float]) -> int | None:
         """Write the climb; returns its number, or None, with `trouble`."""
@@ -312,10 +417,20 @@ class Flight:
             if now > begin + ARMING_S:
                 return "arming refused: is the drone level, its battery full enough?"
             if not armed and now > asked + REPLY_S:
-                asked = now
+                asked = self._armed_at = now
                 self.link.cf.supervisor.send_arming_request(True)
             self._pause(POLL_S)
         return ""
+
+    def _disarm(self) -> None:
+        """Disarm a drone on the ground that was armed for a take-off; repeated until its status confirms it."""
+        now, info = time.monotonic(), self._telemetry.info
+        armed = Info.ARMED in info and Info.AUTO_ARM not in info and self._settings.arm
+        asked = self._armed_at > -math.inf and now - self._armed_at < FRESH_S  # its status may not show it yet
+        self._disarm_at = math.inf
+        if not self.airborne and not self._flying and (armed or asked):
+            self._disarm_at = now + REPLY_S
+            self.link.cf.supervisor.send_arming_request(False)
 
     def _command_planner(self, command: HighLevel, send: Callable[[], object], flag: int = 0) -> int | None:
         """Send a high-level command until the drone replies; returns the code of the reply, or None.

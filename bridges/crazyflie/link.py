@@ -14,6 +14,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol
 
@@ -32,6 +33,7 @@ REPEAT_S: Final = 0.3  # a question about a parameter is repeated after this
 BUSY_S: Final = 0.1  # no packet is handed to a radio that has been silent for longer: it would be sent after the gap
 POLLS: Final = 1_000_000  # unanswered ones before cflib gives a link up: never before `Link.gap` has told
 JOIN_S: Final = 1.5  # cflib's threads check for their end once per second
+OLDEST: Final = (0, 1, 32)  # version of cflib that has all that is called: the emergency stop, for one
 PERIODS_MS: Final = 10.0  # log periods are multiples of this
 
 SLOWEST: Final = 20  # longest period of a log block, in units of 10 ms
@@ -58,12 +60,17 @@ class SilentError(LinkError):
 def prepare(addresses: Sequence[str]) -> None:
     """Load cflib and its drivers, once per process, and plug in the software radios that the addresses name.
 
-    Raises BodyError if cflib is not installed, or one radio is to be in several simulated airs.
+    Raises BodyError if cflib is not installed, or too old, or one radio is to be in several simulated airs.
     """
+    remedy = "pip install -e '.[crazyflie]'"
     try:
         import cflib.crtp.radiodriver  # noqa: PLC0415 - an optional extra, under another licence
     except ModuleNotFoundError:
-        raise BodyError("Crazyflies need cflib (GPL-3.0), which is an extra: pip install -e '.[crazyflie]'") from None
+        raise BodyError(f"Crazyflies need cflib (GPL-3.0), which is an extra: {remedy}") from None
+    installed = version("cflib")
+    if tuple(int(part) for part in re.findall(r"\d+", installed)[: len(OLDEST)]) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise BodyError(f"cflib {installed} is too old, Crazyflies need {oldest}: {remedy}")
     if not cflib.crtp.CLASSES:  # a second call would register every driver twice
         cflib.crtp.init_drivers()
     cflib.crtp.radiodriver.set_retries_before_disconnect(POLLS)
@@ -263,9 +270,13 @@ class CrazyflieLink:
         if abs(confirmed - value) > 1e-5 * max(1.0, abs(value)):  # floats travel with 24 bits
             raise BodyError(f"the parameter {parameter} is {confirmed:g}, not {value:g}")
 
+    def has_parameter(self, parameter: str) -> bool:
+        """Whether the firmware has a parameter."""
+        return self._parameter(parameter) is not None
+
     def parameter_value(self, parameter: str) -> float | None:
         """Value of a parameter; None if the firmware has no such parameter; raises LinkError if no answer comes."""
-        return None if self._parameter(parameter) is None else self._ask(parameter, None)
+        return self._ask(parameter, None) if self.has_parameter(parameter) else None
 
     def _parameter(self, parameter: str) -> Any:  # noqa: ANN401 - cflib's
         group, _, name = parameter.partition(".")

@@ -32,8 +32,12 @@ LEAST_SHARE: Final = 0.1
 SLOWING_S: Final = 2.0  # more before that is done again: a queue drains meanwhile
 LOOP_HZ: Final = 20.0  # at least, for gaps and phases, however few setpoints are streamed
 EXTERNAL_AGE_S: Final = 0.5  # older external poses are not passed on
-LANDING_S: Final = 12.0  # `close` waits so long for a landing
+LANDING_S: Final = 12.0  # `close` waits for a landing for at least so long
 JOIN_S: Final = 5.0
+
+IN_THE_AIR: Final = "connected again, in the air"
+# on the floor without radio, motors with the least thrust of the firmware (20,000 of 65,535) carry half of the weight
+SAFE_PARAMETERS: Final = {"posCtlPid.thrustMin": 5000.0}
 
 TAKEOFF_EXPIRY_S: Final = 2.0  # a take-off that could not begin for so long is dropped
 
@@ -66,6 +70,8 @@ class CrazyfliePilot:
         self._link: CrazyflieLink | None = None
         self._connection_note = "connecting"
         self._order: Order | None = None
+        self._executing = ""  # order
+        self._end_by = inf  # the thread ends then, even if the drone flies [s, monotonic]
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._ending = threading.Event()
@@ -104,6 +110,7 @@ class CrazyfliePilot:
     def locate(self, now: float, position: Array, yaw: float) -> None:
         """Store an external position (3,) [m] and yaw [rad], or NaN, for the estimator on board."""
         self._external_pose = now, position, yaw
+        self._flight.note_external(float(position[2]), yaw)
 
     @property
     def note(self) -> str:
@@ -113,6 +120,7 @@ class CrazyfliePilot:
             for part in (
                 self._connection_note,
                 self._flight.trouble,
+                self._flight.turned if self._flight.airborne else "",
                 self._telemetry.status_text(),
                 "its radio carries less than was measured: fewer logs" if self._share < 1.0 else "",
             )
@@ -136,18 +144,19 @@ class CrazyfliePilot:
 
     def close(self) -> None:
         """Land the drone if it flies, then end the thread."""
+        self._end_by = time.monotonic() + max(LANDING_S, self._flight.landing_s)
         self._ending.set()
         self._wake.set()
 
     def join(self) -> None:
         """Wait for the end of the thread."""
         if self._thread.ident is not None:
-            self._thread.join(LANDING_S + JOIN_S)
+            self._thread.join(self._end_by - time.monotonic() + JOIN_S)
 
     # ------------------------------------------------------------------ the thread
 
     def _run(self) -> None:
-        while not self._ending.is_set() or self._flight.airborne:
+        while not self._ending.is_set() or (self._flight.airborne and time.monotonic() < self._end_by):
             try:
                 link = self._connect_in_turn()
             except LinkError as error:
@@ -234,7 +243,7 @@ class CrazyfliePilot:
         self._closers = [other for other in self._closers if other.is_alive()] + [closer]
 
     def _prepare(self, link: CrazyflieLink) -> None:
-        """Start the logs; set parameters and positioning, unless the drone is in the air.
+        """Start the logs, and set the drone up, unless it is in the air, or was set up and has not moved since.
 
         Raises:
             BodyError: If the setup fails.
@@ -250,19 +259,45 @@ class CrazyfliePilot:
         link.ask_firmware()
         deadline = time.monotonic() + STATUS_S
         while telemetry.status_time == -inf:
-            self._check(link)
+            self._check_link(link)
             if time.monotonic() > deadline:
                 raise LinkError("no status received")
             time.sleep(0.01)
+        if telemetry.stamps.restarted:
+            telemetry.settled = telemetry.stamps.restarted = False
         if self._flight.resume():
-            self._connection_note = "connected again, in the air"
+            self._connection_note = IN_THE_AIR
+            for parameter, value in self._safe_parameters(link).items():
+                link.send_parameter(parameter, value)
             if self._order is None:
                 self.give_order("land")
+        else:
+            self._set_up(link)
+
+    def _safe_parameters(self, link: CrazyflieLink) -> dict[str, float]:
+        """Parameters to set that were not chosen."""
+        chosen = self._settings.parameters
+        return {
+            name: value for name, value in SAFE_PARAMETERS.items() if name not in chosen and link.has_parameter(name)
+        }
+
+    def _set_up(self, link: CrazyflieLink) -> None:
+        """Set parameters and positioning of a drone on the ground.
+
+        An estimator that measures no place is reset to the start once only: the drone may have landed elsewhere.
+
+        Raises:
+            BodyError: If the setup fails.
+            LinkError: If the link is lost.
+        """
+        settings, telemetry = self._settings, self._telemetry
+        if telemetry.settled and settings.positioning is None:
+            self._arrive()
             return
         if Info.CRASHED in telemetry.info and settings.recover:
             link.cf.supervisor.send_crash_recovery_request()
         telemetry.settled = False
-        for parameter, value in settings.parameters.items():
+        for parameter, value in (self._safe_parameters(link) | settings.parameters).items():
             link.set_parameter(parameter, value)
         configure(link, settings)
         for _ in range(3):
@@ -296,7 +331,7 @@ class CrazyfliePilot:
         """Loop of the thread, until `close` or the loss of the link; raises LinkError if the link is lost."""
         ticks = self._ticks
         ticks.start()
-        landed_by = inf
+        landing = False
         link.take_gap()
         while True:
             begin, wait = time.monotonic(), ticks.until_next()
@@ -314,11 +349,13 @@ class CrazyfliePilot:
                 self._forward_external_pose(link, now)
             except OrderReplaced:
                 self._wake.set()
+            if self._connection_note == IN_THE_AIR and not self._flight.airborne:
+                self._set_up(link)
             if self._ending.is_set() and self._order is None:
-                if not self._flight.airborne or now > landed_by:
+                if not self._flight.airborne or now > self._end_by:
                     return
-                if landed_by == inf:
-                    landed_by = now + LANDING_S
+                if not landing:
+                    landing = True
                     self.give_order("land")
 
     def _execute_order(self) -> None:
@@ -327,6 +364,7 @@ class CrazyfliePilot:
         if order is None:
             return
         what, height, given = order
+        self._executing = what
         try:
             if what == "stop":
                 self._flight.stop()
@@ -335,15 +373,20 @@ class CrazyfliePilot:
             elif time.monotonic() - given < TAKEOFF_EXPIRY_S:
                 self._flight.takeoff(height)
         finally:
+            self._executing = ""
             self._flight.publish_airborne()
 
     def _check(self, link: CrazyflieLink) -> None:
+        self._check_link(link)
+        if self._telemetry.stamps.restarted:
+            self._telemetry.settled = False
+            raise LinkError("it was switched off and on")
+
+    def _check_link(self, link: CrazyflieLink) -> None:
         if link.error is not None:
             raise LinkError(link.error)
         if link.gap > (RADIO_LOST_S if link.is_radio else LOST_S):
             raise LinkError(f"no packet for {link.gap:.1f} s")
-        if self._telemetry.stamps.restarted:
-            raise LinkError("it was switched off and on")
 
     def _mend_gap(self, link: CrazyflieLink, now: float) -> None:
         """After a gap: hold or land, and log again. The link stays: its polls have gone on."""
@@ -371,12 +414,17 @@ class CrazyfliePilot:
         self._flight.scale_setpoints(share)
 
     def _pause(self, seconds: float) -> None:
-        """Wait in an order; raises LinkError if the link is lost, OrderReplaced after a stop or a standstill."""
+        """Wait in an order; raises LinkError if the link is lost, OrderReplaced after a standstill or another order.
+
+        A stop replaces all; a landing, and the end of the process, replace a take-off.
+        """
         link = self._flight.link
         until = time.monotonic() + seconds
         while True:
             self._check(link)
-            if self._order is not None and self._order[0] == "stop":
+            waiting = "" if self._order is None else self._order[0]
+            coming_down = waiting == "land" or self._ending.is_set()
+            if waiting == "stop" or (coming_down and self._executing == "takeoff"):
                 raise OrderReplaced
             now = time.monotonic()
             self._forward_external_pose(link, now)

@@ -45,6 +45,8 @@ FULL_V, EMPTY_V, SAG_V = 4.2, 3.5, 0.3
 SMOOTHING_S: Final = 2.0  # time constant of the voltage: a short load is no empty battery
 WRAP_MS: Final = 1 << 24  # stamps of log packets have 24 bits
 BACK_MS: Final = 1000  # a stamp that is further back comes from a drone that was switched off and on
+AHEAD_S: Final = 10.0  # so does one that is further ahead: longer than a full queue, whose packets were late before
+LATE_S: Final = 2.0  # and the first over a new connection that is older: no queue outlives one
 DRIFT: Final = 1e-4  # [s/s] largest difference between the clocks of a drone and of this computer
 INFO_TEXT: Final = {
     Info.LOCKED: "locked: switch it off and on",
@@ -59,6 +61,7 @@ class StampAge:
 
     def __init__(self) -> None:
         self.restarted = False  # the clock of the drone began anew
+        self.connected_anew = False  # the next packet is the first over a new connection
         self._last: int | None = None  # stamp without its overflows [ms]
         self._arrived = -inf
         self._least = inf
@@ -68,7 +71,10 @@ class StampAge:
         if self._last is None:
             self._last = stamp
         since = (stamp - self._last + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
-        if since < -BACK_MS:
+        change = arrival - 1e-3 * (self._last + since) - self._least  # of the smallest difference, infinite at first
+        late = self.connected_anew and isfinite(self._least) and change > LATE_S
+        self.connected_anew = False
+        if since < -BACK_MS or (change < -AHEAD_S and isfinite(self._least)) or late:
             self.restarted, self._last, self._least = True, stamp, inf
         elif since > 0:
             self._last += since
@@ -91,6 +97,7 @@ class Telemetry:
         self.pose: tuple[float, ...] = (nan,) * 7  # x, y, z [m], their rates [m/s], yaw [rad]
         self.settled = False  # position estimate has settled and may be used
         self.info = Info(0)  # flags of the supervisor
+        self.reports_plans = False  # the firmware reports whether its planner is active
         self.power = int(Power.BATTERY)  # state of power management
         self.battery = nan  # charge, 0 to 1
         self.volts = nan  # of the battery [V]
@@ -110,8 +117,8 @@ class Telemetry:
         return time.monotonic() - self.pose_time
 
     def reset_status(self) -> None:
-        """Clear the status at a new connection."""
-        self.stamps = StampAge()
+        """Clear the status at a new connection; whether the drone was switched off and on, its next packet tells."""
+        self.stamps.restarted, self.stamps.connected_anew = False, True
         self.arrival = -inf
         self.status_time = -inf
         self.info = Info(0)
@@ -143,6 +150,7 @@ class Telemetry:
         self.pose_time = measured
         old = sum(flags for name, flags in OLD_INFO.items() if values.get(name))
         self.info = Info(int(values.get("supervisor.info", old)))
+        self.reports_plans = self.reports_plans or Info.PLANNER_ACTIVE in self.info
         self.power = int(values.get("pm.state", Power.BATTERY))
         self._add_volts(values.get("pm.vbat", nan), measured - self.status_time)
         self.stations = int(values.get("lighthouse.status", -1))

@@ -115,10 +115,11 @@ class Trajectories:
                 self._written[address] = sent[1]
             self._sent = None
 
-    def hold(self, target: Target, seconds: float) -> int:
+    def hold(self, target: Target, seconds: float, before_start: Callable[[], None] = lambda: None) -> int:
         """Write the next part of a setpoint that is held for some seconds, or start it when all of it is confirmed.
 
         A setpoint that has been begun is started before another one is written, unless it has become old in a gap.
+        `before_start` is called just before it is started.
         Returns the number of packets that it has taken if it was started, else 0.
         """
         if self._upcoming is None or time.monotonic() - self._sent_at > START_EXPIRY_S:
@@ -128,7 +129,10 @@ class Trajectories:
             again = self._started in (one, other) and not self._missing(self._started, data)
             self._upcoming = self._started if again else other if self._started == one else one, data
         number, data = self._upcoming
-        return self.start(number) if self._write(number, data) else 0
+        if not self._write(number, data):
+            return 0
+        before_start()
+        return self.start(number)
 
     def write_climb(self, place: Target, climb: tuple[float, float], seconds: float) -> int | None:
         """Write the next part of a climb, see `polynomials`; returns its number when all of it is confirmed."""

@@ -19,7 +19,7 @@ from agents.ticks import Ticks
 from bridges.crazyflie import flight, telemetry, trajectory
 from bridges.crazyflie.flight import Flight, Phase
 from bridges.crazyflie.link import BUSY_S
-from bridges.crazyflie.pilot import LOOP_HZ
+from bridges.crazyflie.pilot import LOGS_S, LOOP_HZ
 from bridges.crazyflie.telemetry import Telemetry
 from tests.twins.loopback import request
 from twins.devices.crazyflie.device import CrazyflieTwin
@@ -86,7 +86,7 @@ class Drone:
         fleet.twin.lines[row].queue.clear()  # answers
         self.trajectories._send = self._send
         self.flight.link = self
-        self.error, self._received = None, fleet.now
+        self.error, self._received, self._gap = None, fleet.now, 0.0
         self.cf = self.commander = self.high_level_commander = self
         self.thread = Thread(fleet.now + fleet.random.random() / LOOP_HZ, self._control)
 
@@ -114,6 +114,7 @@ class Drone:
 
     def receive(self, packet):
         port, channel, data = packet[0] >> 4, packet[0] & 3, packet[1:]
+        self._gap = max(self._gap, self._fleet.now - self._received)
         self._received = self._fleet.now
         if (port, channel) == (Port.LOG, 2):
             names, packings, logged = self._blocks[data[0]]
@@ -136,6 +137,13 @@ class Drone:
             self.thread.pause(self._fleet.now + ROOM_S)
         self.out.append(bytes((crtp.header(port, channel),)) + data)
 
+    def _mend_gap(self):
+        gap, self._gap = self._gap, 0.0
+        if gap > LOGS_S:
+            self._blocks.clear()
+            self.telemetry.start_logging(self, log_hz=self._fleet.settings.log_hz, ranges_hz=None)
+        self.flight.land_after_gap(gap)
+
     def _control(self):
         """Loop of the pilot's thread."""
         fleet = self._fleet
@@ -143,6 +151,7 @@ class Drone:
         while True:
             if fleet.now >= ticks.zero + ticks.next:
                 ticks.begin()
+            self._mend_gap()
             order, self.order = self.order, None
             if order is not None:
                 order(self.flight)
@@ -169,6 +178,7 @@ class Fleet:
         for line in self.twin.lines:
             line.heard = 0.0
         self._exchanges = 0
+        self.client = lambda: None  # another client; called before each tick of the twins
 
     def __enter__(self):
         return self
@@ -201,6 +211,18 @@ class Fleet:
         for drone in self.drones:
             drone.order = what
 
+    def climb(self, height, above=0.0):
+        """Take off to a height [m], and fly until all are above another."""
+        self.run(1.0)
+        self.order(lambda flight: flight.takeoff(height))
+        while self.heights.min() < above:
+            self.run(0.02)
+        return self
+
+    @property
+    def heights(self):
+        return self.twin.flock.place[:, 2]
+
     @property
     def phases(self):
         return {drone.flight.phase for drone in self.drones}
@@ -211,6 +233,7 @@ class Fleet:
 
     def _advance(self, speed):
         """Step of the twins; then the robots' loop reads and commands."""
+        self.client()
         self.twin.advance(self.now - self._begin)
         self.ages.append(self.now - np.array([drone.telemetry.pose_time for drone in self.drones]))
         self.fastest = max(self.fastest, -self.twin.flock.quadrotor.velocity[:, 2].min())

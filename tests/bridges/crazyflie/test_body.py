@@ -118,6 +118,7 @@ def test_several_at_a_hundred_hertz():
 
 def test_parameters_are_set():
     with flown(device={"parameters": {"hlCommander.vtoff": 0.7, "stabilizer.controller": 2}}) as (twin, _):
+        assert twin.device.drones[0].value("posCtlPid.thrustMin") == 5000
         assert twin.device.drones[0].value("hlCommander.vtoff") == pytest.approx(0.7)
         assert twin.device.drones[0].value("stabilizer.controller") == 2
 
@@ -234,6 +235,46 @@ def test_arming():
         process.takeoff(0.2)
         assert supervised(twin) == State.FLYING
         process.cut()
+
+
+@pytest.mark.parametrize(("order", "after_s"), [("stop", 0.3), ("land", 0.1)])
+def test_order_during_arming(order, after_s):
+    """It replaces the take-off: the motors stay off, and nothing stays armed."""
+    with flown(device={"platform": "brushless"}) as (twin, process):
+        row = np.array([0])
+        process.tick()
+        process.body.takeoff(row, np.array([0.5]))
+        process.until(lambda: supervised(twin) == State.ARMING, "arming")
+        process.run(after_s)
+        getattr(process.body, order)(row)
+        process.until(lambda: supervised(twin) == State.DISARMED, "disarmed")
+        process.run(1.0)
+        assert supervised(twin) == State.DISARMED
+        assert truth(twin)[2] == 0.0
+        process.takeoff(0.2)
+        process.cut()
+
+
+def test_another_session_finds_it_in_the_air():
+    """A process that was killed has left it there: it is landed, then set up, and nothing says that it flies."""
+    with flown() as (twin, process):
+        process.takeoff(0.4)
+        process.setpoint = [(0.0, 0.0, 0.4, 0.0)]
+        process.run(0.2)
+        pilot = process.body._pilots[0]
+        pilot._end_by = 0.0  # it ends without a landing
+        pilot._ending.set()
+        pilot._thread.join()
+        process.body._claims.release()
+        again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
+        try:
+            assert again.tick().notes == ("",)
+            assert not again.state.flying[0]
+            assert truth(twin)[2] == 0.0
+            assert supervised(twin) != State.LOCKED
+            assert twin.device.drones[0].value("posCtlPid.thrustMin") == 5000
+        finally:
+            again.close()
 
 
 def test_ranges():

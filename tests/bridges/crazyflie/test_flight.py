@@ -1,5 +1,6 @@
 """Flying one Crazyflie, against a link and a clock made by hand: what is sent when answers are lost."""
 
+import math
 import types
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from agents.body.interface import UNANSWERED
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings
-from agents.protocols.crtp import HighLevel, Info, Port
+from agents.protocols.crtp import HighLevel, Info, Port, Status
+from agents.safety.detection import SLOWEST
 from bridges.crazyflie import flight as module
 from bridges.crazyflie import telemetry as telemetry_module
 from bridges.crazyflie import trajectory as trajectory_module
@@ -85,10 +87,14 @@ def test_a_landing_that_is_not_answered_is_ordered_again(air):
     air.sent.clear()
     air.flight.land()
     assert air.flight.phase is Phase.LANDING
-    assert {what for _, what in air.sent} == {"land"}, "a start would make the planner forget the landing"
-    assert len(air.sent) == module.TRIES
-    air.pass_(module.LONGEST_S + module.AGAIN_S)
-    assert len(air.sent) == 2 * module.TRIES
+    assert not air.times("setpoint"), "a start would make the planner forget the landing"
+    assert len(air.times("land")) == module.TRIES
+    air.telemetry.pose = [0.0] * 7
+    air.pass_(air.flight._span)
+    assert 2 < len(air.times("land")[module.TRIES :]) < 5
+    air.sent.clear()
+    air.pass_(module.AGAIN_S)
+    assert len(air.times("land")) == module.TRIES
 
 
 def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
@@ -216,13 +222,132 @@ def test_after_a_gap(air, gap, phase):
     assert air.flight.phase is phase
 
 
-def test_a_drone_out_of_reach_counts_as_flying_until_its_trajectory_has_ended(air):
+def test_a_drone_out_of_reach_counts_as_flying(air):
+    """Until it is seen: its motors may be on, on the floor."""
     air.now += HOLD_S + PLACE[2] / SINK
     air.flight.mark_out_of_reach()
     assert air.flight.airborne
+    assert "lands by itself" in air.flight.trouble
     air.now += PLACE[2] / SINK + module.MARGIN_S + 0.1
     air.flight.mark_out_of_reach()
-    assert not air.flight.airborne
+    assert air.flight.airborne
+    assert "motors may be on" in air.flight.trouble
+    air.telemetry.info = air.info
+    assert not air.flight.resume()
+    assert air.flight.phase is Phase.GROUND
+
+
+@pytest.mark.parametrize("pose", [0.3, math.nan])
+@pytest.mark.parametrize("set_point", [False, True])
+def test_landing_lasts_from_the_highest_place(monkeypatch, pose, set_point):
+    """In a gap the drone climbs on; an estimate may be below what motion capture sees."""
+    air = Air(monkeypatch)
+    air.telemetry.settled, air.flying, air.telemetry.pose = True, False, (0.0,) * 7
+    air.pass_(0.1)
+    air.flight.takeoff(2.0)
+    air.flying = True
+    if set_point:
+        air.flight.set_target(air.now, (0.0, 0.0, 2.0, 0.0))
+        air.flight._stream(air.now + 1.0)
+    air.telemetry.pose = (0.0, 0.0, pose, *(0.0,) * 4)
+    air.flight.land_after_gap(0.9)
+    assert air.flight._span == pytest.approx(2.1 / module.DESCENT)
+
+
+@pytest.mark.parametrize("height", [0.2, 0.8, 8.0])
+def test_no_landing_is_faster_than_half_a_metre_per_second(air, height):
+    """At the fastest a rest-to-rest polynomial is 35/16 of its mean speed."""
+    air.telemetry.pose = [0.0, 0.0, height, *[0.0] * 4]
+    air.flight.land()
+    assert 35.0 / 16.0 * (height - module.FLOOR) / air.flight._span < 0.5
+    assert height == 0.2 or air.flight._span < height / SLOWEST + 1.0
+
+
+def test_the_height_seen_from_outside_counts(air):
+    air.flight.note_external(1.5, math.nan)
+    air.flight.land()
+    assert air.flight._span == pytest.approx(1.6 / module.DESCENT)
+
+
+def test_setpoints_of_others_end_at_each_landing(air):
+    """Before the order to land; and again, because those that follow mute or end it."""
+    air.sent.clear()
+    air.flight.land()
+    air.telemetry.pose = [0.0] * 7
+    air.pass_(air.flight._span)
+    assert [what for _, what in air.sent] == ["send_notify_setpoint_stop", "land"] * (len(air.sent) // 2)
+    repeated = air.times("land")[module.TRIES :]
+    assert np.diff(repeated).max() < 0.6, "the drone locks 2 s after the last setpoint of the other"
+    assert repeated[-1] < air.flight._since + air.flight._span - module.NEAR_S
+    air.replies[HighLevel.LAND] = 1, 0
+    air.pass_(0.1)
+    assert air.now - air.flight._since < 0.2, "it was not landing any more"
+
+
+def test_landing_on_a_table_ends(air):
+    """Where it stands is as high as it would fly if another client had ended the landing: a few more attempts."""
+    air.flight.land()
+    orders, begun, end = len(air.times("land")), 1, air.now + air.flight._span
+    for _ in range(1500):
+        air.flying = air.now < end + 2.0
+        air.pass_(0.02)
+        answered = len(air.times("land"))
+        if answered > orders:
+            accepted = air.now > end
+            orders, air.replies[HighLevel.LAND] = answered, (answered, Status.OK if accepted else Status.REFUSED)
+            begun, end = begun + accepted, air.now + air.flight._span if accepted else end
+    assert begun == 1 + module.LATE_LANDINGS
+    assert air.flight.phase is Phase.GROUND
+
+
+def test_setpoints_of_others_end_in_flight(air):
+    """Before a start: at once where the drone reports that it follows no plan, else every second."""
+    air.telemetry.reports_plans, air.info = True, air.info | Info.PLANNER_ACTIVE
+    air.pass_(2.0)
+    assert 1 <= len(air.times("send_notify_setpoint_stop")) <= 3
+    air.info &= ~Info.PLANNER_ACTIVE
+    air.pass_(0.1)
+    air.sent.clear()
+    air.pass_(0.5)
+    assert [what for _, what in air.sent][:2] == ["send_notify_setpoint_stop", "setpoint"]
+    assert len(air.times("send_notify_setpoint_stop")) == len(air.times("setpoint"))
+
+
+@pytest.mark.parametrize("order", ["stop", "land"])
+def test_order_while_arming_disarms(monkeypatch, order):
+    """It is repeated until the status confirms it."""
+    air = Air(monkeypatch)
+    air.telemetry.settled, air.flying, air.info, air.telemetry.pose = True, False, Info(0), (0.0,) * 7
+    air.pass_(0.1)
+    pause = air.pause
+
+    def replaced(seconds):
+        pause(seconds)
+        if air.times("send_arming_request"):
+            raise RuntimeError
+
+    air.flight._pause = replaced
+    with pytest.raises(RuntimeError):
+        air.flight.takeoff(0.5)
+    air.flight._pause, air.info = pause, Info.ARMED
+    air.sent.clear()
+    getattr(air.flight, order)()
+    air.pass_(1.0)
+    assert {what for _, what in air.sent} == {"send_arming_request"}
+    assert 4 < len(air.sent) < 10
+    air.info = Info(0)
+    air.sent.clear()
+    air.pass_(1.0)
+    assert air.sent == []
+
+
+def test_no_take_off_with_a_wrong_yaw(air):
+    """The decision turns by the yaw from outside, the firmware by its own."""
+    air.telemetry.settled = True
+    air.flight.note_external(0.0, 0.3)
+    assert air.flight.takeoff_refusal() == ""
+    air.flight.note_external(0.0, 0.5 + math.tau)
+    assert "its own yaw is 29° beside" in air.flight.takeoff_refusal()
 
 
 def test_a_process_that_stood_still_sends_no_setpoint_of_before(air):
@@ -233,7 +358,7 @@ def test_a_process_that_stood_still_sends_no_setpoint_of_before(air):
     air.flight._stream(chosen + 0.2)
     assert air.sent == []
     air.flight.send_due(air.now)
-    assert {what for _, what in air.sent} == {"land"}
+    assert {what for _, what in air.sent} == {"land", "send_notify_setpoint_stop"}
 
 
 def test_an_old_status_tells_of_an_earlier_phase(air):

@@ -1,0 +1,112 @@
+"""Gaps, other clients and orders at the worst moments: no Crazyflie falls. On a simulated clock, with twins."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from agents.protocols.crtp import Port, Setpoint
+from bridges.crazyflie.flight import DESCENT, Flight, Phase
+from tests.bridges.crazyflie_clock import Fleet
+from twins.devices.crazyflie.supervisor import State
+
+HZ = 500.0  # [1/s] exchanges of the radio
+TOUCHES = 0.5  # [m/s] a landing is slower
+
+
+@pytest.fixture
+def fleet(monkeypatch):
+    with Fleet(monkeypatch, 1, HZ) as flown:
+        yield flown
+
+
+def landed(fleet):
+    """Fly on until the motors are off; returns the height at which they stopped [m]."""
+    flock = fleet.twin.flock
+    while flock.quadrotor.flying[0]:
+        fleet.run(0.02)
+    return float(flock.place[0, 2])
+
+
+class Client:
+    """Another client of the drone: streams a height, see `Setpoint.POSITION`."""
+
+    def __init__(self, fleet, height):
+        self._fleet, self.height = fleet, height
+        fleet.client = self
+
+    def __call__(self):
+        if self.height is not None:
+            self._fleet.twin._deliver(
+                0, bytes((crtp_header(Port.SETPOINT), Setpoint.POSITION)) + struct.pack("<4f", 0, 0, self.height, 0)
+            )
+
+    def leave(self):
+        self.height = None
+
+
+def crtp_header(port):
+    return port << 4
+
+
+@pytest.mark.parametrize(
+    ("hover", "gap", "begin"), [(2.0, 2.0, 0.43), (2.0, 2.5, 1.0), (1.2, 2.5, 0.3), (0.8, 1.0, 0.03)]
+)
+@pytest.mark.parametrize("speed", [0.0, 0.3])
+def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
+    """The climb goes on, and the landing begins at its end; also when setpoints have begun, and were not received."""
+    fleet.climb(hover, begin)
+    fleet.twin.lines[0].silence(gap)
+    fleet.run(gap, speed=speed)
+    assert landed(fleet) < 0.02
+    assert fleet.fastest < TOUCHES
+    assert fleet.twin.flock.supervisor.state[0] != State.CRASHED
+
+
+@pytest.mark.parametrize("stays_s", [0.0, 2.0, 5.0])
+def test_flight_by_another_client_is_landed(fleet, stays_s):
+    """It leaves at once, or when it has ended the landing again and again."""
+    client = Client(fleet, 0.8)
+    while fleet.phases != {Phase.LANDING}:
+        fleet.run(0.02)
+    fleet.run(stays_s)
+    client.leave()
+    fleet.run(0.8 / DESCENT + 3.0)
+    assert fleet.phases == {Phase.GROUND}
+    assert fleet.fastest < TOUCHES
+    assert fleet.troubles == {"landed: it flew without an order"}
+    assert fleet.twin.flock.supervisor.state[0] != State.LOCKED
+
+
+def test_another_client_in_flight_is_ended(fleet):
+    """Its setpoint mutes the planner: 2 s later the drone would lock. It flies on."""
+    fleet.climb(0.5, 0.45)
+    fleet.run(1.0, speed=0.3)
+    client = Client(fleet, 0.5)
+    fleet.run(0.02, speed=0.3)
+    client.leave()
+    fleet.run(4.0, speed=0.3)
+    assert fleet.phases == {Phase.FLYING}
+    assert fleet.twin.flock.supervisor.state[0] == State.FLYING
+    assert fleet.heights[0] > 0.3
+
+
+def test_landing_from_eight_metres(fleet):
+    fleet.climb(8.0, 7.5)
+    fleet.run(3.0)
+    fleet.order(Flight.land)
+    assert landed(fleet) < 0.02
+    assert fleet.fastest < TOUCHES
+
+
+def test_setpoint_lost_at_the_begin_of_a_gap(fleet):
+    """A lower one that was sent, and not received: the drone is still where the last received one has led it."""
+    fleet.climb(2.0, 0.3)
+    drone = fleet.drones[0]
+    fleet.twin.lines[0].silence(2.0)
+    drone.flight.set_target(fleet.now, (0.0, 0.0, 0.5, 0.0))
+    drone.flight._stream(fleet.now)
+    fleet.run(2.0)
+    assert landed(fleet) < 0.02
+    assert np.isfinite(fleet.fastest)
+    assert fleet.fastest < TOUCHES
