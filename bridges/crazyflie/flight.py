@@ -351,11 +351,15 @@ class Flight:
             self.trouble = "landed: battery low"
             self.land()
 
-    def mark_out_of_reach(self) -> None:
-        """Note a lost link; the drone counts as flying until it is seen, because its motors may be on on the floor."""
+    def mark_out_of_reach(self) -> bool:
+        """Note a lost link; True if what lies on board has ended on the floor.
+
+        The drone counts as flying until it is seen: its motors may be on.
+        """
+        down = time.monotonic() > self._down_at
         if self.airborne and self.phase is not Phase.STOPPING:  # a stop is sent when the drone is in reach again
-            down = time.monotonic() > self._down_at
             self.trouble = "out of reach: " + ("motors may be on: switch it off" if down else "it lands by itself")
+        return down
 
     def resume(self) -> bool:
         """Continue on a new link after a loss; True if the drone is in the air."""

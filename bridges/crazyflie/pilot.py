@@ -162,7 +162,8 @@ class CrazyfliePilot:
             except LinkError as error:
                 self._connection_note = str(error)
                 self._fail(error)
-                self._flight.mark_out_of_reach()
+                if self._flight.mark_out_of_reach() and self._ending.is_set():
+                    break
                 self._ending.wait(RETRY_S)
                 continue
             try:

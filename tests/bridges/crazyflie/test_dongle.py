@@ -140,6 +140,11 @@ def test_nothing_is_received_any_more(begins):
         assert descent.fastest.max() < SINKS
         assert not any(supervised(twin, row) == State.LOCKED for row in range(3))
         assert not twin.device.flock.quadrotor.flying[:2].any()
+        assert process.state.flying[2], "nothing is seen of its motors"
+        twin.device.lines[2].silence(0.0)
+        process.until(lambda: not process.state.flying[2], "in reach again")
+        assert not twin.device.flock.quadrotor.flying[2]
+        assert "connected again" not in process.state.notes[2]
 
 
 def test_a_gap_of_the_radio_that_carries_motion_capture():
