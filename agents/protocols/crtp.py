@@ -119,6 +119,10 @@ class Setpoint(IntEnum):
     """Kinds of low-level setpoints, channel 0 of port 7."""
 
     STOP = 0
+    OLD_VELOCITY = 1  # the older ones turn the other way
+    OLD_HEIGHT = 2
+    CLIMB_RATE = 4
+    OLD_HOVER = 5
     FULL_STATE = 6
     POSITION = 7
     VELOCITY = 8
@@ -130,11 +134,16 @@ class HighLevel(IntEnum):
     """Commands to the planner."""
 
     GROUP = 0
+    OLD_TAKEOFF = 1
+    OLD_LAND = 2
     STOP = 3
+    OLD_GO_TO = 4
     START = 5  # of protocol versions below 10
     DEFINE = 6
     TAKEOFF = 7
     LAND = 8
+    TAKEOFF_VELOCITY = 9
+    LAND_VELOCITY = 10
     SPIRAL = 11
     GO_TO = 12
     START_2 = 13
@@ -200,6 +209,9 @@ IDENT: Final = Struct("<H")
 VECTOR: Final = Struct("<fff")
 POSE: Final = Struct("<fffffff")
 CLIMB: Final = Struct("<ff?f")  # height [m], yaw [rad], keep yaw, time [s]
+OLD_CLIMB: Final = Struct("<ff")  # height [m], time [s]
+CLIMB_VELOCITY: Final = Struct("<f?f?f")  # height [m], relative, yaw [rad], keep yaw, mean speed [m/s]
+OLD_GO_TO: Final = Struct("<?fffff")  # relative, x y z [m], yaw [rad], time [s]
 GO_TO: Final = Struct("<??fffff")  # relative, linear, x y z [m], yaw [rad], time [s]
 FOUR: Final = Struct("<ffff")
 FULL_STATE: Final = Struct("<9hI3h")  # mm, mm/s, mm/s²; attitude in 32 bits; mrad/s

@@ -171,7 +171,7 @@ class Fleet:
         asked = request("crazyflie", ["crazyflie-twin"] * rows, device={"link": "radio"} | device)
         self.settings = chosen("", device, external=False)
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
-        self.twin.flock.estimator.error[:] = 0.0  # set up
+        self.twin.flock.estimator.error[:] = self.twin.flock.estimator.turn[:] = 0.0  # set up
         self.drones = [Drone(self, row) for row in range(rows)]
         self.ages, self.fastest = [], 0.0  # (k, rows) ages of poses [s]; fastest descent [m/s]
         self._begin = self._next_tick = self._next_exchange = self.now

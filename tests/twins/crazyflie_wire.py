@@ -20,6 +20,7 @@ class Wire:
     def __init__(self, device=None, start=None, yaw=0.0, external=False, **faults):
         asked = request("crazyflie", ["x"], device=device, start=start, yaw=yaw, external=external)
         self.flock = Flock(asked, Faults(**faults))
+        self.flock.estimator.turn[:] = 0.0  # it was told how it stands
         self.sent = []
         self.drone = Drone(self.flock, 0, lambda port, channel, data: self.sent.append((port, channel, data)))
         self.ticks = 0

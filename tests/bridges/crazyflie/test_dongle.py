@@ -148,7 +148,7 @@ def test_nothing_is_received_any_more(begins):
 
 
 def test_a_gap_of_the_radio_that_carries_motion_capture():
-    """The estimator is blind, and drifts: it is down before it is far away."""
+    """The estimator is blind, and drifts: it is down before it is far away, and stays there with its motors on."""
     with flown(device=RADIO, external=True) as (twin, process):
         tick = process.tick
 
@@ -164,7 +164,10 @@ def test_a_gap_of_the_radio_that_carries_motion_capture():
         descent = Descent(twin, process)
         twin.device.lines[0].silence(1e6)
         process.until(lambda: truth(twin)[2] == 0.0, "down")
+        process.run(2.0)
         assert np.abs(truth(twin)[:2]).max() < 0.3
+        assert twin.device.flock.quadrotor.flying[0]
+        assert process.state.flying[0], "its motors may be on"
         assert descent.fastest.max() < SINKS
 
 

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.arrays import Array, Mask
+from twins.models.quadrotor import GRAVITY
 
 HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
+STEEPEST: Final = np.radians(20.0)  # the firmware's default limit of roll and pitch
 NEITHER: Final = (np.nan, np.nan, np.nan)
 
 
@@ -26,6 +28,7 @@ class Commander:
         self._body = np.zeros(rows, dtype=bool)
         self._heading = np.full(rows, np.nan)
         self._turn = np.zeros(rows)
+        self._lean = np.zeros((rows, 2))  # acceleration along the axes of the robot, on axes without setpoint [m/s²]
         self._received = np.full(rows, -np.inf)
         self._low_level: NDArray[np.bool_] = np.zeros(rows, dtype=bool)
 
@@ -39,6 +42,7 @@ class Commander:
         heading: float = np.nan,
         turn: float = 0.0,
         body: bool = False,
+        lean: tuple[float, float] = (0.0, 0.0),
         on: bool = True,
     ) -> None:
         """Set a low-level setpoint.
@@ -49,10 +53,13 @@ class Commander:
             heading: Yaw [rad], or NaN: use `turn`.
             turn: Yaw rate [rad/s].
             body: Velocity along the axes of the robot.
+            lean: Roll to the right and pitch nose up [rad]; they count on axes without setpoint.
             on: Motors on.
         """
         self.target[row], self._velocity[row] = target, velocity
         self._heading[row], self._turn[row], self._body[row], self.on[row] = heading, turn, body, on
+        roll, pitch = np.clip(lean, -STEEPEST, STEEPEST)
+        self._lean[row] = -GRAVITY * np.tan([pitch, roll])
         self._received[row] = t
         self._low_level[row] = True
 
@@ -69,6 +76,7 @@ class Commander:
         listening = ~self._low_level
         planned = listening & np.isfinite(goal[:, 0])
         self.target[listening], self._velocity[listening], self._body[listening] = goal[listening, :3], np.nan, False
+        self._lean[listening] = 0.0
         self._heading[planned], self._turn[planned] = goal[planned, 3], 0.0
         self.on[listening] = planned[listening]
         self._received[listening] = t
@@ -79,7 +87,15 @@ class Commander:
         return t - self._received
 
     def model_setpoint(
-        self, position: Array, velocity: Array, yaw: Array, *, level: Mask, gain: Array, turn_gain: float
+        self,
+        position: Array,
+        velocity: Array,
+        yaw: Array,
+        *,
+        level: Mask,
+        gain: Array,
+        speed_gain: float,
+        turn_gain: float,
     ) -> Array:
         """Setpoints as positions and yaws (N, 4), the input of the motion model.
 
@@ -89,6 +105,7 @@ class Commander:
             yaw: (N,) [rad].
             level: (N,) rows without horizontal setpoint.
             gain: (3,) of the model's position controller [1/s]: a velocity v is the position v / gain ahead.
+            speed_gain: Of its horizontal velocity controller [1/s]: an acceleration a is a / speed_gain faster.
             turn_gain: Likewise of its yaw controller [1/s].
         """
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -98,7 +115,11 @@ class Commander:
         speed[:, 1] = np.where(body, sin * v[:, 0] + cos * v[:, 1], v[:, 1])
         target = self.target.copy()
         target[level, :2] = speed[level, :2] = np.nan
-        speed = np.where(np.isnan(speed), velocity, speed)  # axes without setpoint keep their velocity
+        free = velocity.copy()  # axes without setpoint keep their velocity, or lean
+        lean = np.where(level[:, None], 0.0, self._lean) / speed_gain
+        free[:, 0] += cos * lean[:, 0] - sin * lean[:, 1]
+        free[:, 1] += sin * lean[:, 0] + cos * lean[:, 1]
+        speed = np.where(np.isnan(speed), free, speed)
         target = np.where(np.isnan(target), position + speed / gain, target)
         turning = np.isnan(self._heading) | level
         heading = np.where(turning, yaw + np.where(level, 0.0, self._turn) / turn_gain, self._heading)

@@ -47,7 +47,10 @@ TOLD: Final = {  # parameters that make a Crazyflie write to its console
     "supervisor.infdmp": "SUP: Supervisor info ---\n",
 }
 Send = Callable[[Port, int, bytes], None]
+LEAST: Final = "posCtlPid.thrustMin"
 LARGEST: Final = 2.0**32  # upper bound of whole parameters, far above any length, angle or speed
+LEAST_THRUST, MOST_THRUST = 1000, 60000
+DEFAULT_SPEED: Final = 0.5  # [m/s] mean speed of take-offs and landings with velocity that name none
 CLIMB_THRUST: Final = 24000.0  # additional thrust for a climb of about 1 m/s
 
 
@@ -64,6 +67,7 @@ class Drone:
     send: Send
     stored: dict[int, float] = field(default_factory=dict)  # parameters stored on board
     on: bool = True
+    thrust_locked: bool = True  # no thrust before a packet of zero thrust
 
     def __post_init__(self) -> None:
         tables = inventory(self.flock.tables[self.row])
@@ -89,6 +93,7 @@ class Drone:
     def _start(self) -> None:
         """State after switching on."""
         flock, row = self.flock, self.row
+        self.thrust_locked = True
         self.values = [variable.value for variable in self.parameters.variables]
         present = {
             "deck.bcLighthouse4": flock.lighthouse[row],
@@ -103,6 +108,7 @@ class Drone:
                 self.values[self.parameters.number[name]] = int(deck)
         for number, value in self.stored.items():
             self.values[number] = value
+        flock.set_least_thrust(row, self.value(LEAST))
         self.logs.reset()
 
     def value(self, name: str) -> float:
@@ -239,7 +245,10 @@ class Drone:
         name, flock = self.parameters.variables[number].name, self.flock
         if name == "kalman.resetEstimation" and value:
             place = np.array([self.value(f"kalman.initial{axis}") for axis in "XYZ"])
-            flock.estimator.reset(self.row, place - flock.place[self.row])
+            yaw = self.value("kalman.initialYaw") - flock.quadrotor.yaw[self.row]
+            flock.estimator.reset(self.row, place - flock.place[self.row], yaw)
+        elif name == LEAST:
+            flock.set_least_thrust(self.row, value)
         elif name == "lighthouse.systemType" and value != before:
             self.memories.clear_stations()
         elif name == "stabilizer.stop" and value:
@@ -280,9 +289,12 @@ class Drone:
         self.flock.commander.command(self.row, self.flock.t, **setpoint)  # type: ignore[arg-type]
 
     def _thrust(self, _channel: int, data: bytes) -> None:
-        _, _, turn, thrust = _numbers(crtp.THRUST, data)
-        climb = (thrust - HOVER_THRUST) / CLIMB_THRUST
-        self._command(on=thrust > 0, velocity=(math.nan, math.nan, climb), turn=math.radians(turn))
+        roll, pitch, turn, thrust = _numbers(crtp.THRUST, data)
+        self.thrust_locked = self.thrust_locked and thrust > 0
+        on = thrust >= LEAST_THRUST and not self.thrust_locked
+        climb = (min(thrust, MOST_THRUST) - HOVER_THRUST) / CLIMB_THRUST
+        lean = math.radians(roll), math.radians(pitch)
+        self._command(on=on, velocity=(math.nan, math.nan, climb), turn=math.radians(turn), lean=lean)
 
     def _setpoint(self, channel: int, data: bytes) -> None:
         if channel == 1:
@@ -290,24 +302,27 @@ class Drone:
                 self.flock.commander.release(self.row)
             return
         kind, rest, free = data[0], data[1:], math.nan
-        if kind == Setpoint.STOP:
-            self._command(on=False)
-        elif kind == Setpoint.POSITION:
+        sense = -1.0 if kind in (Setpoint.OLD_VELOCITY, Setpoint.OLD_HEIGHT, Setpoint.OLD_HOVER) else 1.0
+        if kind == Setpoint.POSITION:
             x, y, z, yaw = _numbers(crtp.FOUR, rest)
             self._command(target=(x, y, z), heading=math.radians(yaw))
-        elif kind == Setpoint.VELOCITY:
+        elif kind in (Setpoint.VELOCITY, Setpoint.OLD_VELOCITY):
             vx, vy, vz, turn = _numbers(crtp.FOUR, rest)
-            self._command(velocity=(vx, vy, vz), turn=math.radians(turn))
-        elif kind == Setpoint.HOVER:
+            self._command(velocity=(vx, vy, vz), turn=sense * math.radians(turn))
+        elif kind in (Setpoint.HOVER, Setpoint.OLD_HOVER):
             vx, vy, turn, z = _numbers(crtp.FOUR, rest)
-            self._command(velocity=(vx, vy, free), target=(free, free, z), turn=math.radians(turn), body=True)
-        elif kind == Setpoint.HEIGHT:
-            _, _, turn, z = _numbers(crtp.FOUR, rest)
-            self._command(target=(free, free, z), turn=math.radians(turn))
+            self._command(velocity=(vx, vy, free), target=(free, free, z), turn=sense * math.radians(turn), body=True)
+        elif kind in (Setpoint.HEIGHT, Setpoint.OLD_HEIGHT, Setpoint.CLIMB_RATE):
+            roll, pitch, turn, z = _numbers(crtp.FOUR, rest)
+            vertical = "velocity" if kind == Setpoint.CLIMB_RATE else "target"
+            lean = math.radians(roll), math.radians(pitch)
+            self._command(**{vertical: (free, free, z)}, turn=sense * math.radians(turn), lean=lean)
         elif kind == Setpoint.FULL_STATE:
             values = crtp.FULL_STATE.unpack_from(rest)
             x, y, z = (crtp.MM * value for value in values[:3])
             self._command(target=(x, y, z), heading=crtp.yaw_of(values[9]))
+        else:  # a stop, and what the firmware does not know: all zero
+            self._command(on=False)
 
     def _high_level(self, _channel: int, data: bytes) -> bytes:
         return data[:3].ljust(3, b"\0") + bytes((self._plan(data[0], data[1], data[2:]),))
@@ -328,7 +343,12 @@ class Drone:
         begin = {
             HighLevel.TAKEOFF: self._climb,
             HighLevel.LAND: self._climb,
+            HighLevel.OLD_TAKEOFF: self._climb,
+            HighLevel.OLD_LAND: self._climb,
+            HighLevel.TAKEOFF_VELOCITY: self._climb,
+            HighLevel.LAND_VELOCITY: self._climb,
             HighLevel.GO_TO: self._go_to,
+            HighLevel.OLD_GO_TO: self._go_to,
             HighLevel.SPIRAL: self._spiral,
             HighLevel.START: self._follow,
             HighLevel.START_2: self._follow,
@@ -341,15 +361,28 @@ class Drone:
         return status
 
     def _climb(self, command: int, pose: Array, data: bytes) -> Status:
-        height, yaw, keep, span = _numbers(crtp.CLIMB, data)
+        landing = command in (HighLevel.LAND, HighLevel.OLD_LAND, HighLevel.LAND_VELOCITY)
+        if command in (HighLevel.OLD_TAKEOFF, HighLevel.OLD_LAND):
+            (height, span), yaw, keep = _numbers(crtp.OLD_CLIMB, data), 0.0, False
+        elif command in (HighLevel.TAKEOFF_VELOCITY, HighLevel.LAND_VELOCITY):
+            height, relative, yaw, keep, speed = _numbers(crtp.CLIMB_VELOCITY, data)
+            height = float(pose[2]) + (-height if landing else height) if relative else height
+            span = abs(height - float(pose[2])) / (speed if speed > 0.0 else DEFAULT_SPEED)
+        else:
+            height, yaw, keep, span = _numbers(crtp.CLIMB, data)
         yaw = float(pose[3]) if keep else yaw
-        landing = command == HighLevel.LAND
         return self.flock.planner.climb(
             self.row, self.flock.t, pose, height=height, yaw=yaw, span=span, landing=landing
         )
 
-    def _go_to(self, _: int, pose: Array, data: bytes) -> Status:
-        relative, linear, x, y, z, yaw, span = _numbers(crtp.GO_TO, data)
+    def _go_to(self, command: int, pose: Array, data: bytes) -> Status:
+        old = command == HighLevel.OLD_GO_TO
+        packing = crtp.OLD_GO_TO if old else crtp.GO_TO
+        if any(map(math.isnan, packing.unpack_from(data))) and self.flock.quadrotor.flying[self.row]:
+            self.flock.supervisor.stop(self.row)  # no plan has such values: motors off, and locked
+            return Status.OK
+        relative, *straight, x, y, z, yaw, span = _numbers(packing, data)
+        linear = any(straight)
         goal, velocity = np.array([x, y, z, yaw]), self.flock.quadrotor.velocity[self.row]
         return self.flock.planner.go_to(
             self.row, self.flock.t, pose, velocity, goal=goal, span=span, relative=relative, linear=linear
@@ -389,8 +422,10 @@ class Drone:
             return None
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
-            x, y, z, *_ = _numbers(crtp.POSE, rest)
+            x, y, z, qx, qy, qz, qw = _numbers(crtp.POSE, rest)
             flock.estimator.add_external(row, flock.t, (x, y, z))
+            yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+            flock.estimator.turn[row] = math.remainder(yaw - flock.quadrotor.yaw[row], math.tau)
         elif kind == Location.LPP and flock.loco[row]:
             if rest[1] == crtp.ANCHOR_POSITION and rest[0] < ANCHORS:
                 flock.memories[row].set_anchor(rest[0], *_numbers(crtp.VECTOR, rest[2:]))

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask
+from agents.arrays import Array, Mask, some
 from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
 from agents.body.kinds import CRAZYFLIE
@@ -40,11 +40,13 @@ class Estimator:
         self.external = np.zeros((rows, 3))  # last external position [m]
         self.received = np.zeros(rows, dtype=np.intp)  # number of external positions
         self._external_time = np.full(rows, -np.inf)
-        self._drift = np.zeros((rows, 3))  # rate of the error [m/s]
+        self._drift = np.zeros((rows, 3))  # rate of the error without measurements [m/s]
+        self.rate = np.zeros((rows, 3))  # of the error [m/s]: the estimate of the velocity is wrong by as much
+        self.turn = np.zeros(rows)  # estimate minus truth of the yaw [rad]
 
-    def reset(self, row: int, error: Array) -> None:
-        """Restart the estimator of a row with an error (3,) [m]."""
-        self.error[row], self.variance[row] = error, LOST
+    def reset(self, row: int, error: Array, turn: float) -> None:
+        """Restart the estimator of a row with an error (3,) [m] and one of its yaw [rad]."""
+        self.error[row], self.variance[row], self.turn[row] = error, LOST, turn
 
     def add_external(self, row: int, t: float, position: tuple[float, float, float]) -> None:
         """Add an external position (3) [m]."""
@@ -67,10 +69,12 @@ class Estimator:
         wanted = np.where((ready | flow)[:, None], 0.0, self.external - truth)
         measured = ready | outside
         axes = measured[:, None] | (flow[:, None] & UPWARDS)
+        before = self.error.copy()
         self.error += np.where(axes, share * (wanted - self.error), 0.0)
         blind = flying & ~measured & ~flow
         self._drift = np.where(blind[:, None], self._drift + dt * DRIFT, 0.0)
         self.error += dt * self._drift
+        self.rate = (self.error - before) / dt
         settled = self.variance + share * (PRECISE - self.variance)
         growth = np.where(flow, 0.0, GROWTH * dt)
         self.variance = np.where(measured, settled, np.minimum(self.variance + growth, LOST))
@@ -82,7 +86,12 @@ CHARGES: Final = np.linspace(0.0, 1.0, len(VOLTS))
 SAG_V: Final = 0.3  # under the load of hovering: 2 A through 0.15 ohm
 LOW_V: Final = 3.2  # the firmware's own threshold
 LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
-IMPACT: Final = 2.0  # [m/s] a robot that hits the floor faster (a fall of 0.2 m) ends on its side
+IMPACT: Final = 4.2  # [m/s] a robot that hits the floor faster (a fall of 0.9 m) ends on its side
+# share of the weight that the motors carry with the firmware's default of the least thrust, 20,000
+CARRIED: Final = {"crazyflie": 0.51, "brushless": 0.63}
+DEFAULT_THRUST: Final = 20000.0
+SLIDES: Final = 0.4  # share of the weight: a robot of which the motors carry more slides over the floor
+SKATING: Final = 2.0  # [m/s] largest speed of that
 TRIM: Final = np.radians([0.4, -0.3])  # roll, pitch of a robot at rest [rad]: none is exactly level
 LEANING_S: Final = 0.05  # time constant of the attitude
 ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
@@ -131,7 +140,11 @@ class Flock:
         self._latency = Latency(request.disturbance, self.dt)
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
         self._gain, self._turn_gain = np.array(response.position), kind.turn_response
-        self.estimator.error[:] = -self.quadrotor.position  # it believes to be where it was switched on
+        self._speed_gain = np.array(response.velocity)
+        self.estimator.error[:] = -self.quadrotor.position  # it believes to be where it was switched on,
+        self.estimator.turn[:] = -self.quadrotor.yaw  # and to look along x
+        self._carried = np.array([CARRIED[each.platform] for each in settings]) / DEFAULT_THRUST
+        self._slides: Mask = self._carried * DEFAULT_THRUST > SLIDES
         self.place = self.quadrotor.position.copy()  # (N, 3) true positions [m]
         self.estimate = self.place + self.estimator.error  # (N, 3) reported positions [m]
         self.velocity = np.zeros((rows, 3))  # reported, from measured positions [m/s]
@@ -141,7 +154,15 @@ class Flock:
 
     def pose(self, row: int) -> Array:
         """Estimated pose (4,) of a row: x, y, z [m], yaw [rad]."""
-        return np.append(self.quadrotor.position[row] + self.estimator.error[row], self.quadrotor.yaw[row])
+        return np.append(self.quadrotor.position[row] + self.estimator.error[row], self.estimated_yaw(row))
+
+    def estimated_yaw(self, row: int) -> float:
+        """Estimated yaw of a row [rad]."""
+        return float(self.quadrotor.yaw[row] + self.estimator.turn[row])
+
+    def set_least_thrust(self, row: int, thrust: float) -> None:
+        """Set the least thrust of a row's controller, of 65,535."""
+        self._slides[row] = self._carried[row] * thrust > SLIDES
 
     @property
     def volts(self) -> Array:
@@ -188,7 +209,11 @@ class Flock:
         """Arm or disarm a row; False if refused."""
         if on and self.refuse_arming:
             return False
-        return self.supervisor.arm(row, self.t, on=on)
+        done = self.supervisor.arm(row, self.t, on=on)
+        if not on:
+            self.planner.stop(row)
+            self.commander.stop(row)
+        return done
 
     def restart(self, row: int) -> None:
         """Switch a row off and on: motors off, estimator at its start."""
@@ -196,7 +221,7 @@ class Flock:
         self.commander.stop(row)
         self.supervisor.restart(row)
         self.quadrotor.stop(np.array([row]))
-        self.estimator.reset(row, -self.quadrotor.position[row])
+        self.estimator.reset(row, -self.quadrotor.position[row], -float(self.quadrotor.yaw[row]))
 
     def advance(self, t: float) -> Mask:
         """Advance to time `t` [s] by steps of dt; returns the rows (N,) locked or crashed on the way."""
@@ -220,16 +245,22 @@ class Flock:
         setpoint = commander.model_setpoint(
             quadrotor.position + self.estimator.error,
             quadrotor.velocity,
-            quadrotor.yaw,
+            quadrotor.yaw + self.estimator.turn,
             level=supervisor.level,
             gain=self._gain,
+            speed_gain=self._speed_gain[0],
             turn_gain=self._turn_gain,
         )
-        setpoint[:, :3] -= self.estimator.error  # the controller uses the estimate, not the truth
+        setpoint = self._true_setpoint(setpoint)
         quadrotor.command(self._latency.delay(setpoint) if self._latency.present else setpoint)
-        before = quadrotor.velocity
+        before, place = quadrotor.velocity, quadrotor.position.copy()
         quadrotor.advance()
-        self._touch_floor(before)
+        if some(quadrotor.flying):
+            # the controller takes what the estimate does not see of the velocity for none
+            quadrotor.velocity = quadrotor.velocity - np.where(
+                quadrotor.flying[:, None], self.dt * self._speed_gain * self.estimator.rate, 0.0
+            )
+        self._touch_floor(before, place, setpoint)
         self._update_attitude(before)
         self.place = quadrotor.position.copy()
         if self._jitter.present:
@@ -243,14 +274,35 @@ class Flock:
         self._last_measured = measured
         return locked
 
-    def _touch_floor(self, before: Array) -> None:
-        """Stop rows at the floor; those that hit it hard, with `before` (N, 3) [m/s], end on their sides."""
+    def _true_setpoint(self, setpoint: Array) -> Array:
+        """Setpoints (N, 4) of positions and yaws as they are flown: the controller uses the estimate, not the truth."""
+        estimator = self.estimator
+        setpoint[:, :3] -= estimator.error
+        setpoint[:, 3] -= estimator.turn
+        if some(estimator.turn != 0.0):  # it turns its accelerations by a wrong yaw
+            place = self.quadrotor.position[:, :2]
+            ahead, cos, sin = setpoint[:, :2] - place, np.cos(estimator.turn), np.sin(estimator.turn)
+            turned = np.stack([cos * ahead[:, 0] + sin * ahead[:, 1], cos * ahead[:, 1] - sin * ahead[:, 0]], axis=1)
+            setpoint[:, :2] = place + turned
+        return setpoint
+
+    def _touch_floor(self, before: Array, place: Array, setpoint: Array) -> None:
+        """Stop rows at the floor; those that hit it hard, with `before` (N, 3) [m/s], end on their sides.
+
+        A row whose motors still carry much of its weight slides from its `place` (N, 3) [m] to where its estimate
+        leads, `setpoint` (N, 4).
+        """
         quadrotor = self.quadrotor
         floor = quadrotor.position[:, 2] <= 0.0
         self.supervisor.tumbled |= floor & (before[:, 2] < -IMPACT)
         below = quadrotor.position[:, 2] < 0.0
+        sliding = below & quadrotor.flying & self._slides
+        wanted = np.clip(self._gain[:2] * (setpoint[:, :2] - place[:, :2]), -SKATING, SKATING)
+        speed = before[:, :2] + self.dt * self._speed_gain[:2] * (wanted - before[:, :2])
         quadrotor.position[below, 2] = 0.0
         quadrotor.velocity[below] = 0.0
+        quadrotor.velocity[sliding, :2] = speed[sliding]
+        quadrotor.position[below, :2] = place[below, :2] + self.dt * quadrotor.velocity[below, :2]
 
     def _update_attitude(self, before: Array) -> None:
         """Attitude that gives the acceleration from `before` (N, 3) [m/s] on, with a lag."""

@@ -123,11 +123,11 @@ def _motion(flock: Flock, row: int) -> dict[str, Read]:
 
     def level(of: Array) -> Array:
         """Vector of the world (3,) in the level frame with the robot's yaw."""
-        cos, sin = math.cos(quadrotor.yaw[row]), math.sin(quadrotor.yaw[row])
+        cos, sin = math.cos(flock.estimated_yaw(row)), math.sin(flock.estimated_yaw(row))
         return np.array([cos * of[0] + sin * of[1], cos * of[1] - sin * of[0], of[2]])
 
     def angles() -> Array:
-        return np.degrees([*flock.attitude[row], math.remainder(quadrotor.yaw[row], 2.0 * math.pi)])
+        return np.degrees([*flock.attitude[row], math.remainder(flock.estimated_yaw(row), math.tau)])
 
     def force() -> Array:
         """Specific force [g], which is measured; none in free fall."""

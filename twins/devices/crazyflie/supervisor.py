@@ -72,7 +72,7 @@ class Supervisor:
         """Arm or disarm a row; False if not possible in its state."""
         if on and self.state[row] == State.DISARMED and not self.tumbled[row]:
             self.state[row], self._since[row] = State.ARMING, t
-        elif not on and self.state[row] in (State.FLYING, State.LEVEL):
+        elif not on and self.state[row] in (State.FLYING, State.LEVEL) and not self._auto[row]:
             self._stop[row] = True  # disarmed in the air, it locks
         elif not on and self.state[row] not in (State.LOCKED, State.CRASHED):
             self.state[row] = State.DISARMED

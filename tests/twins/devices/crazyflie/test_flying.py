@@ -360,6 +360,7 @@ def test_an_empty_battery_is_reported_after_five_seconds():
 def test_the_floor():
     """Motors that do not carry it leave it where it stands."""
     wire = Wire()
+    wire.zero()
     wire.wait(1.0, lambda: wire.put(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 20000)))
     assert wire.motors
     assert wire.position.tolist() == [0.0, 0.0, 0.0]
@@ -367,7 +368,7 @@ def test_the_floor():
 
 def test_a_fall_ends_upside_down():
     """Crashed, until it is put upright and recovery is asked for; then it flies again."""
-    wire = Wire().hovering()
+    wire = Wire().hovering(1.2)
     wire.plan(HighLevel.STOP)
     wire.wait(1.0)
     assert wire.position[2] == 0.0
