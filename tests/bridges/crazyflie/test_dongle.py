@@ -263,9 +263,9 @@ def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
     with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
-        drone, queue = twin.device.drones[0], twin.device.lines[0].queue
-        send = drone.send
-        drone.send = lambda port, channel, data: [
+        line, queue = twin.device.lines[0], twin.device.lines[0].queue
+        send = line.send
+        line.send = lambda port, channel, data: [
             send(port, channel, data) for _ in range(20 if (port, channel) == (Port.LOG, 2) and len(queue) < 160 else 1)
         ]
         hovering(process)
