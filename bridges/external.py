@@ -142,11 +142,10 @@ class ExternalBody:
                         self._put(row, msgspec.structs.replace(repeated.order, stamp=self._stamp()))
 
     def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Body.takeoff`; no effect on ground robots."""
+        """See `Body.takeoff`; no effect on ground robots, or after a stop."""
         for row, up in zip(rows.tolist(), height.tolist(), strict=True):
-            if self._flies[row]:
+            if self._flies[row] and not self._stopped[row]:
                 self._flight.take_off(row, self._poses.position[row])
-                self._stopped[row] = False
                 self._send_order(row, "takeoff", np.inf, up)
 
     def land(self, rows: Index) -> None:
@@ -264,6 +263,8 @@ class ExternalBody:
     def _send_order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
         """Send an order now, and repeat it for `seconds`."""
         with self._lock:
+            if action == "takeoff" and self._stopped[row]:
+                return  # stopped meanwhile, by another thread
             order = self._next_command(row, action, height=height)
             self._repeated[row] = _RepeatedOrder(order, self._now() + seconds)
             self._put(row, order)

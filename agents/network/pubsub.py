@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Iterator
 from itertools import chain
@@ -29,6 +30,7 @@ HEARTBEAT_S: Final = 0.5  # delay until the loss of the last pose before a silen
 POSES: Final = 16  # queued poses of one robot
 EVENTS: Final = 64  # of a run, repeated to a subscriber that was cut off: without a router much happens at once
 ORDERS: Final = 8  # queued
+LONGEST_ORDER: Final = 4096  # [bytes] an order to land or to stop is shorter
 TOKEN_CHANGES: Final = 256  # queued
 NO_ORDER: Final = 'an order is a query with a payload, such as {"order": "land"}'
 
@@ -178,17 +180,33 @@ class CallbackQueue(Generic[T]):
     lock.
     """
 
-    def __init__(self, depth: int, wanted: Callable[[T], bool] = lambda _: True) -> None:
-        """Keeps the newest `depth` items that are `wanted`. `callback` is the one to declare."""
-        self.waiting: deque[T] = deque(maxlen=depth)  # queued items
-        self._wanted = wanted
+    def __init__(
+        self, depth: int, wanted: Callable[[T], bool] = lambda _: True, urgent: Callable[[T], bool] = lambda _: False
+    ) -> None:
+        """Keeps the newest `depth` items that are `wanted`. `callback` is the one to declare.
+
+        An item that is `urgent` is never displaced: if all are, the new one is left out.
+        """
+        self.waiting: deque[T] = deque()  # queued items
+        self._depth, self._wanted, self._urgent = depth, wanted, urgent
+        self._lock = threading.Lock()
         self.callback = Callback(self._append, indirect=False)
 
     def try_recv(self) -> T | None:
-        return self.waiting.popleft() if self.waiting else None
+        if not self.waiting:
+            return None
+        with self._lock:
+            return self.waiting.popleft()
 
     def _append(self, item: T) -> None:
-        if self._wanted(item):
+        if not self._wanted(item):
+            return
+        with self._lock:
+            if len(self.waiting) == self._depth:
+                displaced = next((number for number, each in enumerate(self.waiting) if not self._urgent(each)), None)
+                if displaced is None:
+                    return
+                del self.waiting[displaced]
             self.waiting.append(item)
 
 
@@ -235,7 +253,7 @@ class Orders(Generic[M]):
 
     def __init__(self, session: zenoh.Session, key: str, kind: type[M]) -> None:
         self._kind, self.malformed = kind, 0  # refused payloads
-        self._queries = CallbackQueue[zenoh.Query](ORDERS)
+        self._queries = CallbackQueue[zenoh.Query](ORDERS, urgent=_ends_flight)
         self.waiting = self._queries.waiting  # queued
         self._queryable = session.declare_queryable(key, self._queries.callback, complete=True)
 
@@ -263,6 +281,15 @@ class Orders(Generic[M]):
 
     def close(self) -> None:
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _ends_flight(query: zenoh.Query) -> bool:
+    """Whether a query is an order to land or to stop, in either encoding."""
+    payload = query.payload
+    if payload is None or len(payload) > LONGEST_ORDER:
+        return False
+    order = payload.to_bytes()
+    return b"land" in order or b"stop" in order
 
 
 class LastValue:

@@ -98,7 +98,7 @@ class Runtime:
         self._estimator = External(len(self._names))
         self._state: BodyState | None = None  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
-        self._joined = False
+        self._opened = self._joined = False
         self._ticks = Ticks(assignment.body_hz, clock=uptime)
         self._utc = 0.0
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names], network.ROBOT_LEASE_S)
@@ -106,6 +106,7 @@ class Runtime:
         self._reason_to_end: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
         self._everyone = np.arange(len(self._names))
+        self._on_wheels = np.flatnonzero([not kind.flies for kind in assignment.kinds])
         self._began = setup.clock.utc()
         self._owned: list[zenoh.LivelinessToken] = []
         self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows that are alive for their neighbours
@@ -142,6 +143,7 @@ class Runtime:
                 rights=self._setup.rights,
             )
             out.callback(leave, session, self)
+            self._subscribe_to_stops(session)
             self._take_names(session, asked)
             out.callback(self._ownership.end)
             self._body.open()
@@ -243,26 +245,35 @@ class Runtime:
     def _await_ownership(self) -> bool:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
-        Until then it must not command its bodies, since another process may drive them.
+        Until then it must not command its bodies, since another process may drive them. Without an answer those on
+        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if the process is told to end, all land:
+        the process drives its bodies again then, until it learns that they belong to another one.
         """
         if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
+        limits, drives = self._assignment.limits, self._on_wheels
         woke, self._hands_off = uptime(), True
         self._ownership.begin(self._session)
         while not self._owns_names():
-            if uptime() - woke > ANSWER_S and self._reason_to_end() is not None:
-                names = ", ".join(self._names)
-                raise network.Unreachable(
-                    f"{names}: told to end after it stood still, and no router answers who owns the name now; its body "
-                    "is left as it is"
-                )
+            waited = uptime() - woke
+            if waited > limits.offline_s or (waited > ANSWER_S and self._reason_to_end() is not None):
+                self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
+                break
+            if len(drives) and waited > limits.link_silence_s:
+                self._body.land(drives)
+                drives = drives[:0]
             self._watchdog.beat()
             time.sleep(self._dt)
         self._ownership.stood_still()
         self._hands_off = False
         return True
 
+    def _subscribe_to_stops(self, session: zenoh.Session) -> None:
+        """Subscribes to emergency stops before the body is opened, which may take a minute."""
+        self._estop = pubsub.ImmediateSubscriber(session, self._setup.keys.estop, self._cut)
+
     def _join(self, session: zenoh.Session) -> None:
+        self._opened = True
         keys, names = self._setup.keys, self._names
         self._session = session
         self._router_due, self._silent_since = -np.inf, np.inf
@@ -270,7 +281,6 @@ class Runtime:
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
         self._orders = [pubsub.Orders(session, keys.order(name), messages.Order) for name in names]
-        self._estop = pubsub.ImmediateSubscriber(session, keys.estop, self._cut)
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = np.flatnonzero(self._setup.located).tolist()
         exact = np.flatnonzero(self._setup.exact).tolist()
@@ -363,9 +373,13 @@ class Runtime:
         return self._silent_since
 
     def _cut(self, _stop: messages.Stop) -> None:
-        """Cuts the motors on reception of an emergency stop, in the receiving thread; the loop does the rest."""
+        """Cuts the motors on reception of an emergency stop, in the receiving thread; the loop does the rest.
+
+        A body that is still being opened is stopped on the first tick.
+        """
         self._cut_off = True
-        self._body.stop(self._everyone)
+        if self._opened:
+            self._body.stop(self._everyone)
 
     def _apply_stops(self) -> None:
         """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
@@ -538,6 +552,8 @@ class Runtime:
                 self._body.takeoff(commands.takeoff, self._assignment.hover[commands.takeoff])
         if not overruled and not stale:
             self._body.command(actions.setpoint)
+        if self._cut_off and not overruled:  # the stop came in between: it has the last word
+            self._body.stop(self._everyone)
 
     def _send_pose(self, row: int, transmission: Transmission, yaw: float, t: float) -> None:
         self._counts.sent[row] += 1

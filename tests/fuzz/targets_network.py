@@ -64,6 +64,7 @@ def robot() -> Iterator[Target]:
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
         runtime = Runtime(Plan(experiment).assignment(["KH01"]), body, setup)
         body.open()
+        runtime._subscribe_to_stops(net.session)
         runtime._join(net.session)
         runtime._utc = runtime._telemetry.utc = time.time()
         command = body.command

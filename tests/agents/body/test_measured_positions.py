@@ -69,6 +69,7 @@ def flown(
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
         runtime = Runtime(Plan(few).assignment(("T",)), body, setup)
         body.open()
+        runtime._subscribe_to_stops(net.session)  # type: ignore[arg-type]
         runtime._join(net.session)  # type: ignore[arg-type]
         runtime._utc = runtime._telemetry.utc = UTC
         agent = runtime.agent

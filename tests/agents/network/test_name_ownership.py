@@ -305,6 +305,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
         robot = Runtime(Plan(pair()).assignment(("A", "B")), Airborne(), setup)
+        robot._subscribe_to_stops(net.session)
         robot._join(net.session)
         robot._joined = True
         shown = [Keys().alive("A"), Keys().alive("B")]

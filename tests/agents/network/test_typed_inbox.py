@@ -6,7 +6,8 @@ import pytest
 
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
-from tests.fuzz.loopnet import Channel, Query, Sample, typed_orders
+from tests.fuzz.loopnet import Channel, Net, Query, Sample, typed_orders
+from tests.fuzz.loopnet import Orders as RealOrders
 
 KEYS = Keys("park")
 
@@ -66,3 +67,25 @@ def test_a_malformed_order_is_answered_and_counted(payload: bytes) -> None:
     channel.add(right := Query(KEYS.order("A"), messages.JSON, b'{"order": "land"}'))
     assert list(orders.read()) == [(right, messages.Order("land"))]
     assert (wrong.answers, right.answers, orders.malformed) == (1, 0, 1)
+
+
+@pytest.mark.parametrize("encoding", ["json", "msgpack"])
+@pytest.mark.parametrize("order", ["land", "stop"])
+def test_flood_of_queries_displaces_no_landing(order: str, encoding: messages.Encoding) -> None:
+    with Net().worn() as net:
+        net.session.declare_queryable = lambda _key, callback, **_: callback  # type: ignore[attr-defined]
+        orders = RealOrders(net.session, KEYS.order("A"), messages.Order)  # type: ignore[arg-type]
+    mime = messages.MIME[encoding]
+
+    def ask(given: messages.Order, times: int = 1) -> None:
+        for _ in range(times):
+            orders._queries._append(Query(KEYS.order("A"), mime, messages.encode(given, encoding)))  # type: ignore[arg-type]
+
+    ask(messages.Order("start"), 5)
+    ask(messages.Order(order))
+    ask(messages.Order("hold"), 40)
+    assert len(orders.waiting) == pubsub.ORDERS
+    assert [given.order for _, given in orders.read()] == [order] + ["hold"] * (pubsub.ORDERS - 1)
+    ask(messages.Order(order), 40)
+    ask(messages.Order("hold"), 40)
+    assert [given.order for _, given in orders.read()] == [order] * pubsub.ORDERS

@@ -1,17 +1,22 @@
 """The loop of a robot process on a simulated clock: skipped ticks, and a hold after it stood still."""
 
 import types
+from functools import partial
 
 import pytest
 
 from agents.body.fleet import assemble
+from agents.decision.lifecycle import Phase
+from agents.network import messages, name_ownership
+from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import loop
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
+from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
-from tests.fuzz.loopnet import Net
+from tests.fuzz.loopnet import Net, Sample
 
 HZ = 100.0
 
@@ -36,6 +41,7 @@ def test_a_loop_that_stood_still_skips_ticks_and_holds_after_a_suspension(stands
             Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
         )
         body.open()
+        runtime._subscribe_to_stops(net.session)
         runtime._join(net.session)
         tick = runtime._tick
 
@@ -58,3 +64,119 @@ def test_a_loop_that_stood_still_skips_ticks_and_holds_after_a_suspension(stands
     assert runtime.agent.tick == 12 + missed
     assert (f"stood still for {stands_s:.1f} s; holding" in capsys.readouterr().out) == holds
     assert (runtime.agent.health.resumed_at == pytest.approx((5 + missed) / HZ)) == holds
+
+
+class Stage:
+    """One robot on a simulated clock, without a network; `orders` of its body, each with the time [s]."""
+
+    def __init__(self, monkeypatch, kind: str) -> None:
+        hover = {"hover": 0.5} if kind == "crazyflie" else {}
+        experiment = pair(robots={"F": Robot(kind=kind, start=[0.1, 0.2], **hover)}, formation=Formation())
+        self.now, self.orders, self.commands = 1000.0, [], 0
+        monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=self.sleep))
+        for module in (loop, name_ownership):
+            monkeypatch.setattr(module, "uptime", lambda: self.now)
+        self.body = assemble(bodies.body_request(experiment, ("F",), [1]))
+        self.runtime = Runtime(
+            Plan(experiment).assignment(("F",)),
+            self.body,
+            Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
+        )
+        for order in ("takeoff", "land", "stop", "command"):
+            monkeypatch.setattr(self.body, order, partial(self.note, order, getattr(self.body, order)))
+        self.in_between = lambda: None  # called before each take-off and setpoint
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+    def note(self, order, call, *args):
+        if order in ("takeoff", "command"):
+            self.in_between()
+        self.orders += [(self.now, order)] if order != "command" else []
+        self.commands += order == "command"
+        call(*args)
+
+    def begin(self, net):
+        self.runtime._subscribe_to_stops(net.session)
+        self.body.open()
+        self.runtime._join(net.session)
+
+    def run(self, visit):
+        """Ticks until `visit`, which is called before each with the phase, is true."""
+        over = []
+
+        def stopping():
+            over.append(visit(Phase(self.runtime.agent.lifecycle.phase[0])))
+            self.runtime.agent.lifecycle.phase[:] = Phase.DONE if over[-1] else self.runtime.agent.lifecycle.phase
+            return "enough" if over[-1] else None
+
+        self.runtime._run_ticks(stopping)
+
+
+@pytest.mark.parametrize(("kind", "after_s"), [("khepera4", [1.0, 10.0]), ("crazyflie", [10.0])])
+def test_standstill_without_router_halts_then_lands(kind, after_s, monkeypatch):
+    stage, woke = Stage(monkeypatch, kind), []
+
+    def visit(phase):
+        life = stage.runtime.agent.lifecycle
+        if phase == Phase.READY:
+            life.takeoff(0)
+        elif phase == Phase.AIRBORNE and not woke:
+            stage.now += 0.8
+            woke.append(stage.now)
+            stage.orders.clear()
+            stage.commands = 0
+            monkeypatch.setattr(network, "connected", lambda _session: False)
+            stage.runtime.agent.hazards.incidents.clear()
+        elif woke and phase == Phase.AIRBORNE:
+            raise AssertionError("it went on")
+        return phase == Phase.DONE
+
+    with Net().worn() as net:
+        stage.begin(net)
+        stage.run(visit)
+    stage.runtime._ownership.end()
+    landed = [at - woke[0] for at, order in stage.orders if order == "land"]
+    assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
+    assert "no router tells who owns its name" in stage.runtime.agent.lifecycle.reason[0]
+
+
+@pytest.mark.parametrize("phase", [Phase.READY, Phase.AIRBORNE])
+def test_stop_during_command_has_last_word(phase, monkeypatch):
+    stage, stops = Stage(monkeypatch, "crazyflie"), []
+
+    def stop():
+        if not stops and stage.runtime.agent.lifecycle.phase[0] == phase:
+            stops.append(stage.now)
+            stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
+
+    def visit(now):
+        if now == Phase.READY:
+            stage.in_between = stop
+            stage.runtime.agent.lifecycle.takeoff(0)
+        return now == Phase.DONE
+
+    with Net().worn() as net:
+        stage.begin(net)
+        stage.run(visit)
+    assert len(stops) == 1
+    assert [order for at, order in stage.orders if at >= stops[0]][-2:] == ["stop", "stop"]
+    assert not stage.body.read(stage.runtime._ticks.t + 0.01).flying[0]
+
+
+def test_stop_while_body_opens_keeps_it_down(monkeypatch):
+    stage = Stage(monkeypatch, "crazyflie")
+
+    def visit(phase):
+        assert stage.runtime.agent.lifecycle.takeoff(0) != ""
+        return phase == Phase.DONE
+
+    with Net().worn() as net:
+        stage.runtime._subscribe_to_stops(net.session)
+        stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
+        assert stage.orders == [], "a closed body is left alone"
+        stage.body.open()
+        stage.runtime._join(net.session)
+        stage.run(visit)
+    assert [order for _, order in stage.orders] == ["stop"]
+    assert stage.runtime.agent.lifecycle.reason[0].startswith(messages.EMERGENCY)

@@ -112,6 +112,7 @@ def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs()
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     with Net().worn() as net:
         robot = Runtime(Plan(pair()).assignment(("A",)), Airborne(), setup)
+        robot._subscribe_to_stops(net.session)
         robot._join(net.session)
         robot._utc, robot._ticks.t, robot._ticks.next = UTC, 7.0, 7.01
 
