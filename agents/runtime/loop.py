@@ -246,7 +246,7 @@ class Runtime:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
         Until then it must not command its bodies, since another process may drive them. Without an answer those on
-        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if the process is told to end, all land:
+        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
         the process drives its bodies again then, until it learns that they belong to another one.
         """
         if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
