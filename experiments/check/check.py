@@ -44,6 +44,7 @@ SUBJECTS: Final = (
     *(motion.speeds, motion.rates, motion.ends),
     safety.architecture,
     safety.safety,
+    safety.batteries,
     safety.libraries,
     safety.devices,
     chance,

@@ -13,6 +13,7 @@ from agents.decision.position_control import REACHED
 from agents.formation.graph import BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from agents.plugins.planners import Planner
+from agents.safety.hazards import Cause
 from experiments.check import noise
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
@@ -62,6 +63,8 @@ def flight(analysis: Analysis) -> Iterator[Finding]:
         message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
         yield Finding("note", "predicted-in-part", message, "", ("duration_s",))
     for each in prediction.incidents:
+        if each.cause == Cause.BATTERY:  # a finding of its own, of all robots
+            continue
         name = analysis.names[each.row]
         message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
         yield Finding("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 
 from agents.arrays import norm
+from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition import bodies
+
+BEFORE_START_S: Final = 5.0  # of the battery are spent before the common start
+LISTED: Final = 12  # names
 
 
 def safety(analysis: Analysis) -> Iterator[Finding]:
@@ -25,6 +30,29 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
     if chosen.separation is not None:
         yield from _separation(analysis, chosen.separation)
+
+
+def batteries(analysis: Analysis) -> Iterator[Finding]:
+    """Report all robots whose battery ends before the run, by their kinds."""
+    experiment, low = analysis.experiment, analysis.experiment.safety.battery_low
+    if low <= 0.0:
+        return
+    names_of: dict[str, list[str]] = {}
+    for name, robot in experiment.robots.items():
+        names_of.setdefault(robot.kind, []).append(name)
+    for kind in (KINDS[each] for each in names_of):
+        lasts = (1.0 - low) * kind.endurance_s - BEFORE_START_S
+        if lasts >= experiment.duration_s:
+            continue
+        names = names_of[kind.name]
+        what = "land" if kind.flies else "stop"
+        message = (
+            f"{join_names(names, LISTED)} {what}{'s' * (len(names) == 1)} after about {lasts:.0f} s of "
+            f"{experiment.duration_s:g} s: a full battery of a {kind.name} lasts {kind.endurance_s:g} s, and below "
+            f"{low:.0%} it {what}s"
+        )
+        remedy = "shorten duration_s; battery_low = 0 in [safety] lets twins go on, and is not for real robots"
+        yield Finding("warning", "battery-ends", message, remedy, ("duration_s",))
 
 
 def _separation(analysis: Analysis, limit: float) -> Iterator[Finding]:

@@ -16,7 +16,10 @@ from hypothesis import strategies as st
 from agents.arrays import norm
 from agents.decision.position_control import REACHED
 from agents.plugins import registry
+from experiments.check.analysis import analyse
 from experiments.check.check import Figures, check, examine, figures
+from experiments.check.ideal_run import Prediction
+from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
 from experiments.file import catalogue, document
 from experiments.file.problems import DocumentError
@@ -351,3 +354,19 @@ def test_every_error_and_warning_has_a_remedy_and_a_place(made):
         assert each.message
         assert each.severity == "note" or (each.remedy and each.where)
     assert json.loads(msgspec.json.encode(numbers["default"]))["robots"] == len(made.robots)
+
+
+def test_every_battery_that_ends_before_the_run_is_named():
+    experiment = document.read(PARK).cases()["event"]
+
+    def said(duration_s: float, **safety: float) -> list[str]:
+        limits = msgspec.structs.replace(experiment.safety, **safety)
+        made = msgspec.structs.replace(experiment, duration_s=duration_s, safety=limits)
+        standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)))
+        return [each.message for each in batteries(analyse(made, standing))]
+
+    wheels, drones = said(12000.0)
+    assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours
+    assert "CF01, CF02, CF03 land after about 373 s" in drones
+    assert not said(300.0)
+    assert not said(12000.0, battery_low=0.0)
