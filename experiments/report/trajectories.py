@@ -155,16 +155,17 @@ def _end_entries() -> dict[str, Artist]:
 
 @styled
 def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
-    """The formation of each case as `check` expects it, from above: starts hollow, expected ways, target shape with its
-    links (dashed where the shape misses their targets by more than the tolerance).
+    """The formation of each case as `check` expects it, from above: starts hollow, ends full, and the target shape with
+    its links (dashed where the shape misses their targets by more than the tolerance), laid where the leaders are.
     """
     cases = list(analyses.items())
     half = 0.53 * np.array(cases[0][1].experiment.arena.size[:2])
-    figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.4)
+    figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.6)
+    halo = [withStroke(linewidth=1.5, foreground=PAPER)]
     for axes, (name, known) in zip(grid, cases, strict=True):
         experiment, motion = known.experiment, known.prediction.position
         scenery.from_above(axes, experiment)
-        target = motion[-1] if known.shape is None else _laid_upon(known.shape.position, motion[-1])
+        target = motion[-1] if known.shape is None else _laid_upon(known, known.shape.position, motion[-1])
         error = np.zeros(len(known.asked)) if known.shape is None else known.shape.error
         for link, (i, j) in enumerate(zip(known.asked.receiver, known.asked.sender, strict=True)):
             style = "-" if error[link] <= experiment.tolerance else (0, (2, 2))
@@ -175,19 +176,41 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
                 colour = KIND_COLOURS.get(experiment.robots[robot].kind, OTHER_KIND)
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
-            axes.plot(*target[row, :2], "o", ms=3.5, mec="none", color=colour, zorder=3)
-            at = (target[row, 0], target[row, 1])
-            axes.annotate(robot, at, (3, 3), textcoords="offset points", fontsize=5, color=colour)
+            axes.plot(*target[row, :2], "D", ms=4.0, mec=MAGENTA, mfc="none", mew=0.7, zorder=3)
+            axes.plot(*motion[-1, row, :2], "o", ms=3.5, mec="none", color=colour, zorder=4)
+            axes.annotate(
+                robot,
+                (float(motion[-1, row, 0]), float(motion[-1, row, 1])),
+                (3, 3),
+                textcoords="offset points",
+                fontsize=5,
+                color=colour,
+                path_effects=halo,
+                zorder=5,
+            )
         axes.set_title(plain(name), pad=3.0)
     _label_plane(figure)
+    entries = _end_entries()
+    entries["target shape"] = Line2D([], [], color=MAGENTA, linewidth=0.8, marker="D", ms=3.5, mfc="none", mew=0.7)
+    legend_above(figure, (list(entries.values()), list(entries)), columns=3)
     return figure
 
 
-def _laid_upon(shape: Array, place: Array) -> Array:
-    """A shape (N, 3), turned or mirrored in the plane and moved to fit places (N, 3) in the least squares (Kabsch)."""
-    middle, at = shape[:, :2].mean(axis=0), place[:, :2].mean(axis=0)
-    left, _, right = np.linalg.svd((shape[:, :2] - middle).T @ (place[:, :2] - at))
-    return np.column_stack([(shape[:, :2] - middle) @ left @ right + at, shape[:, 2]])
+def _laid_upon(known: Analysis, shape: Array, place: Array) -> Array:
+    """A shape (N, 3), moved as far as its targets leave it free to fit places (N, 3) in the least squares (Kabsch).
+
+    Leaders and anchors keep it where it is. Distances leave it free to turn and be mirrored, about a single leader.
+    """
+    fixed = known.without_neighbours
+    if known.assignment.anchors is not None:
+        return shape
+    about = fixed if len(fixed) else np.arange(len(shape))
+    middle, at = shape[about, :2].mean(axis=0), place[about, :2].mean(axis=0)
+    turn = np.eye(2)
+    if len(fixed) < 2 and known.asked.wants is None:
+        left, _, right = np.linalg.svd((shape[:, :2] - middle).T @ (place[:, :2] - at))
+        turn = left @ right
+    return np.column_stack([(shape[:, :2] - middle) @ turn + at, shape[:, 2]])
 
 
 def has_positions(trace: Trace) -> bool:
