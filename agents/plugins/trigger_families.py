@@ -27,7 +27,7 @@ class Relative(Trigger, frozen=True):
 
     judges_errors: ClassVar[bool] = True
 
-    share: Annotated[Positive, Meta(description="σ [1]")] = 0.03
+    share: Annotated[Positive, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = 0.03
 
     def fires(self, view: View, memory: Array) -> Mask:
         return view.deviation > self.share * view.error
@@ -43,8 +43,10 @@ class Mixed(Trigger, frozen=True):
 
     judges_errors: ClassVar[bool] = True
 
-    share: Annotated[NotNegative, Meta(description="σ [1]")] = 0.0004
-    floor: Annotated[Positive, Meta(description="c [m]")] = 0.007
+    share: Annotated[NotNegative, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = (
+        0.0004
+    )
+    floor: Annotated[Positive, Meta(description="c: deviation that is allowed without errors [m]")] = 0.007
 
     def fires(self, view: View, memory: Array) -> Mask:
         return view.deviation**2 > self.share * view.error**2 + self.floor**2
@@ -58,9 +60,9 @@ class Decaying(Trigger, frozen=True):
     Systems Journal, 2022.
     """
 
-    floor: Annotated[Positive, Meta(description="c0, final threshold [m]")] = 0.008
-    extra: Annotated[NotNegative, Meta(description="c1, addition at the start [m]")] = 0.02
-    rate: Annotated[Positive, Meta(description="α [1/s]")] = 0.3
+    floor: Annotated[Positive, Meta(description="c0: deviation that is allowed in the end [m]")] = 0.008
+    extra: Annotated[NotNegative, Meta(description="c1: deviation that is allowed beside it at the start [m]")] = 0.02
+    rate: Annotated[Positive, Meta(description="α: rate at which that addition fades [1/s]")] = 0.3
 
     def fires(self, view: View, memory: Array) -> Mask:
         return view.deviation > self.floor + self.extra * np.exp(-self.rate * view.since_start)
@@ -76,10 +78,12 @@ class Dynamic(Trigger, frozen=True):
 
     judges_errors: ClassVar[bool] = True
 
-    share: Annotated[NotNegative, Meta(description="σ [1]")] = 0.0003
-    floor: Annotated[NotNegative, Meta(description="c [m]")] = 0.005
-    decay: Annotated[Positive, Meta(description="λ [1/s]")] = 2.0
-    weight: Annotated[NotNegative, Meta(description="θ [s]")] = 0.5
+    share: Annotated[NotNegative, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = (
+        0.0003
+    )
+    floor: Annotated[NotNegative, Meta(description="c: deviation that is allowed without errors [m]")] = 0.005
+    decay: Annotated[Positive, Meta(description="λ: rate at which earlier margin is forgotten [1/s]")] = 2.0
+    weight: Annotated[NotNegative, Meta(description="θ: weight of the present margin [s]")] = 0.5
 
     def memory(self, rows: int) -> Array:
         """η [m² s] and time of its last computation [s]."""
@@ -105,7 +109,7 @@ class Integral(Trigger, frozen=True):
     Sensors 8, 2008, 897–909, for noisy signals. Between two questions the deviation counts as it is at the later one.
     """
 
-    area: Annotated[Positive, Meta(description="A [m s]")] = 0.001
+    area: Annotated[Positive, Meta(description="A: integral of the deviation that is allowed [m s]")] = 0.001
 
     def memory(self, rows: int) -> Array:
         """Integral [m s], its end and the time of its event [s]."""
@@ -140,8 +144,8 @@ class SelfTriggered(Trigger, frozen=True):
     known then, and a bounds its growth. A drone's wobble is in a.
     """
 
-    threshold: Annotated[Positive, Meta(description="δ [m]")] = 0.01
-    acceleration: Annotated[Positive, Meta(description="a [m/s²]")] = 0.25
+    threshold: Annotated[Positive, Meta(description="δ: deviation of the held position that is allowed [m]")] = 0.01
+    acceleration: Annotated[Positive, Meta(description="a: bound on the acceleration of the deviation [m/s²]")] = 0.25
     longest_s: Annotated[Positive, Meta(description="longest planned interval [s]")] = 2.0
 
     def fires(self, view: View, memory: Array) -> Mask:
@@ -161,9 +165,11 @@ class Lyapunov(Trigger, frozen=True):
 
     judges_errors: ClassVar[bool] = True
 
-    level: Annotated[float, Meta(gt=0, lt=1, description="η [1]")] = 0.7
-    floor: Annotated[NotNegative, Meta(description="c [m]")] = 0.006
-    largest: Annotated[Positive, Meta(description="δ [m]")] = 0.012
+    level: Annotated[
+        float, Meta(gt=0, lt=1, description="η: share of the potential at the last event that bounds its level [1]")
+    ] = 0.7
+    floor: Annotated[NotNegative, Meta(description="c: deviation that is allowed without errors [m]")] = 0.006
+    largest: Annotated[Positive, Meta(description="δ: deviation that is allowed at any level [m]")] = 0.012
 
     def fires(self, view: View, memory: Array) -> Mask:
         now, then, slack = view.energy, view.last_event.energy, 0.5 * self.floor**2
@@ -180,8 +186,10 @@ class RelativeControl(Trigger, frozen=True):
 
     places: ClassVar[tuple[Place, ...]] = ("control",)
 
-    floor: Annotated[Positive, Meta(description="c0 [m]")] = 0.005
-    share: Annotated[NotNegative, Meta(description="a [1], and largest addition [m]")] = 0.1
+    floor: Annotated[Positive, Meta(description="c0: change of the law's output that is allowed [m]")] = 0.005
+    share: Annotated[
+        NotNegative, Meta(description="a: share of the output that is allowed beside it [1], and its largest value [m]")
+    ] = 0.1
 
     def fires(self, view: View, memory: Array) -> Mask:
         u = view.offset

@@ -169,7 +169,7 @@ class Periodic(Trigger, frozen=True):
 
     timed: ClassVar[bool] = True
 
-    period_s: Annotated[Positive, Meta(description="T [s]")] = 0.02
+    period_s: Annotated[Positive, Meta(description="T: time between two transmissions [s]")] = 0.02
 
     def fires(self, view: View, memory: Array) -> Mask:
         return view.since_event >= self.period_s - ROUNDING_S
@@ -182,7 +182,7 @@ class SendOnDelta(Trigger, frozen=True):
     the distance of positions. Case 2 of the paper's experiment, with δ = 1 cm.
     """
 
-    threshold: Annotated[Positive, Meta(description="δ [m]")] = 0.01
+    threshold: Annotated[Positive, Meta(description="δ: deviation of the held position that is allowed [m]")] = 0.01
 
     def fires(self, view: View, memory: Array) -> Mask:
         return view.deviation > self.threshold

@@ -38,7 +38,15 @@ def chance(analysis: Analysis) -> Iterator[Finding]:
 
 
 SUBJECTS: Final = (
-    *(theory.network, theory.presence, theory.realisation, theory.rigidity, theory.redundancy, theory.stability),
+    *(
+        theory.network,
+        theory.presence,
+        theory.lengths,
+        theory.realisation,
+        theory.rigidity,
+        theory.redundancy,
+        theory.stability,
+    ),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.encounters),
     *(motion.speeds, motion.rates, motion.ends),

@@ -22,6 +22,7 @@ FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another s
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
+MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
 
@@ -78,6 +79,20 @@ def network(analysis: Analysis) -> Iterator[Finding]:
         reached = f"every robot is reached by {join_names(leaders)}"
         led = reached if leaders else "no leader: the formation finds its own place"
         yield Finding("note", "connected", whole + led)
+
+
+def lengths(analysis: Analysis) -> Iterator[Finding]:
+    """Check that distances are no millimetres: most of them longer than the arena."""
+    distance, size = analysis.asked.distance[_measured(analysis)], np.array(analysis.experiment.arena.size)
+    if not len(distance) or float(np.median(distance)) <= float(norm(size)):
+        return
+    longest = int(np.flatnonzero(_measured(analysis))[distance.argmax()])
+    asked, whole = float(distance.max()), " × ".join(f"{length:g}" for length in size)
+    message = f"{analysis.link(longest)} asks for {asked:g} m in an arena of {whole} m"
+    remedy = "lengths are in metres; enlarge size in [arena] if it is meant"
+    if asked >= MILLIMETRES:
+        message, remedy = f"{message}: millimetres?", f"lengths are in metres: write {asked / 1e3:g}"
+    yield Finding("error", "too-long", message, remedy, analysis.link_path(longest))
 
 
 def realisation(analysis: Analysis) -> Iterator[Finding]:
@@ -282,7 +297,7 @@ def strength(analysis: Analysis) -> str:
 def stability(analysis: Analysis) -> Iterator[Finding]:
     """Check that the sampled loop is stable near the shape."""
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
-    if loop is None or shape is None or shape.worst > FAR_OFF:
+    if loop is None or shape is None or shape.worst > FAR_OFF or next(lengths(analysis), None) is not None:
         return
     law, choice = analysis.assignment.law, registry.split(formation.law)[0]
     if not math.isfinite(loop.gain):

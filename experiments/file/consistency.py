@@ -167,6 +167,8 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
     if body not in bodies:
         hint = f"{did_you_mean(body, bodies)}; one of your own is a plug-in to install (docs/plugins.md)"
+        if body.partition(":")[0] == "radio":
+            hint = "write channel, rate and address, such as radio://0/80/2M/E7E7E7E701"
         yield Fault((*path, "body"), f"no {body!r} among the bodies", hint)
     elif (driven := DRIVES.get(body, robot.kind)) != robot.kind and robot.kind in KINDS:
         own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
@@ -316,8 +318,10 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
         again = [pair for pair in both if pair in given]
         if again:
             receiver, sender = again[0]
-            message = f"the link {sender} > {receiver} is already given by '{given[again[0]]}'"
-            yield Fault(path, message, "keep one of the two", on_key=True)
+            first = given[again[0]]
+            what = f"stands twice, as '{first}' and" if f"{sender} > {receiver}" != first else "stands again in"
+            message = f"the link from {sender} to {receiver} {what} '{text}'"
+            yield Fault(path, message, "remove one of the two: 'A - B' is 'A > B' and 'B > A'", on_key=True)
         given.update(dict.fromkeys(both, text))
 
 

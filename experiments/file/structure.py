@@ -47,6 +47,7 @@ _GROUPS: Final[dict[tuple[str | int | type, ...], str]] = {
     ("avoidance",): registry.AVOIDANCES,
     ("world", "engine"): registry.ENGINES,
 }
+LINK: Final = 'write "{name}" = 0.5, in metres; or "{name}" = {{ offset = [0.5, 0.0] }}, or "{name}" = "shape"'
 _FIELDS: Final = frozenset(Experiment.__struct_fields__)
 
 
@@ -245,6 +246,12 @@ def _in_words(text: str, value: object, annotation: object, path: Path, note: st
     if isinstance(value, bool) or not isinstance(value, list | dict):
         limit += f", not {shown(value)}"
     tables = [part for part in (plain, *get_args(plain)) if _is_struct(part)]
+    if path[:2] == ("formation", "links"):
+        return Fault(path, f"'{name}' must be {' or '.join(wanted)}{limit}", LINK.format(name=name))
+    if path[-2:-1] == ("shape",) and isinstance(value, list):
+        return Fault(
+            path, f"'{name}' must be numbers, x, y (, z) [m], not {shown(value)}", f"write {name} = [0.5, 0.0]"
+        )
     for table in tables[:1] if not isinstance(value, dict) else []:
         fields = msgspec.structs.fields(table)
         needed = [field.encode_name for field in fields if field.required] or [fields[0].encode_name]

@@ -92,6 +92,9 @@ def parsed(text: str, label: str, *, json: bool) -> dict[str, Any]:
 
 def _toml_problem(text: str, label: str, message: str) -> Problem:
     match = _AT.search(message)
+    if text.lstrip().startswith("{"):
+        top = text.partition("\n")[0]
+        return Problem(label, 1, 1, "is JSON, and its name says TOML", "rename it to .json", top)
     if match is None:
         return Problem(label, 0, 0, f"is no TOML: {message}", "give a smaller number")
     lines = text.split("\n")

@@ -60,6 +60,16 @@ def keep_origin(folder: Path, origin: RunOrigin) -> None:
     fresh.replace(folder / ORIGIN)
 
 
+def check_folder(out: str | None) -> None:
+    """Refuse a folder for a run that cannot be used, before anything is made; raises DocumentError."""
+    if out is None or not Path(out).exists():
+        return
+    if not Path(out).is_dir():
+        raise refusal(out, "is a file, and the results of a run need a folder", "name a new folder with --out")
+    if any(Path(out).iterdir()):
+        raise refusal(out, "holds something already", "name a new folder with --out")
+
+
 def new_folder(read: Document, out: str | None, what: str = "") -> Path:
     """Makes the folder of a run: `out`, or one below `runs` with experiment and time in its name, and `what`, if given.
 

@@ -180,7 +180,10 @@ def test_a_plugin_of_two_places_has_its_parameters_once_with_their_defaults():
     lines = CliRunner().invoke(app, ["explain", "send-on-delta"]).stdout.splitlines()
     assert lines[:2] == ["trigger(send-on-delta)", "formation.update(send-on-delta) "]
     (threshold,) = [line for line in lines if ".threshold" in line]
-    assert threshold == "trigger(send-on-delta).threshold δ [m] [> 0, default: 0.01]"
+    assert (
+        threshold
+        == "trigger(send-on-delta).threshold δ: deviation of the held position that is allowed [m] [> 0, default: 0.01]"
+    )
 
 
 def test_tables_are_json_where_it_is_asked_for():

@@ -260,7 +260,7 @@ def _formatted(of: Figures) -> dict[str, str]:
         "single robots it can lose": _redundancy_text(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
         "loop gain, hunts at 2": number(of.loop_gain, ".3g"),
-        "slowest mode": number(of.slowest_mode_s, ".1f", " s")
+        "slowest mode": number(of.slowest_mode_s, ".1f", " s to fall to 37 %; acquired is within the tolerance")
         + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
         "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),
         "speed of the slowest follower": number(of.speed_available, ".3f", " m/s"),
@@ -301,7 +301,9 @@ def explain(
     if not found:
         nearest, about = reference.nearest(key), reference.about(key)
         near = difflib.get_close_matches(key, nearest, 1, 0.75 if about else 0.6)
-        hint = f"did you mean {near[0]!r}?" if near else f"the nearest: {', '.join(nearest)}"
+        table = key.partition(".")[0]
+        listing = f"`./zenpark explain {table}`" if reference.matching(table) else "`./zenpark explain`"
+        hint = f"did you mean {near[0]!r}?" if near else f"{listing} lists what there is"
         listed = () if near else about
         if key.lower() in {
             field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])

@@ -230,7 +230,7 @@ def bridge(
     given = [part for each in os.environ.get(CONNECT, "").split() for part in ("--connect", each)]
     modules = {"vicon": "bridges.vicon.publisher", "ros2": "bridges.ros2"}
     if what not in modules:
-        raise typer.BadParameter(f"'{what}' is neither vicon nor ros2")
+        raise typer.BadParameter(f"'{what}' is neither vicon nor ros2", param_hint="bridge")
     return int(
         import_module(modules[what]).main(context.args if "--connect" in context.args else [*context.args, *given])
     )

@@ -513,7 +513,7 @@ def clean(
     from agents.runtime import run_registry
 
     if not words and older is None:
-        raise typer.BadParameter("say which: words, or --older DAYS (0: all)")
+        raise typer.BadParameter("give words that the runs have, or --older DAYS (0: all)", param_hint="which runs")
     up = {Path(run.folder).resolve() for run in run_registry.runs() if run.folder}
     now = time.time()
     chosen = [

@@ -121,10 +121,11 @@ class _Shown:
 def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
     """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
     from experiments.file.document import load
-    from experiments.recording.run_folder import SOURCE, new_folder, remove_unused
+    from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
     from experiments.report import verdict
 
     read = load(origin.file, *origin.changes)
+    check_folder(show.out)
     _refuse(options, show, virtual=origin.virtual, seeds=origin.seeds)
     if not sound(read, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
