@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import inf
+from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -20,15 +21,21 @@ from agents.network import lab, messages, pubsub
 from agents.network.keys import Keys
 from experiments.real_time.conductor import orders
 from experiments.scene.stage import Moment, Stage
+from experiments.view.heartbeat import STALE_S
 
 if TYPE_CHECKING:
     import viser
 
     from agents.runtime.run_registry import Run
+    from experiments.view.serving import Server
 
 REASON: Final = "button of zenpark view"
 SETTLED_S: Final = 0.4  # after the last move of a slider, or the end of a drag, its value is sent
 SLIDERS: Final = 6
+STEPS: Final = 50  # of a slider up to the value of the file, and
+REACH: Final = 4.0  # times that value at its end
+CALMING: Final = ("hold", "land")  # orders that count whatever the page shows
+OBSERVER: Final = "observer"
 NOTE_S: Final = 8.0
 HANDLE: Final = 0.25  # [m] of a target, in an arena of 2.5 m; in a larger one, as much larger
 LEADERS: Final = 5  # most that are dragged
@@ -52,10 +59,10 @@ class Watched:
 
 
 def may_act(watched: Watched) -> bool:
-    """Whether the page may give orders: on loopback without a lab, and in a lab with an operator's certificate."""
+    """Whether the page may give orders: with an operator's certificate in a lab, elsewhere unless as an observer."""
     folder = lab.lab_of(watched.endpoints)
     if folder is None:
-        return True
+        return watched.identity != OBSERVER
     try:
         known = lab.register(folder).identities.get(watched.identity)
     except lab.LabError:  # where only the own certificate is: that of an observer
@@ -79,8 +86,9 @@ class Acting:
         self._dragged = False
         self._due: dict[str, tuple[float, Callable[[], object]]] = {}  # orders that wait until a control is at rest
         self._lock = threading.Lock()
+        self._number = 0  # of the present stage
 
-    def build(self, server: viser.ViserServer) -> None:
+    def build(self, server: Server) -> None:
         """Adds the buttons."""
         import viser  # noqa: PLC0415 - an extra
 
@@ -94,18 +102,19 @@ class Acting:
         key.on_trigger(lambda _: self.emergency_stop())
         self._folder = gui.add_folder("Orders", order=15.0)
         with self._folder:
-            for text, what, icon in (
-                ("Hold all", "hold", viser.Icon.PLAYER_PAUSE), ("Resume all", "resume", viser.Icon.PLAYER_PLAY),
-                ("Land all", "land", viser.Icon.PLANE_ARRIVAL),
+            for text, what, icon, colour in (
+                ("Hold all", "hold", viser.Icon.PLAYER_PAUSE, "yellow"),
+                ("Land all", "land", viser.Icon.PLANE_ARRIVAL, "orange"),
+                ("Resume all", "resume", viser.Icon.PLAYER_PLAY, "green"),
             ):  # fmt: skip
-                button = gui.add_button(text, icon=icon)
-                button.on_click(partial(self._order_all, messages.Order(what), what, None))  # type: ignore[arg-type]
+                button = gui.add_button(text, icon=icon, color=colour)  # type: ignore[arg-type]
+                button.on_click(partial(self._press, messages.Order(what), what))  # type: ignore[arg-type]
             drag = gui.add_checkbox("Drag targets", initial_value=False, hint="Of the leaders.")
             drag.on_update(lambda event: self._show_targets(shown=bool(event.target.value)))
 
-    def set_stage(self, stage: Stage) -> None:
-        """Another case: its parameters."""
-        self._stage = stage
+    def set_stage(self, stage: Stage, number: int) -> None:
+        """Another case: its parameters, and the number by which pages report that they show it."""
+        self._stage, self._number = stage, number
         for part in (*self._parts, *self._targets.values()):
             part.remove()
         self._parts, self._targets = [], {}
@@ -113,9 +122,12 @@ class Acting:
         if stage.plan is None:
             return
         with self._folder:
-            for name, value in parameters(stage)[:SLIDERS]:
-                slider = self._server.gui.add_slider(name, 0.0, 4.0 * value, value / 50.0, value)
-                slider.on_update(partial(self._slide, name))
+            for parameter in parameters(stage)[:SLIDERS]:
+                step = parameter.value / STEPS
+                slider = self._server.gui.add_slider(
+                    parameter.label, step, REACH * parameter.value, step, parameter.value
+                )
+                slider.on_update(partial(self._slide, parameter))
                 self._parts.append(slider)
 
     def follow(self, moment: Moment, alive: Sequence[str]) -> None:
@@ -176,23 +188,46 @@ class Acting:
         if event.phase != "end":
             self._held_until = inf
             return
-        x, y, _ = event.target.position
+        x, y = (float(each) for each in event.target.position[:2])
         self._held_until = time.monotonic() + SETTLED_S + HELD_S
-        order = messages.Order("go", goal=(float(x), float(y)))
-        self._order_in_thread(name, lambda: self._order_all(order, f"{name} to x = {x:.2f} m, y = {y:.2f} m", [name]))
+        what = f"{name} to x = {x:.2f} m, y = {y:.2f} m"
+        if not (isfinite(x) and isfinite(y)) or self._refuse(event.client_id, what):
+            return
+        order = messages.Order("go", goal=(x, y))
+        self._order_in_thread(name, lambda: self._order_all(order, what, [name]))
 
-    def _slide(self, name: str, event: viser.GuiEvent[Any]) -> None:
-        value = float(event.target.value)
-        order = messages.Order("set", name=name, value=value)
-        self._order_in_thread(name, lambda: self._order_all(order, f"{name} = {value:g}"))
+    def _slide(self, parameter: Parameter, event: viser.GuiEvent[Any]) -> None:
+        if event.client is None:  # moved by this program, not by a hand
+            return
+        value, what = parameter.limited(float(event.target.value)), parameter.name
+        if self._refuse(event.client_id, what):
+            return
+        order = messages.Order("set", name=parameter.name, value=value)
+        self._order_in_thread(what, lambda: self._order_all(order, f"{what} = {value:g}"))
+
+    def _press(self, order: messages.Order, what: str, event: viser.GuiEvent[Any]) -> None:
+        if order.order in CALMING or not self._refuse(event.client_id, what):
+            self._order_all(order, what)
+
+    def _refuse(self, page: int | None, what: str) -> bool:
+        """Whether an order is refused, because its page shows the hand behind it no present picture; says so."""
+        seen = None if page is None else self._server.gate.seen.get(page)
+        if seen is None or seen.drawn == -inf:
+            why = "the page does not report which picture it shows"
+        elif seen.stage != self._number:
+            why = "the page still showed the case before"
+        elif (age := time.time() - seen.drawn) > STALE_S:
+            why = f"the page showed a picture of {age:.0f} s ago"
+        else:
+            return False
+        self._note(what, f"not ordered: {why}. Look, then order again.", bad=True)
+        return True
 
     def _order_in_thread(self, name: str, order: Callable[[], object]) -> None:
         with self._lock:
             self._due[name] = (time.monotonic() + SETTLED_S, order)
 
-    def _order_all(
-        self, order: messages.Order, what: str, robots: Sequence[str] | None = None, _: object = None
-    ) -> None:
+    def _order_all(self, order: messages.Order, what: str, robots: Sequence[str] | None = None) -> None:
         """Gives an order to robots, to all that are there if none is named, and says what they answered."""
         replies = orders.send_order(self._session, self._keys, robots or sorted(self._alive), order)
         refused = {name: reply.reason for name, reply in replies.items() if not reply.ok}
@@ -214,15 +249,44 @@ class Acting:
             )
 
 
-def parameters(stage: Stage) -> list[tuple[str, float]]:
-    """Parameters that robots change in flight, by the name of the order, with their values."""
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter that robots change in flight."""
+
+    name: str  # of the order
+    value: float  # in the file
+    unit: str = ""
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    def limited(self, value: float) -> float:
+        """A value within the reach of the slider, whatever the page sent; NaN becomes the value of the file."""
+        if isnan(value):
+            return self.value
+        return min(max(value, self.value / STEPS), REACH * self.value)
+
+
+def parameters(stage: Stage) -> list[Parameter]:
+    """Parameters that robots change in flight: the numbers of the trigger, and two of the formation."""
     assert stage.plan is not None
     assert stage.experiment is not None
     trigger: Any = stage.plan.trigger
-    numbers = [(f"trigger.{name}", value) for name, value in msgspec.structs.asdict(trigger).items()]
     formation = stage.experiment.formation
-    numbers += [("clamp", formation.clamp), ("tracking_gain", formation.tracking_gain)]
+    found = [Parameter(f"trigger.{name}", value, _unit(trigger, name))
+             for name, value in msgspec.structs.asdict(trigger).items()]  # fmt: skip
+    found += [Parameter(name, getattr(formation, name), _unit(formation, name)) for name in ("clamp", "tracking_gain")]
     return [
-        (name, float(value)) for name, value in numbers
-        if isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < np.inf
+        each for each in found
+        if isinstance(each.value, int | float) and not isinstance(each.value, bool) and 0.0 < each.value < np.inf
     ]  # fmt: skip
+
+
+def _unit(owner: msgspec.Struct, name: str) -> str:
+    """Unit of a field, as its description states it in brackets."""
+    kind = type(owner)
+    _, definitions = msgspec.json.schema_components([kind], ref_template="{name}")
+    text = definitions[kind.__name__]["properties"].get(name, {}).get("description", "")
+    found = re.search(r"\[([^\]]+)\]", text)
+    return "" if found is None else found[1]

@@ -6,10 +6,8 @@ Runs in a process of its own: a slow browser, or a view that dies, touches no ro
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Sequence
 from functools import partial
-from io import StringIO
 from itertools import product
 from math import inf
 from typing import TYPE_CHECKING, Any, Final
@@ -20,8 +18,9 @@ import zenoh
 from agents.arrays import Array, norm
 from agents.network.keys import Keys
 from agents.network.session import connected
-from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown, light
+from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown
 from experiments.scene.stage import MANY, Condition, LinkTracker, Moment, Stage
+from experiments.view import heartbeat
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer
 from experiments.view.panel import PLOT_S, Panel, known, robot_row
@@ -29,40 +28,17 @@ from experiments.view.panel import PLOT_S, Panel, known, robot_row
 if TYPE_CHECKING:
     import viser
 
+    from experiments.view.serving import Server
 
 FRAME_S: Final = 1.0 / 25.0
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
-LOOPBACK: Final = "127.0.0.1"
 FOV: Final = 0.8  # [rad] upright
 ASPECT: Final = 1.2  # width over height of a page that is not known yet
 FROM: Final = np.array([-0.40, -0.77, 0.50])  # direction of the camera, as seen from the arena
 FREE: Final = np.array([-0.92, 0.92])  # of a page from its middle to its edges, where the arena is shown
 PHONE: Final = 0.7  # width over height of a page whose panel is below, not beside
 ABOVE: Final = np.array([0.24, 0.96])  # as `FREE`, upwards, of such a page
-
-
-@contextmanager
-def served(port: int, *, dark: bool) -> Iterator[viser.ViserServer]:
-    """Serve a page to this machine alone, without a button that would share it, at `port` or the next free one."""
-    import viser  # noqa: PLC0415 - an extra
-
-    with redirect_stdout(StringIO()):  # its own banner
-        server = viser.ViserServer(host=LOOPBACK, port=port, label="zenpark", verbose=False)
-    server.gui.configure_theme(
-        dark_mode=dark,
-        show_logo=False,
-        show_share_button=False,
-        control_width="large",
-        brand_color=(0, 114, 178),
-    )
-    server.gui.main_panel.dock_right()
-    light(server)
-    try:
-        yield server
-    finally:
-        with redirect_stdout(StringIO()):
-            server.stop()
 
 
 def standpoint(size: Sequence[float] | Array, aspect: float) -> tuple[Array, Array]:
@@ -174,13 +150,15 @@ class LiveView:
     """The page of one realm."""
 
     def __init__(
-        self, server: viser.ViserServer, session: zenoh.Session, watched: Watched, *, dark: bool, acting: Acting | None
+        self, server: Server, session: zenoh.Session, watched: Watched, *, dark: bool, acting: Acting | None
     ) -> None:
         """Draws an empty page; without `acting` that of an observer, which sees no buttons."""
         self._server, self._session, self._watched, self._acting = server, session, watched, acting
         self.observer = Observer(session, Keys(watched.realm))
+        self._mark = server.gui.add_html("", order=-1.0)
         self._page = Page(server, dark=dark)
         self._trailed: object = None
+        self._stages = 0
         if acting is not None:
             acting.build(server)
         self._begin()
@@ -194,15 +172,17 @@ class LiveView:
                 self._begin()
             if pages:
                 self.draw(begun)
-            time.sleep(max(0.001, begun + (FRAME_S if pages else IDLE_S) - time.monotonic()))
+            period = heartbeat.frame_s(self._server.gate.lag(time.time()), FRAME_S) if pages else IDLE_S
+            time.sleep(max(0.001, begun + period - time.monotonic()))
 
     def _begin(self) -> None:
         """Another case."""
         stage = self.observer.stage
+        self._stages += 1
         self._page.begin(stage)
         self._errors = LinkTracker(stage)
         if self._acting is not None:
-            self._acting.set_stage(stage)
+            self._acting.set_stage(stage, self._stages)
 
     def draw(self, now: float) -> None:
         """Draws what is known now [s, monotonic]."""
@@ -220,6 +200,12 @@ class LiveView:
         panel = self._page.panel
         panel.history.add(now, self._errors.of_robots(moment.error), rates)
         panel.show_plots()
+        utc, observer = time.time(), self.observer
+        age, over = observer.age.seconds(utc, now), False
+        words = "of a recording" if observer.age.recorded else "" if age is not None else "no pose of a robot yet"
+        if age is not None and connected(self._session) and not any(r.alive for r in observer.robots.values()):
+            words, over = "no robot is there any more: the last picture stays", True
+        self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=over)
 
     def _tabulate(self, moment: Moment) -> None:
         observer, stage, panel = self.observer, self.observer.stage, self._page.panel

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import inf, nan
+from math import inf
 from typing import Final, TypeVar
 
 import numpy as np
@@ -21,6 +21,7 @@ from agents.network.session import received
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition
+from experiments.view.heartbeat import DataAge
 
 UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
 RATE_S: Final = 1.0
@@ -54,6 +55,7 @@ class Observer:
     events: deque[messages.Event]  # of the run, incidents of robots included, oldest first
     world: messages.WorldState | None
     scans: dict[str, messages.Ranges]  # last range readings, while they are asked for
+    age: DataAge  # of the poses
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
         self._session, self._keys, self._clock = session, keys, Clock()
@@ -133,7 +135,7 @@ class Observer:
         for name, report in before.items():
             self.robots.setdefault(name, report)
         self._tracker, self._trail = LinkTracker(stage), Trail(len(stage.names))
-        self._starts = np.full(len(stage.names), nan)
+        self.age = DataAge()
 
     def _report(self, name: str) -> RobotReport:
         return self.robots.setdefault(name, RobotReport())
@@ -146,7 +148,10 @@ class Observer:
         report.status, report.heard_at, report.known = status, now, True
 
     def _read_states(self) -> None:
-        for state in self._newest(self._states, messages.State):
+        states = list(self._newest(self._states, messages.State))
+        if states:
+            self.age.add(max(state.stamp for state in states), self._clock.utc(), time.monotonic())
+        for state in states:
             report = self._report(state.robot)
             report.state, report.known = state, True
             for each in state.received:

@@ -249,7 +249,8 @@ def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> 
 
 
 def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
-    from experiments.view.live import Page, served  # noqa: PLC0415 - viser may be missing
+    from experiments.view.live import Page  # noqa: PLC0415 - viser may be missing
+    from experiments.view.serving import served  # noqa: PLC0415
 
     crowd = document.loads(
         'title = "a hundred"\nduration_s = 9.0\narena = { size = [12.0, 12.0, 3.0] }\n'
@@ -285,7 +286,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
     moving = threading.Thread(target=move)
     moving.start()
     try:
-        with opened(f"http://127.0.0.1:{server.get_port()}", 480, 320, drawn=True) as page:
+        with opened(server.address, 480, 320, drawn=True) as page:
             page.until(lambda: "/case/robots/crazyflie/body" in page.nodes, "drawn")
             page.until(lambda: np.all(page.positions("/case/robots/crazyflie/body")[:, 2] > -1.0), "seen")
             rates = []

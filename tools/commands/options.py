@@ -135,12 +135,12 @@ def warn(lines: Sequence[str]) -> None:
         print(f"zenpark: {line}", file=sys.stderr)
 
 
-def open_in_browser(address: str) -> None:
-    """Open a page, or tell that there is no browser."""
+def open_in_browser(address: str, by_hand: str = "") -> None:
+    """Open a page, or tell that there is no browser, and which address is opened `by_hand`."""
     import webbrowser
 
     if not webbrowser.open(address):
-        warn([f"no browser was found here: open {address} by hand"])
+        warn([f"no browser was found here: open {by_hand or address} by hand"])
 
 
 def print_json(value: Any) -> None:  # noqa: ANN401 - whatever JSON can hold, structs included

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from experiments.run import Watch
     from experiments.view.acting import Watched
     from experiments.view.replay import Clock
+    from experiments.view.serving import Server
     from tools.live_table import Row
 
 app: Final = typer.Typer()
@@ -265,11 +266,11 @@ def following(folder: Path, identity: str) -> Iterator[None]:
 @contextmanager
 def paced(pace: float) -> Iterator[Watch]:
     """Inside, runs in virtual time are shown in this process, `pace` times as fast as they would be in real time."""
-    from experiments.view import live
     from experiments.view.paced import PacedView
+    from experiments.view.serving import served
 
-    with live.served(PORT, dark=False) as server:
-        _tell(server.get_port(), "virtual time: begins when the page is open", open_page=True, to=sys.stderr)
+    with served(PORT, dark=False) as server:
+        _tell(server, "virtual time: begins when the page is open", open_page=True, to=sys.stderr)
         yield PacedView(server, pace=pace, dark=False).begin
 
 
@@ -294,14 +295,14 @@ def _of_run(run: Run, identity: str | None) -> Watched:
 
 def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open_page: bool) -> int:
     from experiments.scene import tracks
-    from experiments.view import live
     from experiments.view import replay as replaying
+    from experiments.view.serving import served
 
     files = _recordings(folder)
     films = [replaying.Film(tracks.read(file)) for file in files]
-    with live.served(port, dark=dark) as server:
+    with served(port, dark=dark) as server:
         page = replaying.ReplayView(server, films, str(folder), dark=dark)
-        _tell(server.get_port(), f"{folder}; Ctrl-C ends it", open_page=open_page)
+        _tell(server, f"{folder}; Ctrl-C ends it", open_page=open_page)
         page.run(ended.is_set)
     return 0
 
@@ -336,18 +337,18 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
     from agents.network.shutdown import held
     from experiments.view import live
     from experiments.view.acting import Acting, may_act
+    from experiments.view.serving import served
 
     opened = open_session(watched.endpoints, name="view", wait_s=5.0, identity=watched.identity)
-    with held(opened) as (session, declared), live.served(port, dark=dark) as server:
+    with held(opened) as (session, declared), served(port, dark=dark) as server:
         acting = Acting(session, watched) if may_act(watched) else None
         page = live.LiveView(server, session, watched, dark=dark, acting=acting)
         declared.append(page)
-        _tell(server.get_port(), f"{watched.words}{'' if with_run else '; Ctrl-C ends it'}", open_page=open_page)
+        _tell(server, f"{watched.words}{'' if with_run else '; Ctrl-C ends it'}", open_page=open_page)
         page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
 
 
-def _tell(port: int, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
-    address = f"http://127.0.0.1:{port}"
-    print(f"{address}  {what}", flush=True, file=to)
+def _tell(server: Server, what: str, *, open_page: bool, to: TextIO | None = None) -> None:
+    print(f"{server.address}  {what}", flush=True, file=to)
     if open_page:
-        open_in_browser(address)
+        open_in_browser(server.address_for_once(), server.address)

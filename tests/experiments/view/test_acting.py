@@ -23,23 +23,29 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
     endpoints = lab.secured(["tls/127.0.0.1:7447"], tmp_path)
     found = {name: may_act(Watched(endpoints, "park", name)) for name in (*known, "stranger")}
     assert found == {"operator": True, "observer": False, "ana": True, "stranger": False}
-    assert may_act(Watched(["tcp/127.0.0.1:7447"], "park", "observer"))  # without a lab, on loopback
+    assert [may_act(Watched(["tcp/127.0.0.1:7447"], "park", name)) for name in ("operator", "observer")] == [
+        True,
+        False,
+    ]
     assert not may_act(Watched(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
 
 
 def test_numbers_of_the_trigger_and_the_law_have_sliders():
     park = Stage.of_experiment(load("robotic-park").cases()["event"])
-    assert dict(parameters(park)) == {"trigger.threshold": 0.01, "clamp": 0.1, "tracking_gain": 3.0}
+    assert [(each.label, each.value) for each in parameters(park)] == [
+        ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
+    ]  # fmt: skip
 
 
 @pytest.mark.slow
 def test_a_watched_run_in_virtual_time_is_the_same_to_the_last_bit(monkeypatch):
     pytest.importorskip("viser", reason="needs viser")
-    from experiments.view import live, paced  # noqa: PLC0415
+    from experiments.view import paced  # noqa: PLC0415
+    from experiments.view.serving import served  # noqa: PLC0415
 
     monkeypatch.setattr(paced, "PAGE_S", 0.0)
     read = load("robotic-park", "duration_s=1.0", "timeline=[]", "cases={}")
-    with live.served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
+    with served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=True) as server:
         page = paced.PacedView(server, pace=100.0, dark=True)
         (watched,) = simulate_seeds(read, [1], watch=page.begin)
     alone = simulate(read, seed=1)

@@ -1,0 +1,150 @@
+"""Gate of the view's page: which requests reach it, and whose orders count."""
+
+from __future__ import annotations
+
+import time
+from math import inf
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("viser", reason="needs viser")
+
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from agents.network import messages
+from experiments.file.document import load
+from experiments.scene.stage import Stage
+from experiments.view import acting as orders
+from experiments.view import heartbeat
+from experiments.view.gate import Gate, Seen
+
+HOST = "127.0.0.1:8080"
+HANDSHAKE = ("Upgrade", "websocket")
+
+
+def answered(gate: Gate, path: str, *headers: tuple[str, str]) -> int | str:
+    """Status of the answer to a request, or the path that the page's server is asked for."""
+    asked = []
+
+    def inner(_: object, request: Request) -> Response | None:
+        asked.append(request.path)
+        return None
+
+    given = Headers()
+    for name, value in headers:
+        given[name] = value
+    response = gate.answer(inner, None, Request(path, given))
+    return asked[0] if asked else response.status_code
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:9000"])
+def test_own_page_opens_its_websocket(host):
+    gate = Gate("secret")
+    assert answered(gate, "/secret", ("Host", host), ("Origin", f"http://{host}"), HANDSHAKE) == "/secret"
+    assert answered(gate, "/secret/", ("Host", host)) == "/"
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [
+        ("/", [("Host", HOST)]),
+        ("/", [("Host", HOST), ("Origin", f"http://{HOST}"), HANDSHAKE]),
+        ("/former-secret", [("Host", HOST), ("Origin", f"http://{HOST}"), HANDSHAKE]),
+        ("/clock", [("Host", HOST)]),
+        ("/open/guessed", [("Host", HOST)]),
+        ("/sécret", [("Host", HOST)]),
+        ("/secret", [("Host", HOST), HANDSHAKE]),
+        ("/secret", [("Host", HOST), ("Origin", "http://evil.example"), HANDSHAKE]),
+        ("/secret", [("Host", HOST), ("Origin", "null"), HANDSHAKE]),
+        ("/secret", [("Host", HOST), ("Origin", "http://127.0.0.1:3000"), HANDSHAKE]),
+        ("/secret", [("Host", HOST), ("Origin", f"http://{HOST}"), ("Origin", "http://evil.example"), HANDSHAKE]),
+        ("/secret", [("Host", "evil.example:8080"), ("Origin", "http://evil.example:8080"), HANDSHAKE]),
+        ("/secret", [("Host", "127.0.0.1.evil.example"), ("Origin", "http://127.0.0.1.evil.example"), HANDSHAKE]),
+        ("/secret/", [("Host", "evil.example")]),
+        ("/secret/", [("Host", HOST), ("Host", HOST)]),
+        ("/secret/", [("Host", HOST), ("Origin", "http://evil.example")]),
+        ("/secret/", []),
+    ],
+)
+def test_others_are_refused(path, headers):
+    assert answered(Gate("secret"), path, *headers) == 403
+
+
+def test_address_for_once_leads_in_once():
+    gate = Gate("secret")
+    path = f"/{gate.ticket()}"
+    assert answered(gate, path, ("Host", "evil.example")) == 403
+    assert [answered(gate, path, ("Host", HOST)) for _ in range(2)] == [303, 403]
+
+
+def test_secrets_differ_and_are_not_shown():
+    first, second = Gate(), Gate()
+    assert first.secret != second.secret
+    assert first.secret not in repr(first)
+
+
+def test_page_reports_what_it_shows():
+    gate, now = Gate("secret"), time.time()
+    gate.open(1)
+    for query in ("page=1&drawn=x&stage=1", "page=9&drawn=1&stage=1", f"page=1&drawn={now + 3600}&stage=1", "&" * 99):
+        assert answered(gate, f"/secret/clock?{query}", ("Host", HOST)) == 200
+        assert gate.seen == {1: Seen()}
+    answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=0", ("Host", HOST))
+    assert gate.seen[1].stage == 4
+    assert gate.lag(now) == pytest.approx(7.0, abs=1e-3)
+    answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=1", ("Host", HOST))
+    assert gate.lag(now) == 0.0, "a page that nobody sees slows nothing"
+    gate.close(1)
+    assert gate.seen == {}
+
+
+@pytest.fixture
+def operator(monkeypatch):
+    """Buttons of an operator's page without a network, and the orders that they gave."""
+    monkeypatch.setattr(orders.pubsub, "pose_publisher", lambda *_, **__: SimpleNamespace(put=lambda _: None))
+    monkeypatch.setattr(orders.orders, "stop_publisher", lambda *_: None)
+    given = []
+    monkeypatch.setattr(orders.orders, "send_order", lambda _s, _k, _r, order: given.append(order) or {})
+    made = orders.Acting(None, orders.Watched(["tcp/127.0.0.1:7447"], "park", "operator"))
+    made._server = SimpleNamespace(gate=Gate(), get_clients=dict)
+    made._number = 2
+    return made, given
+
+
+@pytest.mark.parametrize(
+    ("seen", "ordered"),
+    [
+        (Seen(1000.0, 2), ["hold", "land", "resume"]),
+        (Seen(1000.0 - heartbeat.STALE_S - 1.0, 2), ["hold", "land"]),
+        (Seen(1000.0, 1), ["hold", "land"]),
+        (Seen(-inf, 2), ["hold", "land"]),
+        (None, ["hold", "land"]),
+    ],
+)
+def test_old_pictures_order_no_motion(seen, ordered, operator, monkeypatch):
+    monkeypatch.setattr(orders.time, "time", lambda: 1001.0)
+    acting, given = operator
+    if seen is not None:
+        acting._server.gate.seen[7] = seen
+    for what in ("hold", "land", "resume"):
+        acting._press(messages.Order(what), what, SimpleNamespace(client_id=7))
+    assert [order.order for order in given] == ordered
+
+
+@pytest.mark.parametrize("sent", [-1.0, 0.0, 1e9, inf, float("nan")])
+def test_slider_values_are_limited_here(sent):
+    threshold = orders.parameters(Stage.of_experiment(load("robotic-park").cases()["event"]))[0]
+    assert threshold.label == "trigger.threshold [m]"
+    assert 0.0 < threshold.limited(sent) <= 0.04
+
+
+def test_slider_orders_what_is_limited(operator):
+    acting, given = operator
+    acting._server.gate.seen[7] = Seen(time.time(), 2)
+    parameter = orders.Parameter("clamp", 0.1, "m")
+    acting._slide(parameter, SimpleNamespace(client=object(), client_id=7, target=SimpleNamespace(value=1e6)))
+    _, order = acting._due["clamp"]
+    order()
+    assert [(each.name, each.value) for each in given] == [("clamp", 0.4)]
