@@ -18,7 +18,7 @@ from typer.models import CommandInfo
 from agents.errors import ExplainedError
 from tools.bench import bench
 from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
-from tools.commands.options import Group, example, print_json
+from tools.commands.options import Group, example, print_json, warn
 from tools.reliability import chaos, soak
 
 
@@ -104,7 +104,7 @@ def _plain(message: str) -> str:
 
 def _report(message: str, remedy: str = "", problems: Sequence[object] | None = None) -> None:
     """Print an error; where JSON was asked for, on standard output as JSON too."""
-    print(f"zenpark: {message}{remedy}", file=sys.stderr)
+    warn([f"{message}{remedy}"])
     if "--json" in sys.argv:
         print_json({"ok": False, "error": message, "problems": problems or []})
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, RobotView, Shown
 from tools.live_table import Row, Trends, heading, lines, metres
+from tools.terminal import printable, say
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -36,12 +37,12 @@ class Lines:
         """Print what is new."""
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
-                print(f"{event.source}| {event.text}", file=sys.stderr)
+                say(f"{event.source}| {event.text}", to=sys.stderr)
             elif event.kind not in QUIET:
                 when = ""
                 if event.kind in {"hazard", "lost"} and progress.elapsed is not None:
                     when = f" (at {progress.elapsed - progress.clock.utc() + event.stamp:.1f} s)"
-                print(f"{progress.case}: {event.kind} {event.source}: {event.text}{when}", file=sys.stderr)
+                say(f"{progress.case}: {event.kind} {event.source}: {event.text}{when}", to=sys.stderr)
         now = time.monotonic()
         if now >= self._next and progress.elapsed is not None:
             self._next = now + LINE_S
@@ -73,7 +74,7 @@ class Table:
         """Draw the table anew, four times a second at most."""
         for event in self._news.new_events(progress):
             if event.kind == OUTPUT:
-                self._live.console.print(f"{event.source}| {event.text}", markup=False, highlight=False)
+                self._live.console.print(printable(f"{event.source}| {event.text}"), markup=False, highlight=False)
         now = time.monotonic()
         if now >= self._next or progress.phase == "done":
             self._next = now + REFRESH_S

@@ -22,6 +22,8 @@ from experiments.file.consistency import arena_faults
 from experiments.file.problems import Fault, Text, refusal
 
 LOOKED_AT: Final = 100  # files beside an experiment, for the one that was meant
+KEPT: Final = "experiment.toml"  # name of the experiment in the folder of a run, in which its arena files lie as well
+SUFFIX: Final = ".toml"  # of no other file there
 _HERE: Final = ("arena", "file")
 _BELONGS: Final = "belongs in the experiment file: an arena file holds nothing but [arena]"
 
@@ -64,6 +66,10 @@ def load(name: str, folder: Path) -> ArenaFile:
     if not name.strip() or "\0" in name or Path(name).name != name:
         hint = "put it beside the experiment file, and give its name alone"
         raise Misnamed(Fault(_HERE, f"{name!r} is no name of a file", hint))
+    if name.lower() == KEPT or Path(name).suffix.lower() != SUFFIX:
+        hint = f"call it otherwise, such as lab{SUFFIX}"
+        why = "is the experiment itself in the folder of a run" if name.lower() == KEPT else f"does not end with {SUFFIX}"
+        raise Misnamed(Fault(_HERE, f"{name!r} {why}", hint))
     file = folder / name
     if not file.exists() and (index.FOLDER / name).is_file():
         file = index.FOLDER / name

@@ -6,6 +6,7 @@ Draft 7, because Taplo (the TOML extension of most editors) misreads the tuples 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import combinations
 from pathlib import Path as File
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from agents.plugins import registry
 from experiments.definition.experiment import Experiment
 from experiments.file.overrides import SHAPE
 from experiments.file.problems import Path
-from experiments.file.structure import group_of
+from experiments.file.structure import LARGEST, group_of
 
 _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
     "Experiment": (),
@@ -26,10 +27,24 @@ _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and w
     "World": ("world",),
 }
 _CASE: Final = "InCase"
+TARGETS: Final = ("distance", "offset", "bearing")  # of a link, of which one is given
+SHAPES: Final = ("box", "radius", "wall")  # of an obstacle, likewise
+WORD: Final = 2**63  # integers lie below it, and not below its negative
 
 
 def schema() -> dict[str, Any]:
-    """The schema, with every plug-in that is installed and can be used; `unusable` names the others."""
+    """The schema, with every plug-in that is installed and can be used; `unusable` names the others.
+
+    It takes what the parser takes, and little else: 3.0 is a whole number to JSON, and relations between tables, such
+    as links to robots that there are, are beyond it.
+    """
+    whole = described()
+    _exclude(whole["definitions"])
+    return _bounded(whole)
+
+
+def described() -> dict[str, Any]:
+    """The schema without the bounds of all numbers and names, and without choices between fields."""
     _, definitions = msgspec.json.schema_components([Experiment], ref_template="#/definitions/{name}")
     definitions = {name: _draft7(each) for name, each in definitions.items()}
     for owner, path in _OWNERS.items():
@@ -52,6 +67,37 @@ def schema() -> dict[str, Any]:
     )  # in full: a reference at the top would hide its neighbours from draft-7 readers
     whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
     return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
+
+
+def _exclude(definitions: dict[str, Any]) -> None:
+    """Adds the choices between fields of which one is given: in a case none may be, the file has it."""
+    for name, fields in (("Target", TARGETS), ("Link", TARGETS), ("Obstacle", SHAPES)):
+        several = [{"required": list(pair)} for pair in combinations(fields, 2)]
+        for each in (name, name + _CASE):
+            definitions[each]["not"] = {"anyOf": several}
+    for owner, key, elsewhere, fields in (
+        ("Formation", "links", "shape", TARGETS), ("Change", "links", "shape", TARGETS),
+        ("Arena", "obstacles", "file", SHAPES),
+    ):  # fmt: skip
+        one = {"anyOf": [{"not": {"type": "object"}}, *({"required": [field]} for field in fields)]}
+        definitions[owner] |= {
+            "if": {"not": {"required": [elsewhere]}},
+            "then": {"properties": {key: {"additionalProperties": one}}},
+        }
+
+
+def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with bounds of all numbers, and with names that do not end with a line end."""
+    result = _map_children(node, _bounded)
+    largest = {"number": LARGEST, "integer": WORD - 1}.get(str(node.get("type")))
+    if largest is not None:
+        if not {"minimum", "exclusiveMinimum"} & node.keys():
+            result["minimum"] = -largest
+        if not {"maximum", "exclusiveMaximum"} & node.keys():
+            result["maximum"] = largest
+    if str(node.get("pattern", "")).endswith("$"):
+        result["not"] = {"pattern": "\n"}
+    return result
 
 
 def unusable() -> list[str]:

@@ -17,7 +17,7 @@ import msgspec
 
 from agents.body.kinds import KINDS, Kind
 from experiments.catalogue.index import FOLDER
-from experiments.file.json_schema import schema
+from experiments.file.json_schema import described
 
 NONE: Final[Mapping[str, object]] = {}
 _NAMES: Final = {  # tables whose keys are names, with the example of such a name
@@ -93,7 +93,7 @@ class Entry(msgspec.Struct, frozen=True):
 @cache
 def entries() -> tuple[Entry, ...]:
     """Every key, tables before their keys, in the order of the structs."""
-    whole = schema()
+    whole = described()
     return tuple(_walk(whole, whole["definitions"], ""))
 
 

@@ -13,12 +13,13 @@ from typing import Any, Final
 
 import msgspec
 
+from experiments.file.arena_file import KEPT
 from experiments.file.document import Document
 from experiments.file.problems import refusal
 from experiments.recording.version import Provenance
 
 RUNS: Final = Path("runs")
-SOURCE: Final = "experiment.toml"
+SOURCE: Final = KEPT
 ORIGIN: Final = "run.json"
 METRICS: Final = "metrics.json"
 KEY_FIGURES: Final = ("f_hz", "iae", "rmse", "acquired_s")  # means over the robots of a case, see `metrics.json`
@@ -152,9 +153,21 @@ def _past_run(folder: Path) -> PastRun | None:
     for case in dict.fromkeys(each.case for each in cases):
         means = {each.seed: each.mean for each in cases if each.case == case}
         figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in KEY_FIGURES}
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     seeds = sorted({each.seed for each in cases})
-    return PastRun(str(folder), origin, origin.begun or source.stat().st_mtime, size / 1e6, recorded, seeds, figures)
+    try:
+        made = origin.begun or source.stat().st_mtime
+    except OSError:  # removed meanwhile
+        return None
+    return PastRun(str(folder), origin, made, 1e-6 * _size(folder), recorded, seeds, figures)
+
+
+def _size(folder: Path) -> int:
+    """Size of all files in a folder [bytes], without what links lead to."""
+    size = 0
+    for file in folder.rglob("*"):
+        with suppress(OSError):  # removed meanwhile
+            size += file.lstat().st_size if file.is_file() else 0
+    return size
 
 
 class CaseFigures(msgspec.Struct, frozen=True):

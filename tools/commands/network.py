@@ -13,6 +13,7 @@ import typer
 
 from agents.errors import ExplainedError
 from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
+from tools.terminal import printable
 
 if TYPE_CHECKING:
     import zenoh
@@ -89,11 +90,6 @@ def _name(value: dict[str, object]) -> str | None:
     about = value.get("metadata")
     name = about.get("name") if isinstance(about, dict) else None
     return name if isinstance(name, str) else None
-
-
-def printable(text: str) -> str:
-    """Text of others, without what could steer the terminal."""
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
 
 
 def _admin(session: zenoh.Session, selector: str, timeout_s: float) -> Iterator[tuple[str, object]]:

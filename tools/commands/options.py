@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from tools import completion
+from tools.terminal import say
 
 if TYPE_CHECKING:
     import zenoh
@@ -131,8 +132,7 @@ def with_options(command: Callable[..., int]) -> Callable[..., int]:
 
 def warn(lines: Sequence[str]) -> None:
     """Print notes for the user on standard error."""
-    for line in lines:
-        print(f"zenpark: {line}", file=sys.stderr)
+    say(*(f"zenpark: {line}" for line in lines), to=sys.stderr)
 
 
 def open_in_browser(address: str, by_hand: str = "") -> None:
@@ -156,7 +156,7 @@ def print_result(result: Any, *lines: str, as_json: bool) -> None:  # noqa: ANN4
     if as_json:
         print_json(result)
     else:
-        print("\n".join(lines))
+        say(*lines)
 
 
 def routers(connect: list[str] | None, lab: str | None) -> list[str]:

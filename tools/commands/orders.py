@@ -27,6 +27,7 @@ from tools.commands.options import (
     session,
     with_options,
 )
+from tools.terminal import printable, say
 
 if TYPE_CHECKING:
     import zenoh
@@ -91,8 +92,6 @@ class Operator:
 
     def print_results(self, done: Mapping[str, str], refused: Mapping[str, str]) -> int:
         """Print the result of an order for each robot; the exit code: 1 if a robot refused, else 0."""
-        from tools.commands.network import printable
-
         if self.as_json:
             print_json({"ok": not refused, "done": done, "refused": refused})
         else:
@@ -106,8 +105,6 @@ class Operator:
 
     def refuse(self, reason: str) -> int:
         """Print why a whole order was refused; the exit code."""
-        from tools.commands.network import printable
-
         if self.as_json:
             print_json({"ok": False, "error": reason})
         print(f"zenpark: {printable(reason)}", file=sys.stderr)
@@ -218,7 +215,7 @@ def _tell_world(order: messages.WorldOrder, done: str, by: Operator) -> int:
     elif reply.ok:
         print(f"{done}; the world {'stands still' if reply.paused else 'runs'} at {reply.time:.2f} s")
     else:
-        print(f"no: {reply.reason}", file=sys.stderr)
+        say(f"no: {reply.reason}", to=sys.stderr)
     return int(not reply.ok)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,7 +12,8 @@ import typer
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.commands.options import AsJson, example, known_words, print_json, print_result
+from tools.commands.options import AsJson, example, known_words, print_json, print_result, warn
+from tools.terminal import say
 
 if TYPE_CHECKING:
     from experiments.recording.run_folder import PastRun
@@ -240,9 +240,9 @@ def compare(
     if as_json:
         print_json({"reference": first.folder, "runs": [_as_json(run) for run in found], "differences": differ})
     else:
-        print(f"reference: {first.folder}")
+        say(f"reference: {first.folder}")
         for folder, each in differ.items():
-            print(f"{folder}: {'; '.join(each) or 'the same file, seeds, code and versions'}")
+            say(f"{folder}: {'; '.join(each) or 'the same file, seeds, code and versions'}")
         reference = next(iter(first.cases.values()), {})
         rows = []
         for run in found:
@@ -250,8 +250,7 @@ def compare(
                 cells = [_against(values, reference.get(name, {})) for name, values in figures.items()]
                 rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
         head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s (– never)")
-        print()
-        print("\n".join(columns([head, *rows])))
+        say("", *columns([head, *rows]))
         if seeds := max((len(run.seeds) for run in found if len(run.seeds) > 1), default=0):
             print(over_seeds(seeds))
     return report([run.folder for run in found], out) if out is not None else 0
@@ -471,9 +470,9 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
             values = [interval(spread([*by_seed.values()])) for by_seed in figures.values()] or [NONE] * 4
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
-    print("\n".join(columns([head, *rows])) if rows else "no run")
+    say(*(columns([head, *rows]) if rows else ["no run"]))
     for folder in sweeps:
-        print(f"{_minute((folder / SWEEP).stat().st_mtime)}  {folder}  a sweep: `./zenpark report {folder}`")
+        say(f"{_minute((folder / SWEEP).stat().st_mtime)}  {folder}  a sweep: `./zenpark report {folder}`")
     print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB; sweeps: {len(sweeps)}")
 
 
@@ -508,33 +507,42 @@ def clean(
     as_json: AsJson = False,
 ) -> int:
     """Remove folders of past runs: those of some words or age, never one with a tag or one that is up."""
-    import shutil
-
     from agents.runtime import run_registry
+    from experiments.recording import cleaning
 
     if not words and older is None:
         raise typer.BadParameter("give words that the runs have, or --older DAYS (0: all)", param_hint="which runs")
     up = {Path(run.folder).resolve() for run in run_registry.runs() if run.folder}
+    roots = {Path(each).resolve() for each in below or ["runs"]}
     now = time.time()
     chosen = [
         run
         for run in _past_runs(words or [], below)
-        if (tagged or not run.origin.tags) and Path(run.folder).resolve() not in up
+        if (tagged or not run.origin.tags) and cleaning.removable(Path(run.folder))
+        if (place := Path(run.folder).resolve()) not in roots and not any(each.is_relative_to(place) for each in up)
         if older is None or now - run.made > 86400.0 * older
     ]
-    shown = []
+    shown: list[dict[str, Any]] = []
+    failed = False
     for run in chosen:
         folder = Path(run.folder)
-        parts = [*folder.glob("*.mcap"), *folder.glob("logs")] if recordings else [folder]
+        parts = [*folder.glob("*.mcap"), *folder.glob("logs")] if recordings else None
+        removed = [folder] if parts is None else parts
         try:
-            for part in parts if yes else ():
-                shutil.rmtree(part) if part.is_dir() else part.unlink()
+            cleaning.remove(folder, parts, really=yes)
+        except cleaning.InUse as error:
+            warn([f"{error}: it stays"])
+            continue
+        except FileNotFoundError:  # another one has removed it meanwhile
+            continue
         except OSError as error:
-            print(f"zenpark: {error.filename}: cannot be removed: {error.strerror}", file=sys.stderr)
-            return 1
-        shown.append({"folder": run.folder, "parts": parts, "removed": yes})
+            warn([f"{error.filename}: cannot be removed: {error.strerror}"])
+            failed = True
+            continue
+        shown.append({"folder": run.folder, "parts": removed, "removed": yes})
         if not as_json:
-            print(f"{'removed' if yes else 'would remove'} {', '.join(map(str, parts)) or f'nothing of {folder}'}")
-    remedy = "; --yes does it" if chosen and not yes else ""
-    print_result(shown, f"runs: {len(chosen)}{remedy}", as_json=as_json)
-    return 0
+            what = ", ".join(map(str, removed)) or f"nothing of {folder}"
+            say(f"{'removed' if yes else 'would remove'} {what}")
+    remedy = "; --yes does it" if shown and not yes else ""
+    print_result(shown, f"runs: {len(shown)}{remedy}", as_json=as_json)
+    return int(failed)

@@ -33,6 +33,7 @@ from tools.commands.options import (
     warn,
 )
 from tools.commands.results import summary, write_figures_of_merit, write_report
+from tools.terminal import say
 
 if TYPE_CHECKING:
     from experiments.file.document import Document
@@ -121,6 +122,7 @@ class _Shown:
 def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
     """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
     from experiments.file.document import load
+    from experiments.recording.cleaning import using
     from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
     from experiments.report import verdict
 
@@ -132,7 +134,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     folder = new_folder(read, show.out)
     try:
         read.keep(folder / SOURCE)
-        with _kept_origin(folder, origin, read, options):
+        with using(folder), _kept_origin(folder, origin, read, options):
             if origin.virtual:
                 with viewing.paced(show.pace or 1.0) if show.view else nullcontext(lambda *_: lambda _: None) as watch:
                     runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch), "", 0
@@ -143,16 +145,17 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
             return code
         if not runs[0].traces:
             why = stopped or "interrupted"
-            print(f"{why}, before the common start: there is nothing to report; logs: {folder / 'logs'}")
+            why += f", before the common start: there is nothing to report; logs: {folder / 'logs'}"
+            print_result({"ok": False, "error": why}, why, as_json=show.as_json)
             return code or (FAILED if stopped else 130)
         _write(runs, folder, show)
         if stopped:
-            print(f"zenpark: {stopped}", file=sys.stderr)
+            warn([stopped])
         if not code:
             failures = verdict.failures([case for each in runs for case in each.metrics.values()])
             warn([finding.text for finding in failures])
             code = FAILED if failures or stopped else 0
-        return code if former is None else max(code, _print_differences(folder, former))
+        return code if former is None else max(code, _print_differences(folder, former, quiet=show.as_json))
     finally:
         remove_unused(folder)
 
@@ -217,15 +220,15 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
         return _run(again, options, show, former=former if origin.virtual else None)
 
 
-def _print_differences(folder: Path, former: Path) -> int:
-    """Print whether a repeated run came to the same to the last bit; the exit code."""
+def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:
+    """Print whether a repeated run came to the same to the last bit, if not `quiet`, or not; the exit code."""
     from experiments.recording import bundle
 
     found = bundle.differences(folder, former)
     for each in found:
-        print(f"zenpark: differs from the bundle: {each}", file=sys.stderr)
-    if not found:
-        print("the same as in the bundle, to the last bit: figures and recordings")
+        warn([f"differs from the bundle: {each}"])
+    if not found and not quiet:
+        say("the same as in the bundle, to the last bit: figures and recordings")
     return int(bool(found))
 
 
@@ -326,8 +329,7 @@ def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: boo
     found = [finding for finding in check(read, cases) if finding.severity != "note"]
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
-    for finding in found:
-        print(finding, file=sys.stderr)
+    say(*map(str, found), to=sys.stderr)
     if anyway or all(finding.severity != "error" for finding in found):
         return True
     if as_json:

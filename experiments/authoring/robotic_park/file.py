@@ -273,7 +273,17 @@ class Entry(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc] # PyYAML has no types
-    """PyYAML's safe loader that refuses keys that stand twice, drops those that hold nothing, and splits poses."""
+    """PyYAML's safe loader that refuses keys that stand twice, drops those that hold nothing, and splits poses.
+
+    Aliases are refused, because a few lines of them stand for more values than any machine holds.
+    """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:  # noqa: ANN401 - as PyYAML has it
+        if self.check_event(yaml.AliasEvent):
+            alias = self.peek_event()
+            words = f"the alias '*{alias.anchor}' is not read; write out what it stands for"
+            raise yaml.composer.ComposerError(None, None, words, alias.start_mark)
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:  # noqa: ANN401 - as PyYAML has it
         keys = set()
