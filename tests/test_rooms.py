@@ -41,7 +41,8 @@ experiments.authoring experiments.real_time.hosts experiments.real_time.processe
 experiments.report experiments.real_time.conductor
 experiments.run
 experiments.sweep experiments.view
-tools.live_table
+tools.terminal
+tools.live_table tools.consent
 tools.progress tools.completion
 tools.commands
 tools.reliability

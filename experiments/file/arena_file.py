@@ -68,7 +68,9 @@ def load(name: str, folder: Path) -> ArenaFile:
         raise Misnamed(Fault(_HERE, f"{name!r} is no name of a file", hint))
     if name.lower() == KEPT or Path(name).suffix.lower() != SUFFIX:
         hint = f"call it otherwise, such as lab{SUFFIX}"
-        why = "is the experiment itself in the folder of a run" if name.lower() == KEPT else f"does not end with {SUFFIX}"
+        why = (
+            "is the experiment itself in the folder of a run" if name.lower() == KEPT else f"does not end with {SUFFIX}"
+        )
         raise Misnamed(Fault(_HERE, f"{name!r} {why}", hint))
     file = folder / name
     if not file.exists() and (index.FOLDER / name).is_file():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import struct
@@ -9,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from importlib.metadata import distributions
+from io import BytesIO
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +25,8 @@ from experiments.recording.version import PACKAGES, ROOT
 SUFFIX: Final = ".zip"
 LEFT_OUT: Final = ("logs", f"{ORIGIN}.new")  # of the run's folder
 DATE: Final = (2000, 1, 1, 0, 0, 0)  # of every member: the same run makes the same archive
+SUMS: Final = "SHA256SUMS"
+PIECE: Final = 1 << 20  # [bytes] in memory at once
 LARGEST: Final = 1 << 34  # [bytes] of all members together
 # what the library raises of archives that are damaged, ciphered or of another method
 DAMAGED: Final = (
@@ -70,18 +74,36 @@ def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
         version="an older zenpark" if made_by is None else f"zenpark {made_by.zenpark}, code {made_by.code}",
         name=target.name,
     )
-    members = {name: file.read_bytes() for name, file in _files(folder)}
-    members |= {f"plugins/{file.name}": file.read_bytes() for file in sorted(_plugins(experiments))}
     requirements = sorted({f"{each.name}=={each.version}\n" for each in distributions()}, key=str.lower)
+    members: dict[str, Path | bytes] = dict(_files(folder, target))
+    members |= {f"plugins/{file.name}": file for file in sorted(_plugins(experiments))}
     members |= {"README.txt": text.encode(), "requirements.txt": "".join(requirements).encode()}
-    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in sorted(members.items()))
+    draft = target.with_name(f"{target.name}.new")
     try:
-        with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in sorted({**members, "SHA256SUMS": sums.encode()}.items()):
-                archive.writestr(zipfile.ZipInfo(name, DATE), data, zipfile.ZIP_DEFLATED)
+        with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
+            sums = [f"{_add(archive, name, members[name])}  {name}\n" for name in sorted(members)]
+            _add(archive, SUMS, "".join(sums).encode())
+        draft.replace(target)
     except OSError as error:
-        raise RecordingError(f"{target}: cannot be written: {error.strerror}") from None
+        raise RecordingError(f"{error.filename or target}: {error.strerror}: no bundle was made") from None
+    finally:
+        draft.unlink(missing_ok=True)
     return target
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: Path | bytes) -> str:
+    """Add a member to an archive, a file piece by piece; the digest of what was added."""
+    total = hashlib.sha256()
+    member = zipfile.ZipInfo(name, DATE)
+    member.compress_type = zipfile.ZIP_DEFLATED
+    with (
+        BytesIO(data) if isinstance(data, bytes) else data.open("rb") as source,
+        archive.open(member, "w", force_zip64=True) as into,
+    ):
+        while piece := source.read(PIECE):
+            total.update(piece)
+            into.write(piece)
+    return total.hexdigest()
 
 
 def is_bundle(file: str) -> bool:
@@ -99,8 +121,10 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise RecordingError(f"{bundle}: more than {LARGEST >> 30} GB unpacked")
             archive.extractall(into)  # names with .. or / at the front are made harmless by the library
-        sums = (into / "SHA256SUMS").read_text("utf-8")
+        sums = (into / SUMS).read_text("utf-8")
     except DAMAGED as error:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise  # a good bundle, perhaps
         why = getattr(error, "strerror", None) or error
         raise RecordingError(f"{bundle}: is no bundle of `./zenpark export RUN --bundle`: {why}") from None
     for line in sums.splitlines():
@@ -108,22 +132,30 @@ def unpack(bundle: Path, into: Path) -> RunOrigin:
         file = into / name
         if not file.resolve().is_relative_to(into.resolve()) or not file.is_file():
             raise RecordingError(f"{bundle}: {name} is missing in it")
-        if hashlib.sha256(file.read_bytes()).hexdigest() != wanted:
+        with file.open("rb") as content:
+            found = hashlib.file_digest(content, "sha256").hexdigest()
+        if found != wanted:
             raise RecordingError(f"{bundle}: {name} is not what was put into it")
     origin = read_origin(into)
     if origin is None or not origin.file or not (into / SOURCE).is_file():
         raise RecordingError(f"{bundle}: holds no {ORIGIN} and {SOURCE}")
     former = Path(origin.file)
     file = into / (former.name if former.suffix in (".toml", ".json") else f"{former.name}.toml")
-    if file.name != SOURCE:
-        file.write_bytes((into / SOURCE).read_bytes())
+    try:
+        with file.open("xb") as copy:
+            copy.write((into / SOURCE).read_bytes())
+    except (OSError, ValueError):  # the name of another member, such as run.json, or of no file
+        file = into / SOURCE
     return msgspec.structs.replace(origin, file=str(file))
 
 
 def differences(repeated: Path, former: Path) -> list[str]:
     """Differences between the results of two folders of one run in virtual time, to the last bit; empty if nothing."""
     found = []
-    mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
+    try:
+        mine, theirs = (json.loads((folder / METRICS).read_bytes()) for folder in (repeated, former))
+    except (OSError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{METRICS} cannot be compared: {error}") from None
     if mine != theirs:
         old, new = dict(flattened(theirs)), dict(flattened(mine))
         changed = [path for path in sorted(old.keys() | new.keys()) if old.get(path) != new.get(path)]
@@ -146,10 +178,13 @@ def _messages(file: Path) -> str:
     return total.hexdigest()
 
 
-def _files(folder: Path) -> Iterator[tuple[str, Path]]:
+def _files(folder: Path, target: Path) -> Iterator[tuple[str, Path]]:
+    """Files of a run; links are left out, because what they lead to is not of the run."""
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder)
-        if file.is_file() and name.parts[0] not in LEFT_OUT and file.suffix != SUFFIX:
+        if file.is_symlink() or not file.is_file() or name.parts[0] in LEFT_OUT or file.suffix == SUFFIX:
+            continue
+        if not file.name.startswith(target.name):
             yield name.as_posix(), file
 
 

@@ -200,6 +200,7 @@ def test_results_of_doing_are_json_where_it_is_asked_for(tmp_path, monkeypatch):
     past.mkdir(parents=True)
     for name in ("experiment.toml", "default.mcap"):
         (past / name).touch()
+    (past / "run.json").write_text('{"begun": 1.0}')
     invoke = CliRunner().invoke
     said = json.loads(invoke(app, ["clean", "--older", "0", "--recordings", "--json"]).stdout)
     assert said == [{"folder": "runs/past", "parts": ["runs/past/default.mcap"], "removed": False}]

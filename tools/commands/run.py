@@ -73,6 +73,9 @@ def run(
     ] = None,
     lab: Lab = None,
     identity: As = "operator",
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Agrees to machines and devices that a bundle, or another user's file, names.")
+    ] = False,
     view: Annotated[bool, typer.Option("--view", help="Shows it in the browser, in three dimensions.")] = False,
     pace: Annotated[
         float | None, typer.Option(min=0.01, max=100.0, help="Of --virtual --view: so many times as fast. [1]")
@@ -98,7 +101,7 @@ def run(
         anyway=anyway,
         tags=tag or [],
     )
-    show = _Shown(out, as_json, report, open_report, view, pace)
+    show = _Shown(out, as_json, report, open_report, view, pace, yes)
     if not bundle.is_bundle(file):
         return _run(origin, options, show)
     if origin != RunOrigin(file=file, virtual=virtual, tags=origin.tags):
@@ -117,10 +120,16 @@ class _Shown:
     open_report: bool
     view: bool
     pace: float | None  # simulated seconds in one second, in a view
+    agreed: bool  # to what an experiment of others touches
 
 
-def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None) -> int:
-    """Run an experiment; `former` is a folder with the same run, with which results in virtual time are compared."""
+def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path | None = None, bundle: str = "") -> int:
+    """Run an experiment.
+
+    Args:
+        former: Folder with the same run, with which results in virtual time are compared.
+        bundle: Archive from which it comes.
+    """
     from experiments.file.document import load
     from experiments.recording.cleaning import using
     from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
@@ -131,6 +140,12 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     _refuse(options, show, virtual=origin.virtual, seeds=origin.seeds)
     if not sound(read, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
+    if not origin.virtual:
+        from experiments.real_time.conductor.conduct import embody
+        from tools import consent
+
+        if bundle or consent.stranger(read.path):
+            consent.require(bundle or str(read.path), embody(read, options), given=show.agreed)
     folder = new_folder(read, show.out)
     try:
         read.keep(folder / SOURCE)
@@ -217,7 +232,7 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
         if again.virtual:
             again = msgspec.structs.replace(again, bodies=None, here=False)
         options = RunOptions(again.cases, again.bodies, again.here, lab, identity)
-        return _run(again, options, show, former=former if origin.virtual else None)
+        return _run(again, options, show, former=former if origin.virtual else None, bundle=asked.file)
 
 
 def _print_differences(folder: Path, former: Path, *, quiet: bool) -> int:

@@ -199,6 +199,13 @@ def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
     assert not (tmp_path / "again.toml").exists()
 
 
+@pytest.mark.parametrize("name", ["experiment.toml", "Experiment.TOML", "run.json", "metrics.json", "event.mcap"])
+def test_names_of_a_runs_own_files_are_refused(name, lab, tmp_path):
+    (tmp_path / name).write_text(LAB)
+    with pytest.raises(DocumentError, match="call it otherwise"):
+        read(lab(ONE.replace("lab.toml", name)))
+
+
 def test_an_arena_of_the_catalogue_needs_not_stand_beside(lab):
     arena = read(lab(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
     assert list(arena.obstacles) == ["left", "right"]

@@ -81,7 +81,7 @@ def test_a_pipe_receives_the_whole_texts():
 
 def test_without_a_key_all_at_the_top_are_listed():
     lines = CliRunner().invoke(app, ["explain"]).output.splitlines()
-    assert [line.partition(" ")[0] for line in lines] == list(reference.schema()["properties"])
+    assert [line.partition(" ")[0] for line in lines] == list(reference.described()["properties"])
 
 
 def test_a_misspelt_plug_in_is_recognised():

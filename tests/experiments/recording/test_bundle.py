@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -126,6 +128,64 @@ def test_what_is_no_bundle_is_refused(tmp_path: Path) -> None:
             bundle.unpack(tmp_path / name, tmp_path / "into" / name)
     assert not (tmp_path / "into" / "outside.txt").exists()
     assert not (tmp_path / "outside.txt").exists()
+
+
+def test_links_stay_out_and_large_files_go_in_pieces(flown: Path, tmp_path: Path, monkeypatch) -> None:
+    folder = shutil.copytree(flown / "run", tmp_path / "run")
+    (tmp_path / "secret").write_text("of the user")
+    (folder / "notes.txt").symlink_to(tmp_path / "secret")
+    (folder / "more").symlink_to(tmp_path)
+    monkeypatch.setattr(bundle, "PIECE", 1000)
+    bundle.write(folder, tmp_path / "run.zip", [])
+    assert (tmp_path / "run.zip").read_bytes() == (flown / "run.zip").read_bytes()
+
+
+def test_failed_bundles_leave_the_former_one(flown: Path, tmp_path: Path, monkeypatch) -> None:
+    target = tmp_path / "run.zip"
+    target.write_text("the former one")
+
+    def full(*_: object) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device", "run.zip")
+
+    monkeypatch.setattr(bundle, "_add", full)
+    with pytest.raises(RecordingError, match="No space left"):
+        bundle.write(flown / "run", target, [])
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("run.zip", "the former one")]
+
+
+@pytest.mark.parametrize("name", ["run.json", "metrics.json", "a\0b.toml", f"{'x' * 300}.toml", "experiment.toml"])
+def test_names_in_bundles_overwrite_nothing(name: str, flown: Path, tmp_path: Path) -> None:
+    origin = json.loads((flown / "run" / "run.json").read_bytes())
+    changed = json.dumps(origin | {"file": f"sub/{name}"}).encode()
+    with zipfile.ZipFile(flown / "run.zip") as old:
+        sums = old.read("SHA256SUMS").decode().splitlines(keepends=True)
+    kept = "".join(line for line in sums if not line.endswith("  run.json\n")).encode()
+    bundle.unpack(
+        rewritten(flown / "run.zip", tmp_path / "odd.zip", run_json=changed, SHA256SUMS=kept), tmp_path / "into"
+    )
+    assert (tmp_path / "into" / "run.json").read_bytes() == changed
+    assert (tmp_path / "into" / "metrics.json").read_bytes() == (flown / "run" / "metrics.json").read_bytes()
+
+
+def test_repetition_with_json_prints_one_document(flown: Path, tmp_path: Path) -> None:
+    done = zenpark("run", str(flown / "run.zip"), "--no-report", "--json", "--out", str(tmp_path / "again"))
+    assert done.exit_code == 0, done.output
+    assert {"cases"} <= json.loads(done.stdout).keys()
+
+
+def test_control_sequences_of_a_bundle_stay_out(flown: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(flown / "run", tmp_path / "run")
+    origin = json.loads((folder / "run.json").read_bytes())
+    origin["made_by"]["packages"]["numpy"] = origin["title"] = "\x1b]0;owned\x07\x1b[2J"
+    (folder / "run.json").write_text(json.dumps(origin))
+    assert zenpark("export", str(folder), "--bundle").exit_code == 0
+    again = zenpark("run", str(tmp_path / "run.zip"), "--no-report", "--out", str(tmp_path / "again"))
+    compared = zenpark("compare", str(folder), str(tmp_path / "again"))
+    past = zenpark("runs", "--past", "--in", str(tmp_path))
+    for said in (again, compared, past):
+        assert said.exit_code == 0, said.output
+        assert "\x1b" not in said.output
+    assert "owned" in again.output + compared.output
 
 
 def test_a_bundle_takes_no_options_of_its_run(flown: Path) -> None:

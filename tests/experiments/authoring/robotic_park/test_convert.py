@@ -369,7 +369,7 @@ def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
         ("  mode: virtual ", " \tmode: virtual ", "", 3),
         ("tool: Webots", "tool: 'Webots", "", None),
         ("tool: Webots", "tool: !!python/object/apply:os.system ['true']", "the tag", 4),
-        ("tool: Webots", "tool: *nothing", "undefined alias", 4),
+        ("tool: Webots", "tool: *nothing", "the alias '*nothing' is not read", 4),
         ("  tool: Webots\n", "  tool: Webots\n  tool: Gazebo\n", "stands twice", 5),
     ],
 )  # fmt: skip

@@ -1,0 +1,75 @@
+"""Consent before an experiment of others touches machines and devices."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.file.document import load, loads
+from experiments.file.problems import DocumentError
+from tools import consent
+
+REACHING = """
+title = "two"
+duration_s = 5.0
+[robots.A]
+kind = "crazyflie"
+start = [-0.4, 0.0]
+hover = 0.5
+body = "radio://0/80/2M/E7E7E7E701"
+[robots.B]
+kind = "khepera4"
+start = [0.4, 0.0]
+[formation.links]
+"A - B" = 0.8
+[hosts.pi]
+address = "pi@192.0.2.7"
+robots = ["B"]
+"""
+
+
+def asking(monkeypatch: pytest.MonkeyPatch, answer: str | None) -> None:
+    """A terminal in which the user answers; None: no terminal."""
+    stdin = SimpleNamespace(isatty=lambda: answer is not None, readline=lambda: f"{answer}\n")
+    monkeypatch.setattr(consent.sys, "stdin", stdin)
+    monkeypatch.setattr(consent.sys.stderr, "isatty", lambda: True, raising=False)
+
+
+def test_devices_and_machines_are_named() -> None:
+    device, machine = consent.touched(loads(REACHING).cases().values())
+    assert "A: radio://0/80/2M/E7E7E7E701" in device
+    assert "ssh pi@192.0.2.7" in machine
+
+
+def test_simulated_runs_ask_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    asking(monkeypatch, None)
+    consent.require("a.zip", load("robotic-park").cases(), given=False)
+
+
+@pytest.mark.parametrize(("answer", "runs"), [("y", True), ("YES", True), ("n", False), ("", False), (None, False)])
+def test_others_files_run_when_agreed(answer, runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    asking(monkeypatch, answer)
+    cases = loads(REACHING).cases()
+    consent.require("a.zip", cases, given=True)
+    if runs:
+        consent.require("a.zip", cases, given=False)
+    else:
+        with pytest.raises(DocumentError, match="--yes" if answer is None else "--here"):
+            consent.require("a.zip", cases, given=False)
+
+
+def test_own_files_are_no_strangers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "own.toml"
+    file.touch()
+    assert not consent.stranger(file)
+    assert not consent.stranger(tmp_path / "missing.toml")
+    owner = SimpleNamespace(st_uid=os.geteuid() + 4321)
+    monkeypatch.setattr(Path, "stat", lambda self, **_: owner if self == file else SimpleNamespace(st_uid=0))
+    monkeypatch.setattr(Path, "exists", lambda *_: True)
+    monkeypatch.delenv("SUDO_UID", raising=False)
+    assert consent.stranger(file)
+    monkeypatch.setenv("SUDO_UID", str(owner.st_uid))
+    assert not consent.stranger(file)
