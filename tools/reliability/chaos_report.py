@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 from agents.errors import ExplainedError
+from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.recording.reader import recover
 from experiments.report.page import NONE, Finding, Section, Table, date_of, render
@@ -71,6 +72,9 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
         kind = each.fault.properties.recorded
         if kind and not ((kind, each.victim) in events if each.victim else kind in kinds):
             wrong.append(f"the recording has no event {kind} {each.victim}".rstrip())
+    left = [each for each in outcomes if each.ended and not each.fault.properties.ordered]
+    if left and not measure(read.trace).failures:
+        wrong.append(f"robots came down by {left[0].fault.kind}, and the run would end with 0")
     return wrong
 
 

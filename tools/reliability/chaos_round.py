@@ -92,8 +92,9 @@ class ChaosRound:
             self._wrong.append(f"not in formation {FORM_S:g} s after the start ({why}): no fault was done")
         while not (why or self._begun["conductor"] or self._setting.interrupted()):
             t = self._poll()
-            fault = next_fault(self._waiting, self._stage, self._begun, self._run.experiment.duration_s - t)
             running = self._observer.running() - self._run.dead.keys()
+            able = [each for each in self._waiting if running.intersection(self._run.robots(each.properties.among))]
+            fault = next_fault(able, self._stage, self._begun, self._run.experiment.duration_s - t)
             if fault is None or len(running) < FEWEST:
                 return
             if time.monotonic() >= well + fault.after_s:
@@ -154,7 +155,8 @@ class ChaosRound:
         run, observer, victim, at_s = self._run, self._observer, fault.victim, t
         if victim:
             names = observer.invariants.names
-            victim = next(name for name in (*names, *names)[names.index(victim) :] if name in running)
+            able = running.intersection(run.robots(fault.properties.among))
+            victim = next(name for name in (*names, *names)[names.index(victim) :] if name in able)
         active = self._active = ActiveFault(fault, victim, run, observer, running)
         check = fault.properties.begin(active)
         self._begun[fault.kind] += 1

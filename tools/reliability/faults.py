@@ -7,7 +7,7 @@ check that goes on until all is well: the reason why it is not, or an empty text
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from signal import SIGKILL, SIGSTOP
 from typing import Final, Literal
@@ -116,6 +116,17 @@ class ActiveFault:
         unaware = [name for name in self.receivers() if victim not in observer.status[name].missing]
         return f"{', '.join(unaware)}: not noticed that {victim} is lost" if unaware else ""
 
+    def unaware(self, names: Collection[str], text: str) -> str:
+        """Reason why living robots among `names` neither hold nor land, with `text` in the incident."""
+        blind = [name for name in sorted(self.live.intersection(names)) if not self.incidents(name, text)]
+        return f"{', '.join(blind)}: not noticed that its position is wrong" if blind else ""
+
+    def deaf_to(self) -> list[str]:
+        """Living robots whose poses the victim has not received since the fault was lifted."""
+        observer, victim = self.observer, self.victim
+        senders = [name for name, receivers in observer.receivers.items() if victim in receivers and name in self.live]
+        return [name for name in senders if observer.received_at.get((victim, name), 0.0) < self.lifted]
+
     def receivers(self) -> list[str]:
         """Living robots that receive the poses of the victim."""
         return sorted(self.observer.receivers[self.victim] & self.live)
@@ -146,6 +157,16 @@ class ActiveFault:
         asked = sorted(observer.status.keys() - self.run.dead.keys())
         awake = [name for name in asked if observer.status[name].phase != "done"]
         return f"in the air {up}, not done {awake}" if up or awake else ""
+
+    def all_unaware(self, text: str) -> Check:
+        """Check that all robots measured by motion capture notice that their positions are wrong."""
+        return lambda: self.unaware(self.run.measured, text)
+
+    def landed(self) -> str:
+        """Reason why the victim is not down after an order to land."""
+        if not self.observer.is_down(self.victim):
+            return f"{self.victim} does not land"
+        return f"{self.victim} has not come down yet" if self.observer.invariants.in_the_air(self.victim) else ""
 
     def incidents(self, name: str, what: str) -> list[messages.Incident]:
         """Incidents since the fault began that made a robot hold, land or cut its motors, and whose text has `what`."""
@@ -242,6 +263,52 @@ def _mocap_clock(it: ActiveFault) -> Check:
     return it.positions_kept
 
 
+def _mocap_frozen(it: ActiveFault) -> Check:
+    """Motion capture tells the same poses in new frames for 5 s: no robot may move by them."""
+    it.run.spoil_capture("frozen")
+    return it.all_unaware("position")
+
+
+def _mocap_repeated(it: ActiveFault) -> Check:
+    """Motion capture sends its last frame again and again for 5 s: no robot may move by it."""
+    it.run.spoil_capture("repeated")
+    return it.all_unaware("position")
+
+
+def _mocap_swapped(it: ActiveFault) -> Check:
+    """Motion capture takes two subjects for each other for 5 s: both must hold or land."""
+    names = it.run.measured
+    it.run.spoil_capture("swapped", it.victim)
+    pair = it.victim, names[(names.index(it.victim) + 1) % len(names)]
+    it.note = f"and {pair[1]}"
+    return lambda: it.unaware(pair, "")
+
+
+def _mocap_renamed(it: ActiveFault) -> Check:
+    """A subject of motion capture has another name for 5 s: its robot must hold or land."""
+    it.run.spoil_capture("renamed", it.victim)
+    return lambda: it.unaware([it.victim], "position")
+
+
+def _refused_landing(it: ActiveFault) -> Check:
+    """A robot is ordered to land, and its body refuses for 12 s: it must be told again until it is down."""
+    it.run.refuse_landing(it.victim, it.observer.session)
+    return it.landed
+
+
+def _sleep(it: ActiveFault) -> Check:
+    """The computer of a robot sleeps for 8 s: on waking it must be heard, hear the others, or be down."""
+    it.run.sleep(it.victim)
+
+    def check() -> str:
+        if (why := it.back()) or it.observer.is_down(it.victim):
+            return why
+        deaf = it.deaf_to()
+        return f"{it.victim} receives no pose of {', '.join(deaf)}" if deaf else ""
+
+    return check
+
+
 def _double(it: ActiveFault) -> Check:
     """A second process of a robot's name is started: it must be refused, and touch nothing."""
     victim, second = it.victim, it.run.start_duplicate(it.victim)
@@ -303,6 +370,8 @@ class FaultKind:
     size: tuple[float, float] = (0.0, 0.0)  # range of its size [s]
     signed: bool = False  # the size may be negative as well
     unsteered: bool = False  # nothing steers the victim while it lasts: its body must stop
+    among: Literal["all", "measured", "flying"] = "all"  # robots that it can befall
+    ordered: bool = False  # its landings are ordered, so they fail no run
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
 
     @property
@@ -324,6 +393,16 @@ FAULT_KINDS: Final = {
     "mocap-clock": FaultKind(
         _mocap_clock, 3.0, victim=False, most=3, stage="motion capture", size=(0.5, 4.5), signed=True
     ),
+    "mocap-frozen": FaultKind(
+        _mocap_frozen, 5.0, heals_s=8.0, victim=False, most=1, stage="motion capture", among="measured"
+    ),
+    "mocap-repeated": FaultKind(
+        _mocap_repeated, 5.0, heals_s=8.0, victim=False, most=1, stage="motion capture", among="measured"
+    ),
+    "mocap-swapped": FaultKind(_mocap_swapped, 5.0, heals_s=8.0, most=1, stage="motion capture", among="measured"),
+    "mocap-renamed": FaultKind(_mocap_renamed, 5.0, heals_s=8.0, most=1, stage="motion capture", among="measured"),
+    "refused-landing": FaultKind(_refused_landing, 12.0, heals_s=8.0, most=1, among="flying", ordered=True),
+    "sleep": FaultKind(_sleep, 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
     "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),
     "disk": FaultKind(_disk, victim=False, most=1),

@@ -7,6 +7,10 @@ writes and the processes of the run map into memory. Stamps of the network libra
     clock, clock-ROLE   how much more the wall clock of all processes, or of those with that role, reads [s]
     lease               lease that a router announces [s]; 0: its own
     read-ROBOT          not 0: reading the body of that robot raises
+    sleep-ROLE          how long the computer of robots slept: their monotonic clock leaves that out, as Linux does [s]
+    refuse-ROBOT        not 0: the body of that robot does not obey orders to land
+    capture             number of the fault of motion capture in `CAPTURE_FAULTS`
+    capture-subject     row of its subject
     cut-ROBOT           when its twin cut the motors, by the machine's monotonic clock [s]; only if the file is there
 """
 
@@ -35,6 +39,7 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.real_time.processes.centre": "centre",
     "tools.reliability.spoilt_run": CONDUCTOR,
     "bridges.vicon.publisher": "positioning",
+    "twins.devices.vicon": "capture",
 }
 ROBOT: Final = "experiments.real_time.processes.robot"
 OTHER: Final = "other"
@@ -81,7 +86,13 @@ def spoil(folder: Path, words: Sequence[str]) -> None:
         os.environ.pop(READING, None)
     if role == "router":
         _announce(Switch(folder / "lease").read())
+    elif role == "world":
+        _refuse_landings(folder)
+    elif role == "capture":
+        _spoil_capture(Switch(folder / "capture"), Switch(folder / "capture-subject"))
     elif ROBOT in words:
+        monotonic, slept = time.monotonic, Switch(folder / f"sleep-{role}")
+        time.monotonic = lambda: monotonic() - slept.read()
         _break_body([Switch(folder / f"read-{name}") for name in role.split("+")])
         if (file := folder / f"cut-{role}").exists():
             _stamp_stops(Switch(file))
@@ -106,6 +117,37 @@ def _break_body(broken: Sequence[Switch]) -> None:
         return read(body, t)
 
     ExternalBody.read = failing  # type: ignore[assignment, method-assign]
+
+
+def _spoil_capture(number: Switch, subject: Switch) -> None:
+    from twins.devices.device import CAPTURE_FAULTS  # not in every process
+    from twins.devices.vicon import ViconTwin
+
+    advance = ViconTwin.advance
+
+    def spoilt(twin: ViconTwin, t: float) -> None:
+        twin.subject, twin.fault = int(subject.read()), CAPTURE_FAULTS[int(number.read())]
+        advance(twin, t)
+
+    ViconTwin.advance = spoilt  # type: ignore[method-assign, assignment]
+
+
+def _refuse_landings(folder: Path) -> None:
+    from agents.network.messages import Command  # not in every process
+    from experiments.real_time.processes.world_network import Exchange
+
+    obey, switches = Exchange._obey, dict[str, Switch]()
+
+    def refusing(exchange: Exchange, row: int, command: Command, t: float) -> None:
+        name = command.robot
+        if name not in switches:
+            switches[name] = Switch(folder / f"refuse-{name}")
+        if command.action == "land" and switches[name].read():
+            exchange._done[name], exchange._quiet[row] = command.seq - 1, t  # it is repeated, and the robot hovers
+        else:
+            obey(exchange, row, command, t)
+
+    Exchange._obey = refusing  # type: ignore[method-assign, assignment]
 
 
 def _stamp_stops(stamp: Switch) -> None:

@@ -43,6 +43,7 @@ from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged
 from tools.progress import Lines
 from tools.reliability import spoilt_process
 from tools.reliability.spoilt_process import CONDUCTOR, Switch, role_of
+from twins.devices.device import CAPTURE_FAULTS, CaptureFault
 
 Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
@@ -114,14 +115,18 @@ class SpoiltRun:
         self.started: float | None = None
         self.answer = messages.RunReply()
         self._keys = Keys(experiment.network.realm)
+        self.flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
+        # by motion capture, on its stage; the exchange of two subjects needs two
+        self.measured = self.flying if len(self.flying) > 1 else list(experiment.robots)
         self._stopped: list[int] = []
+        self._refusing: list[Switch] = []
+        self._asleep: dict[str, float] = {}  # processes of sleeping robots, and since when [monotonic s]
         self._process_of = {name: "+".join(names) for names in experiment.processes.values() for name in names}
         self.switch("lease").write(LEASE_S if stage == "patient router" else 0.0)
         changes = [*setting.changes, f"network.listen={json.dumps(self.routers)}"]
         changes.append(f"network.routers={len(self.routers)}")
         if stage == "motion capture":
-            flying = [name for name, robot in experiment.robots.items() if KINDS[robot.kind].flies]
-            changes += [f'robots.{name}.position="external"' for name in flying or experiment.robots]
+            changes += [f'robots.{name}.position="external"' for name in self.measured]
             changes.append('positioning="vicon-twin"')
         near = {
             role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
@@ -140,6 +145,11 @@ class SpoiltRun:
     def over(self) -> bool:
         """Whether its time is over."""
         return time.monotonic() - (self.started or 0.0) > self.experiment.duration_s - END_S
+
+    def robots(self, which: Literal["all", "measured", "flying"]) -> list[str]:
+        """Robots that can be the victims of a kind of fault."""
+        everyone = list(self.experiment.robots)
+        return {"all": everyone, "measured": self.measured, "flying": self.flying or everyone}[which]
 
     def processes(self) -> dict[int, str]:
         """Processes that run: role by id."""
@@ -176,8 +186,35 @@ class SpoiltRun:
         """Let nothing pass between a robot and its routers."""
         self._signal(self._launcher.get(f"{CABLE}-{self.process_of(robot)}").handle.pid, signal.SIGSTOP)
 
+    def sleep(self, robot: str) -> None:
+        """Let the computer of a robot sleep: its process stands still, and its monotonic clock leaves that out."""
+        self.cut(robot)
+        self.send(robot, signal.SIGSTOP)
+        self._asleep[self.process_of(robot)] = time.monotonic()
+
+    def spoil_capture(self, fault: CaptureFault, subject: str = "") -> None:
+        """Let motion capture tell wrong poses, of a subject, if not of all; `release` ends that."""
+        self.switch("capture-subject").write(self.measured.index(subject) if subject else 0)
+        self.switch("capture").write(CAPTURE_FAULTS.index(fault))
+
+    def refuse_landing(self, robot: str, session: zenoh.Session) -> None:
+        """Order a robot to land, whose body does not obey until `release`."""
+        switch = self.switch(f"refuse-{robot}")
+        switch.write(1.0)
+        self._refusing.append(switch)
+        threading.Thread(
+            target=orders.send_order, args=(session, self._keys, [robot], messages.Order("land")), daemon=True
+        ).start()
+
     def release(self) -> None:
-        """Undo what can be undone: continue stopped processes, cables too, and set the clock of motion capture."""
+        """Undo what can be undone: continue stopped processes, cables too, obey landings, and mend motion capture."""
+        for role, since in self._asleep.items():
+            slept = self.switch(f"sleep-{role}")
+            slept.write(slept.read() + time.monotonic() - since)
+        self._asleep.clear()
+        for switch in (*self._refusing, self.switch("capture")):
+            switch.write(0.0)
+        self._refusing.clear()
         for pid in self._stopped:
             self._signal(pid, signal.SIGCONT)
         self._stopped.clear()

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Literal, Protocol, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -20,6 +20,11 @@ import numpy as np
 from agents.arrays import Array
 from agents.body.interface import BodyRequest
 from agents.ticks import Ticks
+
+# what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, and one
+# under another name
+CaptureFault = Literal["", "frozen", "repeated", "swapped", "renamed"]
+CAPTURE_FAULTS: Final[tuple[CaptureFault, ...]] = get_args(CaptureFault)
 
 
 class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -38,6 +43,9 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tumbled_for_s: float = 1e9  # [s] until it is put upright
     occluded_from_s: float | None = None  # [s] begin of an occlusion of all robots from motion capture
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
+    capture: CaptureFault = ""  # fault of motion capture; of its first subjects, where it has subjects
+    capture_from_s: float = 0.0  # [s] begin of that
+    capture_for_s: float = 1e9  # [s] duration of that
 
     def silent(self, t: float) -> bool:
         """Whether the device is silent at time `t` [s]."""
@@ -50,6 +58,10 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def occluded(self, t: float) -> bool:
         """Whether motion capture sees nothing at time `t` [s]."""
         return _during(t, self.occluded_from_s, self.occluded_for_s)
+
+    def captured(self, t: float) -> CaptureFault:
+        """Fault of motion capture at time `t` [s]; empty if none."""
+        return self.capture if _during(t, self.capture_from_s, self.capture_for_s) else ""
 
 
 def _during(t: float, begin: float | None, duration: float) -> bool:

@@ -29,7 +29,7 @@ from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
-from twins.devices.device import Faults, FaultyLink, serve_until_next
+from twins.devices.device import CaptureFault, Faults, FaultyLink, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
@@ -54,7 +54,13 @@ class _Client:
 
 
 class ViconTwin:
-    """DataStream server for subjects whose poses are set by `place`."""
+    """DataStream server for subjects whose poses are set by `place`.
+
+    Attributes:
+        latency_s: Reported age of the frames [s].
+        fault: Injected fault, beside those of `Faults`.
+        subject: Row of that fault; subjects are exchanged with the next row.
+    """
 
     def __init__(
         self,
@@ -80,12 +86,12 @@ class ViconTwin:
         self._position = np.zeros((len(self._subjects), 3))
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
         self._visible = np.zeros(len(self._subjects), dtype=bool)
-        self.latency_s = 0.0  # reported age of the frames
+        self.latency_s = 0.0
+        self.fault: CaptureFault = ""
+        self.subject = 0
+        self._told: CaptureFault = ""  # in the last frame
+        self._last = b"", b""  # the last frame without a fault: its number, its poses
         self._frames = 0
-        self._names = b"".join(
-            [vicon_datastream.pack_stream_info(rate_hz), vicon_datastream.pack_axes()]
-            + [vicon_datastream.pack_subject(number, name) for number, name in enumerate(self._subjects)]
-        )
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._clients: dict[socket.socket, _Client] = {}
@@ -160,27 +166,52 @@ class ViconTwin:
         del self._clients[connection]
         connection.close()
 
+    def _names(self) -> bytes:
+        """Blocks that describe the subjects."""
+        names = list(self._subjects)
+        if self._told == "renamed":
+            names[self.subject] += "-renamed"
+        return b"".join(
+            [vicon_datastream.pack_stream_info(self._rate), vicon_datastream.pack_axes()]
+            + [vicon_datastream.pack_subject(number, name) for number, name in enumerate(names)]
+        )
+
     def _frame(self, t: float) -> bytes:
         """Blocks of the current frame."""
+        fault = self.fault or self.link.faults.captured(t)
+        if fault != self._told:
+            renamed = "renamed" in (fault, self._told)
+            self._told = fault
+            for client in self._clients.values() if renamed else ():
+                client.named = False
+        head = vicon_datastream.pack_frame_number(self._frames) + vicon_datastream.pack_latency(
+            [("Data Collected", self.latency_s)]
+        )
+        if fault not in ("frozen", "repeated"):
+            self._last = head, self._poses(t, swapped=fault == "swapped")
+        return (self._last[0] if fault == "repeated" else head) + self._last[1]
+
+    def _poses(self, t: float, *, swapped: bool) -> bytes:
         position = self._position
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
+        rows = list(range(len(self._subjects)))
+        if swapped:
+            other = (self.subject + 1) % len(rows)
+            rows[self.subject], rows[other] = other, self.subject
         seen = self._visible & (not self.link.faults.occluded(t))
-        frame = [
-            vicon_datastream.pack_frame_number(self._frames),
-            vicon_datastream.pack_latency([("Data Collected", self.latency_s)]),
-        ]
-        poses = zip(seen.tolist(), position.tolist(), self._rotation.reshape(-1, 9).tolist(), strict=True)
-        for number, (visible, (x, y, z), rotation) in enumerate(poses):
-            segments = [Segment(0, (x, y, z), tuple(rotation))] if visible else []
-            frame.append(vicon_datastream.pack_segments(number, segments))
-        return b"".join(frame)
+        frame = b""
+        for number, row in enumerate(rows):
+            x, y, z = position[row].tolist()
+            turned = tuple(self._rotation[row].reshape(9).tolist())
+            frame += vicon_datastream.pack_segments(number, [Segment(0, (x, y, z), turned)] if seen[row] else [])
+        return frame
 
     def _send(self, frame: bytes) -> None:
         for client in self._clients.values():
             if not (client.streams or client.asked) or len(client.unsent) > BACKLOG:
                 continue
-            client.unsent += vicon_datastream.packet(frame if client.named else self._names + frame)
+            client.unsent += vicon_datastream.packet(frame if client.named else self._names() + frame)
             client.named = True
             client.asked = max(0, client.asked - 1)
 

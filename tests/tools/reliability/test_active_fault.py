@@ -87,3 +87,28 @@ def test_a_body_that_nothing_steers_stops(it):
     it.observer.moved = lambda _, before: 0.3
     it.check_held()
     assert it.violations == ["CF01 moved although no process steered it"]
+
+
+def test_wrong_positions_must_be_noticed_by_living_robots(it):
+    check = it.all_unaware("position")
+    it.run.measured = ["CF01", "KH01"]
+    assert check() == "KH01: not noticed that its position is wrong"
+    it.observer.status["KH01"] = status(incidents=[Incident(1, 0.0, "hold: its own position is lost")])
+    assert check() == ""
+
+
+def test_refused_landing_ends_on_the_floor(it):
+    it.observer.invariants.place("CF01", (0.0, 0.0, 0.5))
+    assert it.landed() == "CF01 does not land"
+    it.observer.status["CF01"] = status("landing")
+    assert it.landed() == "CF01 has not come down yet"
+    it.observer.invariants.place("CF01", (0.0, 0.0, 0.0))
+    assert it.landed() == ""
+
+
+def test_sleeper_must_hear_its_senders(it):
+    it.observer.receivers = {"KH01": {"CF01"}, "KH02": {"KH01"}, "CF01": {"KH01"}}
+    it.observer.received_at, it.lifted = {("CF01", "KH01"): 5.0}, 6.0
+    assert it.deaf_to() == ["KH01"]
+    it.observer.received_at["CF01", "KH01"] = 6.5
+    assert it.deaf_to() == []

@@ -26,7 +26,8 @@ from agents.protocols.vicon_datastream import Framer, Kind, Malformed, Segment
 from bridges.vicon.client import Decoder, Frame, Reader
 from tests.conftest import ROOT, RouterProcess
 from tests.twins.camera import Camera
-from twins.devices.device import Faults
+from tests.waiting import until
+from twins.devices.device import CaptureFault, Faults
 from twins.devices.vicon import ViconTwin, upright
 
 # the vendor's client, in a process of its own: it holds the interpreter, and never returns from a dead server
@@ -371,3 +372,72 @@ def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
         assert ended.returncode == 2
         assert words in ended.stderr
         assert "Traceback" not in ended.stderr
+
+
+# ---------------------------------------------------------------------- wrong frames
+
+
+def told(fault: CaptureFault) -> tuple[list[Frame], list[Frame]]:
+    """Frames of two moving subjects, before and during a fault."""
+    twin = ViconTwin(["CF01", "CF02"], sigma=0.001)
+    decoder, frames = Decoder(), []
+    try:
+        for k in range(1, 7):
+            twin.fault = fault if k > 3 else ""
+            for row in range(2):
+                twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
+            twin._frames = k
+            blocks = twin._frame(0.01 * k)
+            frames.append(decoder.frame(twin._names() + blocks))
+    finally:
+        twin.close()
+    assert all(frame is not None for frame in frames)
+    return frames[:3], frames[3:]
+
+
+def x_of(frame: Frame, subject: str) -> float:
+    pose = frame.poses[subject]
+    assert pose is not None
+    return round(pose.position[0], 1)
+
+
+def test_frozen_capture_counts_its_frames() -> None:
+    before, during = told("frozen")
+    assert [frame.number for frame in during] == [4, 5, 6]
+    assert all(frame.poses == before[-1].poses for frame in during)
+
+
+def test_repeated_capture_is_its_last_frame() -> None:
+    before, during = told("repeated")
+    assert during == [before[-1]] * 3
+
+
+def test_swapped_subjects_have_the_pose_of_the_other() -> None:
+    before, during = told("swapped")
+    for frames, expected in ((before, [0.0, 1.0]), (during, [1.0, 0.0])):
+        for frame in frames:
+            assert [frame.poses[name].position[1] for name in ("CF01", "CF02")] == pytest.approx(expected, abs=0.02)
+    assert [x_of(frame, "CF01") for frame in during] == [0.4, 0.5, 0.6]
+
+
+def test_renamed_subject_is_missing() -> None:
+    before, during = told("renamed")
+    assert {tuple(frame.poses) for frame in before} == {("CF01", "CF02")}
+    assert {tuple(frame.poses) for frame in during} == {("CF01-renamed", "CF02")}
+
+
+def test_faults_of_capture_have_their_time() -> None:
+    faults = Faults(capture="swapped", capture_from_s=2.0, capture_for_s=1.0)
+    assert [faults.captured(t) for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
+
+
+def test_clients_get_the_names_when_one_changes() -> None:
+    with Camera(["CF01"], rate_hz=200.0) as camera:
+        camera.place("CF01", [0.0, 0.0, 0.5])
+        reader = Reader("127.0.0.1", camera.port)
+        try:
+            for fault, name in (("", "CF01"), ("renamed", "CF01-renamed"), ("", "CF01")):
+                camera.twin.fault = fault
+                until(lambda name=name: (frame := reader.newest(2.0)) is not None and name in frame.poses, name)
+        finally:
+            reader.close()
