@@ -123,12 +123,12 @@ class TelloBody:
     def land(self, rows: Index) -> None:
         with self._lock:
             now = time.monotonic()
-            call_all(partial(self._pilots[row].land, now) for row in rows.tolist())
+            call_all(partial(self._pilots[row].land, now) for row in rows.tolist() if self._pilots)
 
     def stop(self, rows: Index) -> None:
         with self._lock:
             now = time.monotonic()
-            call_all(partial(self._pilots[row].cut, now) for row in rows.tolist())
+            call_all(partial(self._pilots[row].cut, now) for row in rows.tolist() if self._pilots)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
         self._external.update(row, t, position, yaw)
@@ -138,10 +138,10 @@ class TelloBody:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-        pilots, self._pilots = self._pilots, []
         try:
-            call_all(pilot.leave for pilot in pilots)
+            call_all(pilot.leave for pilot in self._pilots)  # which can still be stopped
         finally:
+            self._pilots = []
             if self._library is not None:
                 self._library.close()
                 self._library = None

@@ -72,6 +72,7 @@ class TelloPilot:
         self.yaw = 0.0  # external, else its own [rad]
         self.setpoint, self.setpoint_time = (0.0,) * 4, -math.inf  # velocity in the world [m/s], yaw rate [rad/s]
         self.hold_position = (math.nan,) * 3  # [m] goal of the climb, held until setpoints come
+        self._floor = math.nan  # [m] external height at the take-off
         self._state: Mapping[str, Any] = {}
         self._zero_yaw: int | None = None
         self._height, self._motors = 0, -1
@@ -121,7 +122,7 @@ class TelloPilot:
             self.trouble = f"no take-off: battery at {self.battery:.0%}"
         else:
             self.hold_position = (self.position[0], self.position[1], height)
-            self.trouble = ""
+            self._floor, self.trouble = self.position[2], ""
             self._refusals = 0
             self._begin(Duty.RISE, "takeoff", now)
 
@@ -129,6 +130,7 @@ class TelloPilot:
         """Land at the current place; `reason` is for users."""
         if self.duty in (Duty.RISE, Duty.HOLD, Duty.FLY):
             self.trouble = reason or self.trouble
+            self._rest_sticks()
             self._begin(Duty.LAND, "land", now)
 
     def cut(self, now: float) -> None:
@@ -147,10 +149,11 @@ class TelloPilot:
 
     def leave(self) -> None:
         """End the pilot: land or stop a drone in the air, and release the library's object."""
-        last = "emergency" if self.duty is Duty.CUT else "land" if self.flying else ""
         try:
-            for _ in range(LAST_REPEATS if last else 0):
-                self._send(last)
+            if self.duty in (Duty.HOLD, Duty.FLY):
+                self._rest_sticks()
+            for _ in range(LAST_REPEATS if self.flying else 0):
+                self._send("emergency" if self.duty is Duty.CUT else "land")  # it may be stopped meanwhile
                 time.sleep(0.02)
         finally:
             self._drone.end()
@@ -167,11 +170,7 @@ class TelloPilot:
     def _act(self, now: float, last_read: float) -> None:
         """Send due commands."""
         if self.duty is Duty.REST:
-            if self.silent(now) and now - self._sent_at >= SDK_RETRY_S:
-                self._send_and_await("command", now)
-            elif self._rested >= UNORDERED and self._height >= LOW:
-                self.trouble = "landing: it flew without an order"
-                self._begin(Duty.LAND, "land", now)
+            self._watch_rest(now)
         elif now - self.state_received > LANDED_ALONE_S:
             self._rest("silent: must have landed by itself")
         elif self.duty is Duty.CUT:
@@ -185,9 +184,19 @@ class TelloPilot:
             if self._on_ground(now):  # the answer was lost
                 self._rest(self.trouble)
             elif now - self._sent_at >= LAND_RETRY_S:
+                if self._sent_at == -math.inf:  # after a failed step
+                    self._rest_sticks()
                 self._send_and_await("land", now)
         else:
             self._send_sticks(now, last_read)
+
+    def _watch_rest(self, now: float) -> None:
+        """Enter SDK mode; land a drone that flies all the same."""
+        if self.silent(now) and now - self._sent_at >= SDK_RETRY_S:
+            self._send_and_await("command", now)
+        elif self._rested >= UNORDERED and self._height >= LOW:
+            self.trouble = "landing: it flew without an order"
+            self._begin(Duty.LAND, "land", now)
 
     def _motors_stopped(self) -> bool:
         """Whether the counter of motor seconds has been constant long enough, also since the stop.
@@ -215,6 +224,10 @@ class TelloPilot:
             right, forward, up, clockwise = self._sticks(now, last_read)
             if self._clock() - now <= FRESH_S:  # else the process stood still meanwhile
                 self._send(f"rc {right} {forward} {up} {clockwise}")
+
+    def _rest_sticks(self) -> None:
+        """Centre the sticks, which a drone keeps while it does not land."""
+        self._send("rc 0 0 0 0")
 
     def _land_unattended(self, now: float) -> None:
         self.land(now, f"landing: its process did nothing for {UNREAD_S:.0f} s")
@@ -257,6 +270,8 @@ class TelloPilot:
         if state is not self._state and state:  # the library has no time stamps, but a new dict for each state line
             self._state, self.state_received, self._send_error = state, now, ""
             self._store_state(state, now)
+        if self.position[2] - self._floor > 0.01 * LOW:  # whatever the drone measures
+            self._aloft = now
         answers: list[bytes] = self._drone.get_own_udp_object()["responses"]
         while answers:
             self._process_answer(answers.pop(0).decode("ascii", "replace").strip(), now)
@@ -287,8 +302,11 @@ class TelloPilot:
             elif refused:
                 self._rest(f"refuses to take off: {answer!r}, battery at {self.battery:.0%}")
         elif self.duty is Duty.LAND:
-            if answer == "ok" and self._height < LOW and now - self._ordered_up_at > ON_GROUND_S:
+            low = self._height < LOW and self._aloft < now
+            if answer == "ok" and low and now - self._ordered_up_at > ON_GROUND_S:
                 self._rest(self.trouble)
+            elif refused:
+                self._rest_sticks()
         elif self.duty in (Duty.HOLD, Duty.FLY) and refused:
             self._refusals, self._refused_at, self._refusal = self._refusals + 1, now, answer
 

@@ -6,6 +6,7 @@ silent, not when we are. So every end sends zeros on cmd_vel, and every command 
 
 from __future__ import annotations
 
+from collections import deque
 from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
@@ -27,6 +28,7 @@ ANSWER_S: Final = 2.5  # the note reports a robot that is not known to stand so 
 BLOCKED_S: Final = 1.5  # the note reports a robot that does not move for so long despite commands
 STANDING: Final = (0.005, 0.02)  # [m/s, rad/s] slower robots stand
 FASTEST: Final = 0.5  # [m/s] odometry that jumps faster was restarted
+RESETS: Final = (3, 5.0)  # as many within as many seconds are no restarts: two robots send odometry, or it is broken
 DRIFT: Final = 1e-3  # [s/s] largest difference between the robot's clock, which may be slewed, and ours
 ORIGIN: Final = (0.01, 0.02)  # [m, rad] odometry closer to zero is at its origin
 
@@ -80,6 +82,7 @@ class Robot:
         self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame
         self._frame: Planar | None = None  # origin of odometry in the arena
         self._restarted = False
+        self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last, monotonic [s]
         self._odometry_age, self._scan_age = StampAge(), StampAge()
         self._twist = self._sent_twist = (0.0, 0.0)
         self._commanded = self._sent_at = self._still_since = -np.inf
@@ -119,7 +122,9 @@ class Robot:
         for message in self._odometry.received():
             if self._integrate(message, now):
                 self.age = self._odometry_age.age(now, ros2.stamp_of(message.header))
-                self.odometry_received, self.time = now, t - self.age
+                self.odometry_received = now
+                if not self._unsteady(now):
+                    self.time = t - self.age
         if (scan := self._scan.newest()) is not None:
             self.scan = ranges(scan, t - self._scan_age.age(now, ros2.stamp_of(scan.header)))
         if (battery := self._battery.newest()) is not None:
@@ -151,6 +156,7 @@ class Robot:
         if self.odometry_received > -np.inf and self._odometry_reset((x, y, yaw), pose, now):
             # odometry counts from zero again: assume that the robot stands at its last known pose
             self._frame, self._restarted = _frame(self.pose, (x, y, yaw)), True
+            self._resets.append(now)
             pose = self.pose
         self._raw_pose = (x, y, yaw)
         self.pose, self.speed = pose, (v, w)
@@ -162,6 +168,11 @@ class Robot:
         jump = hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
         back = silence > SILENCE_S and _at_origin(counted) and not _at_origin(self._raw_pose)
         return back or jump > FASTEST * silence + 0.1
+
+    def _unsteady(self, now: float) -> bool:
+        """Whether odometry was reset too often to tell a position."""
+        count, span = RESETS
+        return len(self._resets) == count and now - self._resets[0] < span
 
     @property
     def standing(self) -> bool:
@@ -226,17 +237,24 @@ class Robot:
         unanswered = UNANSWERED if now - self._halted_since > ANSWER_S and not self.standing else ""
         return "; ".join(part for part in (unanswered, self._link_fault(now, linked)) if part)
 
-    def _link_fault(self, now: float, linked: bool) -> str:
-        if not linked:
-            return "no router"
+    def _odometry_fault(self, now: float) -> str:
         if now - self.odometry_received > SILENCE_S:
             return (
                 f"odometry silent for {now - self.odometry_received:.0f} s"
                 if self.odometry_received > -np.inf
                 else "no odometry"
             )
+        if self._unsteady(now):
+            return "odometry jumps again and again: do two robots have this namespace?"
         if self.age > SILENCE_S:
             return f"odometry is {self.age:.1f} s old by its stamps: its link holds it back, or its clock was set"
+        return ""
+
+    def _link_fault(self, now: float, linked: bool) -> str:
+        if not linked:
+            return "no router"
+        if fault := self._odometry_fault(now):
+            return fault
         mine = (self._command_type, self._types.hash(self._command_type) if self.address.style == "rmw" else "")
         types = set(self._command_receivers.values())
         if types and mine not in types:

@@ -400,3 +400,13 @@ def test_it_outlives_its_router(body: ExternalBody, far: FarEnd, router: RouterP
     router.start()
     drive.until(lambda: not any(drive.state.notes), "it is back", np.ones((3, 4)))
     drive.until(lambda: len(far.look()) > before, "it is heard again", np.ones((3, 4)))
+
+
+def test_no_take_off_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    body, said = ExternalBody(request("tcp/127.0.0.1:1")), list[str]()
+    monkeypatch.setattr(body, "_put", lambda _, command: said.append(command.action))
+    body.stop(np.array([0]))
+    body.takeoff(np.array([0]), np.array([1.0]))
+    body.land(np.array([0]))
+    body.command(np.full((3, 4), np.nan))
+    assert said == ["stop", "stop"]

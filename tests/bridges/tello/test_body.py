@@ -93,7 +93,7 @@ def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before():
     pilot._sticks = sticks
     assert drone.sticks == []
     pilot.step(cockpit.now, read)
-    assert drone.sticks == []
+    assert drone.sticks == [(0, 0, 0, 0)]
     assert (pilot.duty, drone.said[-1]) == (Duty.LAND, "land")
     rising = Cockpit()
     rising.pass_(0.2)

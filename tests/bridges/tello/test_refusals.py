@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from bridges.tello import pilot
 from bridges.tello.body import TelloBody
 from bridges.tello.library import TelloLibrary
 from bridges.tello.pilot import Duty
@@ -81,6 +82,59 @@ def test_drone_that_flies_unordered_is_landed():
     assert cockpit.drone.said[-1] == "land"
     assert cockpit.pilot.flying
     assert cockpit.pilot.note(cockpit.now) == "landing: it flew without an order"
+
+
+def test_drone_that_does_not_land_rests_its_sticks():
+    """It keeps the last sticks that it was told."""
+    cockpit = Cockpit().fly()
+    cockpit.pilot.duty, cockpit.pilot.setpoint, cockpit.pilot.setpoint_time = (
+        Duty.FLY,
+        (0.5, 0.0, 0.0, 0.0),
+        cockpit.now,
+    )
+    cockpit.pass_(0.1)
+    assert cockpit.drone.sticks[-1] == (0, 50, 0, 0)
+    cockpit.pilot.land(cockpit.now)
+    assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)
+    count = len(cockpit.drone.sticks)
+    cockpit.pass_(1.0)
+    assert len(cockpit.drone.sticks) == count  # a landing that is obeyed is left alone
+    cockpit.drone.responses.append(b"error")
+    cockpit.pass_(0.05)
+    assert len(cockpit.drone.sticks) == count + 1
+
+
+def test_height_of_motion_capture_counts_in_the_air():
+    """A drone without a counter of motor seconds whose own height stays at zero."""
+    cockpit = Cockpit()
+    del cockpit.report["time"]
+    cockpit.pass_(0.2)
+    cockpit.pilot.position = (0.0, 0.0, 0.05)
+    cockpit.pilot.take_off(1.0, cockpit.now)
+    cockpit.pass_(3.0)
+    cockpit.drone.responses.append(b"ok")
+    cockpit.pilot.position = (0.0, 0.0, 1.0)
+    cockpit.pass_(5.0)
+    assert cockpit.pilot.duty is Duty.HOLD
+    cockpit.pilot.land(cockpit.now)
+    cockpit.drone.responses.append(b"ok")
+    cockpit.pass_(0.05)
+    assert cockpit.pilot.duty is Duty.LAND
+    cockpit.pilot.position = (0.0, 0.0, 0.05)
+    cockpit.pass_(3.2)
+    assert cockpit.pilot.duty is Duty.REST
+
+
+def test_stop_counts_while_the_body_closes(monkeypatch):
+    body, cockpit = TelloBody(request("tello", ["tello://10.0.0.2"], external=True)), Cockpit().fly()
+    body._pilots = [cockpit.pilot]
+    cockpit.drone.said.clear()
+    monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop(np.array([0])))
+    body.close()
+    assert cockpit.drone.said[:2] == ["land", "emergency"]
+    assert set(cockpit.drone.said[1:-1]) == {"emergency"}
+    body.stop(np.array([0]))  # nobody is left
+    assert cockpit.drone.said[-1] == "(end)"
 
 
 def test_carried_drone_is_left_alone():

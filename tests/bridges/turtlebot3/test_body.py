@@ -559,6 +559,42 @@ def test_no_router_is_named_in_time(monkeypatch):
         TurtleBot3(request("nonsense", addresses=("ros2dds://tb3_0",))).open()
 
 
+def odometry(x: float, stamp: float) -> SimpleNamespace:
+    still = SimpleNamespace(linear=SimpleNamespace(x=0.0), angular=SimpleNamespace(z=0.0))
+    ahead = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    pose = SimpleNamespace(position=SimpleNamespace(x=x, y=0.0), orientation=ahead)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=int(stamp), nanosec=round(stamp % 1.0 * 1e9)))
+    return SimpleNamespace(
+        header=header, pose=SimpleNamespace(pose=pose), twist=SimpleNamespace(twist=still)
+    )  # fmt: skip
+
+
+def test_two_robots_of_one_namespace_have_no_position() -> None:
+    robot = Robot(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
+    robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST
+    waiting: list[SimpleNamespace] = []
+    nothing = SimpleNamespace(newest=lambda: None)
+    robot._odometry = SimpleNamespace(received=lambda: [waiting.pop()])  # type: ignore[assignment]
+    robot._scan = robot._battery = nothing  # type: ignore[assignment]
+    robot._watch = SimpleNamespace(handler=SimpleNamespace(try_recv=lambda: None))  # type: ignore[assignment]
+
+    def hear(k: int, x: float) -> None:
+        waiting.append(odometry(x, 100.0 + 0.05 * k))
+        robot.receive_messages(0.05 * k, 0.05 * k)
+
+    for k in range(20):
+        hear(k, 3.0 if k == 10 else 0.0)  # there and back: it may have been restarted
+    assert robot.time == pytest.approx(0.95)
+    assert "was restarted" in robot.note(0.95, linked=True)
+    for k in range(20, 40):
+        hear(k, 3.0 * (k % 2))
+    assert robot.time < 1.1
+    assert "do two robots have this namespace?" in robot.note(1.95, linked=True)
+    for k in range(40, 160):
+        hear(k, 0.0)
+    assert robot.time == pytest.approx(7.95)
+
+
 def test_stale_commands_are_followed_by_zeros() -> None:
     """Also when the loop does not run, and when another robot cannot be told."""
     now = [100.0]
