@@ -15,7 +15,7 @@ from typing import Final
 
 from agents.network import session as network
 from tools.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
-from tools.reliability.faults import NOTICE_S, ActiveFault, Check, Fault, next_fault
+from tools.reliability.faults import FAULT_KINDS, NOTICE_S, ActiveFault, Check, Fault, next_fault
 from tools.reliability.observer import Observer
 from tools.reliability.spoilt_run import Setting, SpoiltRun
 
@@ -205,6 +205,8 @@ class ChaosRound:
             absent = [other for other in self._observer.status[name].missing if other in live]
             if absent:
                 return f"{name} misses {', '.join(absent)}"
+        if any(FAULT_KINDS[kind].disbands for kind in self._begun):
+            return ""
         error = self._observer.invariants.formation_error(live, t)
         return f"a link is {error:.3f} off" if error > self._run.experiment.tolerance else ""
 

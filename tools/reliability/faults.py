@@ -371,6 +371,7 @@ class FaultKind:
     signed: bool = False  # the size may be negative as well
     unsteered: bool = False  # nothing steers the victim while it lasts: its body must stop
     among: Literal["all", "measured", "flying"] = "all"  # robots that it can befall
+    disbands: bool = False  # drones land for it: for the rest of the round no formation is asked for
     ordered: bool = False  # its landings are ordered, so they fail no run
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
 
@@ -394,14 +395,20 @@ FAULT_KINDS: Final = {
         _mocap_clock, 3.0, victim=False, most=3, stage="motion capture", size=(0.5, 4.5), signed=True
     ),
     "mocap-frozen": FaultKind(
-        _mocap_frozen, 5.0, heals_s=8.0, victim=False, most=1, stage="motion capture", among="measured"
+        _mocap_frozen, 5.0, heals_s=8.0, victim=False, most=1, disbands=True, stage="motion capture", among="measured"
     ),
     "mocap-repeated": FaultKind(
-        _mocap_repeated, 5.0, heals_s=8.0, victim=False, most=1, stage="motion capture", among="measured"
+        _mocap_repeated, 5.0, heals_s=8.0, victim=False, most=1, disbands=True, stage="motion capture", among="measured"
     ),
-    "mocap-swapped": FaultKind(_mocap_swapped, 5.0, heals_s=8.0, most=1, stage="motion capture", among="measured"),
-    "mocap-renamed": FaultKind(_mocap_renamed, 5.0, heals_s=8.0, most=1, stage="motion capture", among="measured"),
-    "refused-landing": FaultKind(_refused_landing, 12.0, heals_s=8.0, most=1, among="flying", ordered=True),
+    "mocap-swapped": FaultKind(
+        _mocap_swapped, 5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
+    ),
+    "mocap-renamed": FaultKind(
+        _mocap_renamed, 5.0, heals_s=8.0, most=1, disbands=True, stage="motion capture", among="measured"
+    ),
+    "refused-landing": FaultKind(
+        _refused_landing, 12.0, heals_s=8.0, most=1, disbands=True, among="flying", ordered=True
+    ),
     "sleep": FaultKind(_sleep, 8.0, heals_s=6.0, most=2, unsteered=True),
     "double": FaultKind(_double, heals_s=6.0),
     "read-error": FaultKind(_read_error, heals_s=12.0, most=1, recorded="lost"),
@@ -431,7 +438,8 @@ def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int],
 
     Args:
         begun: Faults of the round by kind.
-        left_s: Rest of the round's time [s]. The death of the launcher, which ends the round, waits for the last of it.
+        left_s: Rest of the round's time [s]. The death of the launcher, which ends the round, waits for the last of it;
+            faults for which drones land come behind the others.
     """
     fits = []
     for fault in waiting:
@@ -439,7 +447,11 @@ def next_fault(waiting: Sequence[Fault], stage: Stage, begun: Mapping[str, int],
         there = kind.stage in ("plain", stage) and kind.never != stage
         if there and begun.get(fault.kind, 0) < kind.most and kind.lasts_s + max(LATEST_S, kind.heals_s) < left_s:
             fits.append(fault)
-    return min(fits, key=lambda fault: (fault.kind == "conductor") == (left_s > LAST_S), default=None)
+
+    def urgency(fault: Fault) -> tuple[bool, bool]:
+        return (fault.kind == "conductor") == (left_s > LAST_S), fault.properties.disbands
+
+    return min(fits, key=urgency, default=None)
 
 
 def _fault(kind: str, after_s: float, robots: Sequence[str], random: np.random.Generator) -> Fault:

@@ -64,6 +64,12 @@ def test_no_fault_begins_that_could_not_heal():
     assert next_fault(waiting, "plain", {}, 60.0).kind != "conductor"
 
 
+def test_faults_that_disband_come_last():
+    waiting = script(ROBOTS, 6, 1, ["refused-landing", "sleep"])
+    kinds = [fault.kind for fault in flown(waiting)]
+    assert kinds == ["sleep", "sleep", "refused-landing"]
+
+
 def test_only_the_kinds_that_were_asked_for():
     drawn = script(ROBOTS, 30, 1, ["kill", "conductor"])
     assert {fault.kind for fault in drawn} == {"kill", "conductor"}
