@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from typing import Final
 
 import numpy as np
@@ -45,8 +44,8 @@ class KheperaBody:
         ):
             self._links.append(Khepera4Link(name, address, device, (x, y, yaw)))
             self._links[-1].start()
-        deadline, pause = time.monotonic() + OPEN_S, threading.Event()
-        while time.monotonic() < deadline and any(
+        deadline, pause = uptime() + OPEN_S, threading.Event()
+        while uptime() < deadline and any(
             link.odometry.stamp == -math.inf and not link.refused for link in self._links
         ):
             pause.wait(0.01)
@@ -56,7 +55,7 @@ class KheperaBody:
             raise BodyError("no Khepera answers: " + "; ".join(reasons))
 
     def read(self, t: float) -> BodyState:
-        now, self._read_at = time.monotonic(), uptime()
+        now, self._read_at = uptime(), uptime()
         odometry = [link.odometry for link in self._links]
         rows = len(odometry)
         # unknown before the first odometry: the pose is counted by the robot, not read from the file
@@ -93,7 +92,7 @@ class KheperaBody:
         """See `Body.takeoff`: no effect on a ground robot."""
 
     def land(self, rows: Index) -> None:
-        now = time.monotonic()
+        now = uptime()
         for row in rows.tolist() if self._links else ():
             self._links[row].halt(now)
 
@@ -108,7 +107,7 @@ class KheperaBody:
         return Inspection(firmware=f"server {server}" if server else None)
 
     def close(self) -> None:
-        now = time.monotonic()
+        now = uptime()
         for link in self._links:
             link.halt(now)
             link.end()

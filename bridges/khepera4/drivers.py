@@ -52,8 +52,8 @@ class Wire:
         return data
 
     def receive(self, until: float) -> bytes:
-        """Next bytes; raises TimeoutError after `until` [s, monotonic], ConnectionError if the other end has closed."""
-        if not self._poll.poll(max(0.0, 1e3 * (until - time.monotonic()))):
+        """Next bytes; raises TimeoutError after `until` [s, `uptime`], ConnectionError if the other end has closed."""
+        if not self._poll.poll(max(0.0, 1e3 * (until - uptime()))):
             raise TimeoutError
         return self._read()
 
@@ -151,16 +151,16 @@ class Park:
 
     def _send(self, command: bytes, instead: bytes = b"", until: float = NEVER) -> float:
         """Send a command in a segment of its own, or `instead` if it is past `until`; returns when [s]."""
-        time.sleep(max(0.0, self._free - time.monotonic()))  # of two commands in one segment the second is lost
+        time.sleep(max(0.0, self._free - uptime()))  # of two commands in one segment the second is lost
         self._wire.send(command if uptime() <= until else instead)
-        now = time.monotonic()
+        now = uptime()
         self._free = now + protocol.GAP_S
         self._sent = self._sent[1], now
         return now
 
     def _receive(self, asked: str) -> bytes:
         try:
-            return self._wire.receive(time.monotonic() + self.patience_s)
+            return self._wire.receive(uptime() + self.patience_s)
         except TimeoutError as error:
             raise TimeoutError(f"no answer to {asked}") from error
 
@@ -173,13 +173,13 @@ class Park:
     def _add(self, reports: list[list[float]], odometer: Odometer) -> None:
         """Add increments, each of which is reported once."""
         for way, turn in reports if self.server.answer == "increments" else ():
-            odometer.steps(way, self._angle * turn, time.monotonic())
+            odometer.steps(way, self._angle * turn, uptime())
 
     def _add_last(self, report: list[float], odometer: Odometer, sent: tuple[float, float], _asked: float) -> None:
         """Add the newest report of any other kind; two commands were `sent` before its request [s]."""
         if self.server.answer == "pose":
             x, y, theta = report
-            odometer.pose(x, y, self._angle * theta, time.monotonic())
+            odometer.pose(x, y, self._angle * theta, uptime())
         else:
             self._add_turn(report, odometer, sent)
 
@@ -196,7 +196,7 @@ class Park:
             self._speed = way / (end - begin), 0.0
         way = self._speed[0] * since if since > 0.0 else 0.0
         self._counted = end
-        odometer.heading(way, self._angle * theta, time.monotonic())
+        odometer.heading(way, self._angle * theta, uptime())
         return way
 
 
@@ -235,7 +235,7 @@ class GoalPark(Park):
             self._send(b"i 0.0 0.0 1.570796")
             goal, stay = protocol.park_goal_2023_04(v, turn), (0.0, 0.0)
         else:
-            now = time.monotonic()
+            now = uptime()
             if not (v or turn) or now - self._placed > PLACED_S:
                 self._send(b"i 0.0 0.0")
                 self._way, self._placed = np.zeros(2), now
@@ -264,7 +264,7 @@ class GoalPark(Park):
             self._speed = way / reported, turn / reported
         self._counted = end
         if since > 0.0:
-            odometer.steps(self._speed[0] * since, self._speed[1] * since, time.monotonic())
+            odometer.steps(self._speed[0] * since, self._speed[1] * since, uptime())
 
 
 def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> Park:
@@ -279,7 +279,7 @@ def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) 
     time.sleep(protocol.GAP_S)
     wire.send(b"p")
     try:
-        answer = wire.receive(time.monotonic() + max(FIRST_ANSWER_S, chosen.silence_s))
+        answer = wire.receive(uptime() + max(FIRST_ANSWER_S, chosen.silence_s))
     except TimeoutError as error:
         raise TimeoutError(
             "no answer to p; a server of 2023 serves one client in its life: start it anew on the robot, for each case"
@@ -325,7 +325,7 @@ class KTeam:
 
     def move(self, odometer: Odometer) -> None:
         left, right = self._request("R", 2)[:2]
-        odometer.wheels(left, right, time.monotonic())
+        odometer.wheels(left, right, uptime())
 
     def ranges(self) -> tuple[Array, Array]:
         sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
@@ -342,7 +342,7 @@ class KTeam:
         """Send a request; returns the numbers of the answer, at least `count`."""
         self._wire.pending()  # cannot be the answer
         self._wire.send(f"{request}\r".encode())
-        until = time.monotonic() + self.patience_s
+        until = uptime() + self.patience_s
         answer = b""
         while not answer.endswith(b"\n"):
             try:

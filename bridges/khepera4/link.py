@@ -120,7 +120,7 @@ class Address:
 class Odometry:
     """Newest odometry of a robot, in the experiment's frame."""
 
-    stamp: float = -math.inf  # time of reception, monotonic [s]
+    stamp: float = -math.inf  # time of reception [s, `uptime`]
     x: float = math.nan  # [m]
     y: float = math.nan  # [m]
     yaw: float = math.nan  # [rad]
@@ -134,10 +134,10 @@ class Khepera4Link:
         self, name: str, address: Address, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
     ) -> None:
         self.odometry = Odometry()
-        self.scan: tuple[float, Array, Array] | None = None  # monotonic time [s], bearings [rad], distances [m]
+        self.scan: tuple[float, Array, Array] | None = None  # time [s, `uptime`], bearings [rad], distances [m]
         self.battery = math.nan  # charge, 0 to 1
         self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `uptime`] of what it was decided on
-        self.halted_since = math.inf  # monotonic [s]; infinity while the robot may move
+        self.halted_since = math.inf  # [s, `uptime`]; infinity while the robot may move
         self.refused = False  # the server must not be driven; it is not tried again
         self.server = ""  # that runs on the robot, by its answers; empty while not known
         self.trouble = f"{address}: not connected yet"  # for users; empty while connected
@@ -171,7 +171,7 @@ class Khepera4Link:
 
     def end(self) -> None:
         """Ask the thread to stop the wheels and end; `join` waits for it."""
-        self._stop_deadline = time.monotonic() + STOP_TRIES_S
+        self._stop_deadline = uptime() + STOP_TRIES_S
         self._ending.set()
 
     def join(self) -> None:
@@ -217,7 +217,7 @@ class Khepera4Link:
     @property
     def _finished(self) -> bool:
         """Whether the thread may end: asked to, and the wheels stand or the time for that is over."""
-        return self._ending.is_set() and (self._stands or time.monotonic() > self._stop_deadline)
+        return self._ending.is_set() and (self._stands or uptime() > self._stop_deadline)
 
     def _remedy(self, error: Exception) -> str:
         if isinstance(error, BlockingIOError):
@@ -233,7 +233,7 @@ class Khepera4Link:
         driver.begin()
         driver.move(self._odometer)  # before any motion: counters at zero show that the robot was switched on anew
         self._stands = True
-        ticks = Ticks(self._settings.poll_hz)
+        ticks = Ticks(self._settings.poll_hz, clock=uptime)
         ranges_due = battery_due = answered = ticks.zero
         silent = False
         while not self._ending.wait(ticks.until_next()):
@@ -248,12 +248,12 @@ class Khepera4Link:
                 # stops wait in the connection until the robot hears again; the next exchange after that stops it
                 self.trouble = f"{self._address}: {error}; it is told to stop until it answers"
                 silent, driver.patience_s = True, AGAIN_S
-                if time.monotonic() - answered > KEEP_S:
+                if uptime() - answered > KEEP_S:
                     raise
                 continue
             silent, driver.patience_s = False, self._settings.silence_s
             self._stands = not moves
-            now, at = time.monotonic(), self._odometer
+            now, at = uptime(), self._odometer
             answered = now
             self.odometry = Odometry(now, at.x, at.y, at.yaw, at.velocity)
             self.trouble = ""
@@ -277,7 +277,7 @@ class Khepera4Link:
                     driver.drive(0.0, 0.0)
                 driver.move(self._odometer)
             except TimeoutError:
-                if time.monotonic() > self._stop_deadline:
+                if uptime() > self._stop_deadline:
                     raise
                 continue
             self._stands = True

@@ -6,9 +6,9 @@ Of the library only parser and non-blocking sends are used, for the reasons in `
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
-import time
 from functools import partial
 from typing import Final
 
@@ -18,6 +18,7 @@ from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import FRESH_S, BodyError, BodyRequest, BodyState, call_all, settings
+from agents.clock import uptime
 from agents.protocols import tello as protocol
 from bridges.tello.library import TelloLibrary
 from bridges.tello.pilot import Duty, TelloPilot
@@ -66,11 +67,11 @@ class TelloBody:
         self._ending.clear()
         self._thread = threading.Thread(target=self._run, args=(library,), name="tello pilots", daemon=True)
         self._thread.start()
-        deadline = time.monotonic() + OPEN_S
-        while time.monotonic() < deadline and any(pilot.state_received == -math.inf for pilot in self._pilots):
+        deadline = uptime() + OPEN_S
+        while uptime() < deadline and any(pilot.state_received == -math.inf for pilot in self._pilots):
             self._ending.wait(0.02)
         if all(pilot.state_received == -math.inf for pilot in self._pilots):
-            now = time.monotonic()
+            now = uptime()
             reasons = [
                 f"{name} at {host}:{port}: {pilot.note(now)}"
                 for name, (host, port), pilot in zip(self._names, self._endpoints, self._pilots, strict=True)
@@ -83,7 +84,7 @@ class TelloBody:
         rows = len(self._names)
         nowhere = np.full((rows, 3), np.nan)
         with self._lock:
-            now = self._last_read = time.monotonic()
+            now = self._last_read = uptime()
             yaw = self._start_yaw + [pilot.turned for pilot in self._pilots]
             received = np.array([pilot.state_received for pilot in self._pilots]) - now + t
             silent = np.array([pilot.silent(now) for pilot in self._pilots])
@@ -110,7 +111,7 @@ class TelloBody:
 
     def command(self, setpoint: Array) -> None:
         with self._lock:
-            now = time.monotonic()
+            now = uptime()
             for pilot, (x, y, z, turn) in zip(self._pilots, setpoint.tolist(), strict=True):
                 if math.isfinite(x + y + z + turn) and pilot.duty in (Duty.HOLD, Duty.FLY):
                     pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (x, y, z, turn), now
@@ -118,16 +119,16 @@ class TelloBody:
     def takeoff(self, rows: Index, height: Array) -> None:
         with self._lock:
             for row, to in zip(rows.tolist(), height.tolist(), strict=True):
-                self._pilots[row].take_off(to, time.monotonic())
+                self._pilots[row].take_off(to, uptime())
 
     def land(self, rows: Index) -> None:
         with self._lock:
-            now = time.monotonic()
+            now = uptime()
             call_all(partial(self._pilots[row].land, now) for row in rows.tolist() if self._pilots)
 
     def stop(self, rows: Index) -> None:
         with self._lock:
-            now = time.monotonic()
+            now = uptime()
             call_all(partial(self._pilots[row].cut, now) for row in rows.tolist() if self._pilots)
 
     def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
@@ -151,8 +152,9 @@ class TelloBody:
         period = 1.0 / max(chosen.rc_hz for chosen in self._settings)
         while not self._ending.wait(period):  # not by `Ticks`: a stop needs the lock, and gets it in this pause
             with self._lock:
-                library.receive()
-                now = time.monotonic()
+                with contextlib.suppress(Exception):  # no datagram may end the thread
+                    library.receive()
+                now = uptime()
                 for pilot in self._pilots:
                     try:
                         pilot.step(now, self._last_read)

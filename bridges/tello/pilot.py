@@ -15,6 +15,7 @@ from typing import Any, Final, Protocol
 
 from agents.body.interface import FRESH_S, UNANSWERED
 from agents.body.kinds import Kind
+from agents.clock import uptime
 from agents.protocols import tello as protocol
 
 SDK_RETRY_S: Final = 0.5  # between two attempts to enter SDK mode
@@ -57,10 +58,10 @@ class Duty(Enum):
 
 
 class TelloPilot:
-    """One drone: duty, commands sent, state received. Times are monotonic [s]."""
+    """One drone: duty, commands sent, state received. Times are those of `uptime` [s]."""
 
     def __init__(
-        self, drone: Vendor, kind: Kind, chosen: protocol.TelloSettings, clock: Callable[[], float] = time.monotonic
+        self, drone: Vendor, kind: Kind, chosen: protocol.TelloSettings, clock: Callable[[], float] = uptime
     ) -> None:
         self._drone, self._kind, self._settings, self._clock = drone, kind, chosen, clock
         self.duty = Duty.REST

@@ -1,6 +1,7 @@
 """Tellos that do not do what they are told, and datagrams that are none of theirs."""
 
 import socket
+import time
 from importlib.util import find_spec
 
 import numpy as np
@@ -190,6 +191,22 @@ def test_failing_pilot_lands_and_others_fly(kind):
     assert len(good.drone.sticks) == 3
     assert set(broken.drone.said) == {"land"}
     assert broken.pilot.trouble == f"cannot be driven: {kind.__name__}: {kind('broken')}"
+
+
+def test_sleep_of_the_machine_ends_its_flight(monkeypatch):
+    """The machine's monotonic clock stands still meanwhile; its uptime goes on."""
+    body, cockpit = TelloBody(request("tello", ["tello://10.0.0.2"], external=True)), Cockpit().fly()
+    pilot = cockpit.pilot
+    pilot.state_received = pilot._aloft = np.inf
+    body._pilots, body._ending = [pilot], Rounds(1)
+    body.read(0.0)
+    body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
+    cockpit.drone.sticks.clear()
+    gettime = time.clock_gettime
+    monkeypatch.setattr(time, "clock_gettime", lambda which: gettime(which) + 3.0)
+    body._run(Post())
+    assert pilot.duty is Duty.LAND
+    assert cockpit.drone.sticks == [(0, 0, 0, 0)]
 
 
 @pytest.mark.skipif(find_spec("djitellopy") is None, reason="needs djitellopy")
