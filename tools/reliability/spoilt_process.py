@@ -120,16 +120,12 @@ def _break_body(broken: Sequence[Switch]) -> None:
 
 
 def _spoil_capture(number: Switch, subject: Switch) -> None:
-    from twins.devices.device import CAPTURE_FAULTS  # not in every process
-    from twins.devices.vicon import ViconTwin
+    from twins.devices.device import CAPTURE_FAULTS, CaptureFault, Faults  # not in every process
 
-    advance = ViconTwin.advance
+    def captured(_faults: Faults, _t: float) -> tuple[CaptureFault, int]:
+        return CAPTURE_FAULTS[int(number.read())], int(subject.read())
 
-    def spoilt(twin: ViconTwin, t: float) -> None:
-        twin.subject, twin.fault = int(subject.read()), CAPTURE_FAULTS[int(number.read())]
-        advance(twin, t)
-
-    ViconTwin.advance = spoilt  # type: ignore[method-assign, assignment]
+    Faults.captured = captured  # type: ignore[method-assign, assignment]
 
 
 def _refuse_landings(folder: Path) -> None:

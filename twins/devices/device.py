@@ -43,7 +43,8 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tumbled_for_s: float = 1e9  # [s] until it is put upright
     occluded_from_s: float | None = None  # [s] begin of an occlusion of all robots from motion capture
     occluded_for_s: float = 1e9  # [s] duration of the occlusion
-    capture: CaptureFault = ""  # fault of motion capture; of its first subjects, where it has subjects
+    capture: CaptureFault = ""  # fault of motion capture
+    capture_subject: int = 0  # number of its subject, which is exchanged with the next
     capture_from_s: float = 0.0  # [s] begin of that
     capture_for_s: float = 1e9  # [s] duration of that
 
@@ -59,9 +60,9 @@ class Faults(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Whether motion capture sees nothing at time `t` [s]."""
         return _during(t, self.occluded_from_s, self.occluded_for_s)
 
-    def captured(self, t: float) -> CaptureFault:
-        """Fault of motion capture at time `t` [s]; empty if none."""
-        return self.capture if _during(t, self.capture_from_s, self.capture_for_s) else ""
+    def captured(self, t: float) -> tuple[CaptureFault, int]:
+        """Fault of motion capture at time `t` [s], empty if none, and the number of its subject."""
+        return self.capture if _during(t, self.capture_from_s, self.capture_for_s) else "", self.capture_subject
 
 
 def _during(t: float, begin: float | None, duration: float) -> bool:

@@ -57,9 +57,8 @@ class ViconTwin:
     """DataStream server for subjects whose poses are set by `place`.
 
     Attributes:
+        link: Its faults, and what waits to be sent.
         latency_s: Reported age of the frames [s].
-        fault: Injected fault, beside those of `Faults`.
-        subject: Row of that fault; subjects are exchanged with the next row.
     """
 
     def __init__(
@@ -87,9 +86,7 @@ class ViconTwin:
         self._rotation = np.repeat(np.eye(3)[None], len(self._subjects), axis=0)
         self._visible = np.zeros(len(self._subjects), dtype=bool)
         self.latency_s = 0.0
-        self.fault: CaptureFault = ""
-        self.subject = 0
-        self._told: CaptureFault = ""  # in the last frame
+        self._told: tuple[CaptureFault, int] = "", 0  # fault of the last frame, and its subject
         self._last = b"", b""  # the last frame without a fault: its number, its poses
         self._frames = 0
         self._listener = socket.create_server((host, port))
@@ -169,8 +166,9 @@ class ViconTwin:
     def _names(self) -> bytes:
         """Blocks that describe the subjects."""
         names = list(self._subjects)
-        if self._told == "renamed":
-            names[self.subject] += "-renamed"
+        fault, subject = self._told
+        if fault == "renamed":
+            names[subject % len(names)] += "-renamed"
         return b"".join(
             [vicon_datastream.pack_stream_info(self._rate), vicon_datastream.pack_axes()]
             + [vicon_datastream.pack_subject(number, name) for number, name in enumerate(names)]
@@ -178,27 +176,26 @@ class ViconTwin:
 
     def _frame(self, t: float) -> bytes:
         """Blocks of the current frame."""
-        fault = self.fault or self.link.faults.captured(t)
-        if fault != self._told:
-            renamed = "renamed" in (fault, self._told)
-            self._told = fault
-            for client in self._clients.values() if renamed else ():
+        before, self._told = self._told, self.link.faults.captured(t)
+        fault, subject = self._told
+        if before != self._told and "renamed" in (before[0], fault):
+            for client in self._clients.values():
                 client.named = False
         head = vicon_datastream.pack_frame_number(self._frames) + vicon_datastream.pack_latency(
             [("Data Collected", self.latency_s)]
         )
         if fault not in ("frozen", "repeated"):
-            self._last = head, self._poses(t, swapped=fault == "swapped")
+            self._last = head, self._poses(t, [subject, subject + 1] if fault == "swapped" else [])
         return (self._last[0] if fault == "repeated" else head) + self._last[1]
 
-    def _poses(self, t: float, *, swapped: bool) -> bytes:
+    def _poses(self, t: float, swapped: Sequence[int]) -> bytes:
+        """Blocks of the poses of all subjects, of which two may be swapped."""
         position = self._position
         if self._sigma > 0.0:
             position = position + self._rng.normal(0.0, self._sigma, position.shape)
         rows = list(range(len(self._subjects)))
-        if swapped:
-            other = (self.subject + 1) % len(rows)
-            rows[self.subject], rows[other] = other, self.subject
+        for one, other in zip(swapped, reversed(swapped), strict=True):
+            rows[one % len(rows)] = other % len(rows)
         seen = self._visible & (not self.link.faults.occluded(t))
         frame = b""
         for number, row in enumerate(rows):

@@ -383,7 +383,7 @@ def told(fault: CaptureFault) -> tuple[list[Frame], list[Frame]]:
     decoder, frames = Decoder(), []
     try:
         for k in range(1, 7):
-            twin.fault = fault if k > 3 else ""
+            twin.link.faults = Faults(capture=fault if k > 3 else "")
             for row in range(2):
                 twin.place(row, np.array([0.1 * k, float(row), 0.5]), upright(0.0))
             twin._frames = k
@@ -428,7 +428,7 @@ def test_renamed_subject_is_missing() -> None:
 
 def test_faults_of_capture_have_their_time() -> None:
     faults = Faults(capture="swapped", capture_from_s=2.0, capture_for_s=1.0)
-    assert [faults.captured(t) for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
+    assert [faults.captured(t)[0] for t in (1.9, 2.0, 2.9, 3.0)] == ["", "swapped", "swapped", ""]
 
 
 def test_clients_get_the_names_when_one_changes() -> None:
@@ -437,7 +437,7 @@ def test_clients_get_the_names_when_one_changes() -> None:
         reader = Reader("127.0.0.1", camera.port)
         try:
             for fault, name in (("", "CF01"), ("renamed", "CF01-renamed"), ("", "CF01")):
-                camera.twin.fault = fault
+                camera.twin.link.faults = Faults(capture=fault)
                 until(lambda name=name: (frame := reader.newest(2.0)) is not None and name in frame.poses, name)
         finally:
             reader.close()
