@@ -131,6 +131,8 @@ class Trends:
         note = status.hazard or status.reason or ("misses " + ", ".join(status.missing) if status.missing else "")
         if status.malformed:
             note += f" {status.malformed} malformed"
+        if foreign := sum(status.foreign.values()):
+            note += f" {foreign} foreign"
         return Row(
             name, phase, rank, error, trend.rate, status.missed, sum(status.lost.values()), trend.cpu, status.battery,
             status.sent, note.strip(), growing, status.pid,

@@ -78,6 +78,8 @@ class NeighbourStates:
         # (E,) age of poses on arrival [s] where the sender's clock lags, else 0; None: nowhere
         self.clock_lag: Array | None = None
         self.refused: dict[int, str] = {}  # links of which all poses are refused, and why
+        self.foreign: dict[int, int] = {}  # number of poses from another source than the sender, by link
+        self.foreign_at = -np.inf  # time of the last of them [s]
         self._all, self._avoidance_only, self._silence_s = links, avoidance_only, silence_s
         self._present: Mask = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._in_law = self._available = np.zeros(len(links), dtype=bool)
@@ -110,6 +112,11 @@ class NeighbourStates:
         """All poses on links `at` are refused for a `reason`; empty: they are not, or no longer."""
         refused = {link: why for link, why in self.refused.items() if link not in at}
         self.refused = refused | (dict.fromkeys(at, reason) if reason else {})
+
+    def mark_foreign(self, at: Collection[int], count: int, t: float) -> None:
+        """Poses on links `at` came from another source than the sender until `t` [s], `count` so far."""
+        self.foreign.update(dict.fromkeys(at, count))
+        self.foreign_at = t
 
     @property
     def stamp_once_alive(self) -> Array:

@@ -298,16 +298,18 @@ class PoseInbox(ModelledInbox):
         # (n) newest received poses of each row, for telemetry, which empties them
         self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
         self.received = [0] * len(agent.assignment.names)  # (n) received poses of each row
-        self._marks = [(0.0, "")] * len(self.senders)
+        self._marks = [(0.0, "", 0)] * len(self.senders)
 
     def deliver(self, t: float, utc: float) -> None:
         """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the agent and to telemetry."""
         got = self.receive(t, utc, self._start, self._assignment.names)
-        if (marks := [(sender.behind, sender.doubt) for sender in self.senders]) != self._marks:
-            self._marks = marks
-            for sender in self.senders:
+        if (marks := [(sender.behind, sender.doubt, sender.foreign) for sender in self.senders]) != self._marks:
+            for sender, (_, _, foreign) in zip(self.senders, self._marks, strict=True):
                 self._neighbours.mark_clock_lag(sender.links, sender.behind)
                 self._neighbours.mark_refused(sender.numbers, sender.doubt)
+                if sender.foreign > foreign:
+                    self._neighbours.mark_foreign(sender.numbers, sender.foreign, t)
+            self._marks = marks
         if got is None:
             return
         assert got.extra is not None  # the recorded pose keeps its own stamp

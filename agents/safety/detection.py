@@ -59,6 +59,7 @@ CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
 SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
+FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
@@ -159,6 +160,8 @@ class Detector:
             found.append(self._lagging(neighbours, neighbours.clock_lag))
         if neighbours.refused:
             found.append(self._refused_poses(neighbours.refused))
+        if now.t - neighbours.foreign_at < FOREIGN_S:
+            found.append(self._foreign_poses(neighbours.foreign))
         if health.just_resumed(now.t):
             found.append(self._not_refreshed(now, rows))
         if health.troubled:
@@ -288,15 +291,23 @@ class Detector:
         yield Observation(Cause.BEHIND, self._receivers(late), names)
 
     def _refused_poses(self, refused: Mapping[int, str]) -> Iterator[Observation]:
+        yield self._of_senders(Cause.REFUSED, {link: f"{{}}: {reason}" for link, reason in refused.items()})
+
+    def _foreign_poses(self, foreign: Mapping[int, int]) -> Iterator[Observation]:
+        text = "{} poses of {{}} came from another source, and were not used"
+        yield self._of_senders(Cause.FOREIGN, {link: text.format(count) for link, count in foreign.items()})
+
+    def _of_senders(self, cause: Cause, texts: Mapping[int, str]) -> Observation:
+        """A cause in the senders on some links, each with its text, in which the name is left open."""
         links, robots = self._assignment.links, self._assignment.robots
         there = np.zeros(len(links), dtype=bool)
-        there[list(refused)] = True
+        there[list(texts)] = True
 
-        def reasons(row: int) -> str:
-            mine = np.flatnonzero(there & (links.receiver == row)).tolist()
-            return ", ".join(f"{robots[links.sender[link]]}: {refused[link]}" for link in mine)
+        def detail(row: int) -> str:
+            of_row = np.flatnonzero(there & (links.receiver == row)).tolist()
+            return ", ".join(texts[link].replace("{}", robots[links.sender[link]]) for link in of_row)
 
-        yield Observation(Cause.REFUSED, self._receivers(there), reasons)
+        return Observation(cause, self._receivers(there), detail)
 
     def _surroundings(self, t: float, health: ProcessHealth) -> Iterator[Observation]:
         """Router, conductor and control loop."""

@@ -90,6 +90,7 @@ class Cause(IntEnum):
     SINKING = Rule("it comes down by itself", Outcome.LAND, after_s=0.1)
     CLOCK = Rule("the clock that stamps its positions is off", Outcome.WARN, after_s=0.5)  # not one late sample
     BEHIND = Rule("a neighbour's clock is behind", Outcome.WARN)
+    FOREIGN = Rule("a tool sends poses of a neighbour", Outcome.WARN, after_s=1.0)  # not late ones of a former process
     REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
     STANDSTILL = Rule("its process stood still", Outcome.HOLD)
     # in the air a position that does not follow is a wrong one, by which the robot would fly away

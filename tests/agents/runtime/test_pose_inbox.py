@@ -14,6 +14,7 @@ from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
 from agents.plugins.predictors import ConstantVelocity
 from agents.runtime.pose_inbox import LATE_S, PoseInbox
+from agents.safety.detection import FOREIGN_S
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
 from tests.fuzz.loopnet import Net, Payload
@@ -321,11 +322,13 @@ def test_neighbour_whose_poses_are_all_refused_is_lost(robot, sends):
         robot.pose(seq, 0.4, session="other", age=-8.0)  # which says nothing about B
         robot.after()
     assert (robot.agent.missing_neighbours(0) == ["B"]) == sends
-    assert [text.split(": ")[:2] for text in hazards(robot)] == ([["REFUSED", "B"]] if sends else [])
+    assert [text.split(": ")[:2] for text in hazards(robot)] == ([["REFUSED", "B"]] if sends else []) + [
+        ["FOREIGN", "70 poses of B came from another source, and were not used"]
+    ]
     assert robot.neighbours.malformed == 70 * sends
     robot.pose(90, 0.4, session="one")
     robot.after()
-    robot.after()
+    robot.after(1.0)
     assert robot.live
     assert robot.agent.missing_neighbours(0) == []
     assert hazards(robot) == []
@@ -336,6 +339,8 @@ def hazards(robot: Robot) -> list[str]:
     lag, refused = agent.neighbours.clock_lag, agent.neighbours.refused
     seen = [] if lag is None else list(agent._detector._lagging(agent.neighbours, lag))
     seen += list(agent._detector._refused_poses(refused)) if refused else []
+    if robot.t - agent.neighbours.foreign_at < FOREIGN_S:
+        seen += agent._detector._foreign_poses(agent.neighbours.foreign)
     return [f"{each.cause.name}: {each.detail(0)}" for each in seen if each.rows[0]]
 
 
@@ -447,3 +452,15 @@ def test_a_pose_that_is_stamped_ahead_was_measured_when_it_arrived(robot, ahead)
     assert believed(robot) == pytest.approx(0.6, abs=1e-5), "two seconds old, not younger"
     (news,) = robot.neighbours.news[0]
     assert news.stamp == pytest.approx(UTC + 7.0 + ahead), "recorded as it was stamped"
+
+
+def test_replay_on_the_key_is_a_hazard_with_its_number(robot):
+    robot.token("one")
+    robot.pose(1, 0.4, session="one")
+    robot.after()
+    robot.pose(9000, 3.0, session=None, age=100.0)
+    robot.after()
+    assert hazards(robot) == ["FOREIGN: 1 poses of B came from another source, and were not used"]
+    robot.t += 1.0
+    assert hazards(robot) == []
+    assert robot.x == 0.4

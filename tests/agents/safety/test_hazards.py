@@ -64,6 +64,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.SINKING: [(10, "LAND")],
     Cause.CLOCK: [(50, "WARN")],
     Cause.BEHIND: [(0, "WARN")],
+    Cause.FOREIGN: [(100, "WARN")],
     Cause.REFUSED: [(0, "WARN")],
     Cause.STANDSTILL: [(0, "HOLD")],
     Cause.STILL: [(0, "LAND")],
