@@ -51,6 +51,7 @@ LAND_S: Final = 0.5  # period at which a landing is ordered again: setpoints of 
 NEAR_S: Final = 1.0  # but not within this time of its end: after it the motors would start again;
 LOW: Final = 0.2  # [m] if the drone is higher then, it flies, or stands on a table:
 LATE_LANDINGS: Final = 3  # so many attempts
+UNSTARTED_S: Final = 1.0  # a drone that has descended by itself for longer, because no setpoint was started, is landed
 STARTS: Final = 8  # trajectories that may be on board
 TURNED: Final = 0.35  # [rad] largest difference of the yaw on board from that of the external positions
 
@@ -223,7 +224,7 @@ class Flight:
         high = self._telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
         if now - self._since > self._span + AGAIN_S:
             self._land()
-        elif (high or not near) and now - self._released_at > LAND_S:
+        elif (high or not near) and not self.link.busy and now - self._released_at > LAND_S:
             self._order_landing()
 
     @property
@@ -270,6 +271,11 @@ class Flight:
         if self.phase not in (Phase.CLIMBING, Phase.FLYING):
             return
         self._confirm_starts()
+        begun = self._since + (self._span if self.phase is Phase.CLIMBING else 0.0)
+        if now - max(self._sent_at, begun) > self._hold + UNSTARTED_S:
+            self.trouble = "landed: its setpoints are not confirmed"
+            self.land()
+            return
         if now - max(self._commanded_at, self._since) > LOOP_SILENCE_S:
             self.trouble = "landed: no commands from the robot's loop"
             self.land()

@@ -108,11 +108,10 @@ class Trajectories:
             self._send(Port.HIGH_LEVEL, 0, bytes((HighLevel.DEFINE, number)) + place)
 
     def note_answer(self, address: int, status: int) -> None:
-        """Answer of the drone about a part that was written."""
+        """Answer of the drone about a part that was written; one that it refuses is written again after a while."""
         sent = self._sent
-        if sent is not None and sent[0] == address:
-            if status == 0:
-                self._written[address] = sent[1]
+        if sent is not None and sent[0] == address and status == 0:
+            self._written[address] = sent[1]
             self._sent = None
 
     def hold(self, target: Target, seconds: float, before_start: Callable[[], None] = lambda: None) -> int:

@@ -122,6 +122,43 @@ while True:
 """
 
 
+@pytest.mark.system
+def test_reset_in_the_air():
+    """A brown-out: nothing lifts it again, and all that was set up is set up again."""
+    with flown() as (twin, process):
+        process.takeoff(0.4)
+        process.setpoint = [(0.0, 0.0, 0.4, 0.0)]
+        process.run(0.3)
+        flock, drone = twin.device.flock, twin.device.drones[0]
+        flock.restart(0)
+        drone._start()
+        process.until(lambda: not process.state.flying[0], "seen")
+        process.setpoint = None
+        process.until(lambda: drone.value("posCtlPid.thrustMin") == 5000 and not process.state.notes[0], "set up again")
+        assert truth(twin)[2] == 0.0
+        assert not flock.quadrotor.flying[0]
+        process.takeoff(0.3)
+        process.cut()
+
+
+@pytest.mark.system
+def test_a_new_link_does_not_move_a_flow_deck():
+    """Where it has landed it stays, and is not told again to stand at its start; switched off and on, it is."""
+    with flown() as (twin, process):
+        process.takeoff(0.3)
+        process.setpoint = [(0.4, 0.0, 0.3, 0.0)]
+        process.until(lambda: abs(truth(twin)[0] - 0.4) < 0.02, "goal")
+        process.land()
+        link_before, pilot = process.body._pilots[0]._link, process.body._pilots[0]
+        twin.device.lines[0].silence(1.5)
+        process.until(lambda: pilot._link is not link_before and not process.state.notes[0], "a new link")
+        assert process.state.position[0, 0] == pytest.approx(truth(twin)[0], abs=0.02)
+        assert truth(twin)[0] > 0.3
+        twin.device.flock.restart(0)
+        twin.device.drones[0]._start()
+        process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.notes[0], "at its start")
+
+
 @pytest.mark.parametrize("link", ["udp", "radio"])
 @pytest.mark.system
 def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):

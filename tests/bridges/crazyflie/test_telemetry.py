@@ -44,6 +44,24 @@ def test_a_drone_that_was_switched_off_and_on():
     assert stamps.restarted
 
 
+def test_restart_half_an_overflow_later():
+    """On a charger for hours: the stamp of the new start is ahead of the old one, counted around."""
+    stamps = StampAge()
+    stamps.age(50.0, 10_000_000)
+    assert stamps.age(53.0, 2_000) == 0.0
+    assert stamps.restarted
+
+
+@pytest.mark.parametrize(("stamp", "restarted"), [(15_000, False), (14_000, False), (8_000, True)])
+def test_restart_found_with_a_larger_stamp(stamp, restarted):
+    """Switched off and on soon after its first start: ten seconds later its clock has advanced by three."""
+    stamps = StampAge()
+    stamps.age(50.0, 5_000)
+    stamps.connected_anew = True
+    stamps.age(60.0, stamp)
+    assert stamps.restarted is restarted
+
+
 class Blocks:
     """Log blocks of a link, by name."""
 

@@ -73,7 +73,6 @@ class Drone:
         tables = inventory(self.flock.tables[self.row])
         self.parameters, self._log_table = tables.parameters, tables.logs
         self.memories = self.flock.memories[self.row]
-        self.trajectories = Trajectories(self.memories)
         self.logs = LogBlocks(self.flock, self.row, self.value, tables.logs)
         self._start()
         # answer to a packet on the same port and channel, or None
@@ -94,6 +93,9 @@ class Drone:
         """State after switching on."""
         flock, row = self.flock, self.row
         self.thrust_locked = True
+        self.memories.restart()
+        self.trajectories = Trajectories(self.memories)
+        self.logs.began = flock.t
         self.values = [variable.value for variable in self.parameters.variables]
         present = {
             "deck.bcLighthouse4": flock.lighthouse[row],

@@ -46,6 +46,7 @@ class LogBlocks:
     """The log blocks of one Crazyflie."""
 
     def __init__(self, flock: Flock, row: int, parameter: Callable[[str], float], table: Table) -> None:
+        self.began = 0.0  # time at which the drone was switched on [s]
         self._blocks: dict[int, Block] = {}
         known = _motion(flock, row) | _system(flock, row, parameter)  # the others are constants of the table
         self._read: list[Read] = [
@@ -78,7 +79,7 @@ class LogBlocks:
 
     def due(self, t: float) -> Iterator[bytes]:
         """Packets that are due at `t` [s]."""
-        stamp = (int(crtp.SECONDS_MS * t) & MILLISECONDS).to_bytes(3, "little")
+        stamp = (int(crtp.SECONDS_MS * (t - self.began)) & MILLISECONDS).to_bytes(3, "little")
         for number, block in self._blocks.items():
             if block.period == 0.0 or t < block.next - 1e-6:
                 continue

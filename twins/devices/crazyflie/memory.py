@@ -52,6 +52,10 @@ class Memories:
         self.write_errors = 0  # of the tester: bytes that are not their address
         self.stored = (0, 0)  # masks of the stations whose geometry and calibration would survive a restart
 
+    def restart(self) -> None:
+        """Forget what does not survive switching off and on: the trajectories."""
+        self._bytes[Memory.TRAJECTORY] = bytearray(SIZES[Memory.TRAJECTORY])
+
     @property
     def listed(self) -> list[tuple[int, int]]:
         """Kind and size [bytes] of each memory."""
