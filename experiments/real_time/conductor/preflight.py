@@ -171,7 +171,7 @@ class Inspector(CaseRun):
         self._phase(f"{name}: stop, motors off")
         tried = Tried()
         self._stop(name, tried)
-        return checks.stop("stop, motors off", tried)
+        return checks.stop_at_rest(self._experiment.robots[name], tried)
 
     def _stop(self, name: str, tried: Tried) -> None:
         """Order the motors off, and wait until the robot reports that."""

@@ -15,11 +15,12 @@ import numpy as np
 from agents.arrays import Array
 from agents.body.interface import settings
 from agents.body.limits import Safety
+from agents.body.measured_positions import FROZEN
 from agents.network import messages
 from agents.plugins import registry
 from agents.protocols import tello
 from agents.safety.detection import clock_off, clock_text
-from experiments.definition.bodies import DRIVES
+from experiments.definition.bodies import DRIVES, WORLD
 from experiments.definition.experiment import Robot
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 
@@ -188,9 +189,15 @@ def _charged(charge: float, volts: float) -> str:
 def _position(each: Observed, safety: Safety) -> Check:
     positions = each.positions()
     source = "motion capture" if each.robot.position == "external" else "its positioning system"
+    frozen = f"{source} is frozen: is it live, and not paused? It must not fly by that"
+    if each.status is not None and FROZEN in each.status.body:
+        return _bad("position", FROZEN, frozen)
     if not len(positions):
         return _bad("position", "none", f"does {source} see it where it stands? `./zenpark echo 'park/*/position'`")
     spread = float(positions.std(axis=0).max())
+    captured = each.robot.position == "external" and registry.body_name(each.robot.body) != WORLD
+    if captured and len(positions) > 1 and not np.ptp(positions, axis=0).any():
+        return _bad("position", "the same to the last bit, which no measurement is", frozen)
     ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
     oldest = max(ages, default=0.0)
     found = f"spread {1e3 * spread:.1f} mm, at most {1e3 * oldest:.0f} ms old"
@@ -212,19 +219,28 @@ def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check
     yaw, wanted = each.yaw(), each.robot.start[2] if len(each.robot.start) > 2 else None
     turned = None if yaw is None or wanted is None else math.remainder(yaw - wanted, math.tau)
     said = f"{away:.2f} m from `start`" + ("" if turned is None else f", turned by {math.degrees(turned):.0f}°")
+    nearer = min(observed, key=lambda other: _distance(here, observed[other].robot))
+    if _distance(here, observed[nearer].robot) < min(away, safety.start_within):
+        remedy = f"it stands where {nearer} begins: addresses, markers or robots are swapped"
+        return _bad("start pose", said, remedy)
     if safety.start_within and away > safety.start_within:
-        nearer = min(observed, key=lambda other: _distance(here, observed[other].robot))
-        swapped = nearer != name and _distance(here, observed[nearer].robot) <= safety.start_within
         remedy = (
-            f"it stands where {nearer} begins: addresses, markers or robots are swapped"
-            if swapped
-            else f"put it at ({each.robot.start[0]:g}, {each.robot.start[1]:g}) m, or correct `start`; its positioning "
+            f"put it at ({each.robot.start[0]:g}, {each.robot.start[1]:g}) m, or correct `start`; its positioning "
             "system may have another origin"
         )
         return _bad("start pose", said, remedy)
     if turned is not None and abs(turned) > TURNED:
         return _bad("start pose", said, f"turn it to {wanted:g} rad, or correct `start`")
+    if _counts_from_start(each.robot):
+        return Check(check="start pose", verdict="unknown", found="counts from `start`")
     return Check(check="start pose", verdict="ok", found=said)
+
+
+def _counts_from_start(robot: Robot) -> bool:
+    """Whether a real robot, or its protocol twin, measures its way only: it is at its `start` wherever it stands."""
+    if robot.position == "external" or registry.body_name(robot.body) not in DRIVES:
+        return False
+    return robot.hover is None or not robot.device.get("positioning")
 
 
 def _distance(here: Array, robot: Robot) -> float:
@@ -268,6 +284,14 @@ def stop_in_motion(observed: Observed, tried: Tried) -> Check:
         return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
     if check.verdict == "ok" and observed.robot.kind == "crazyflie":
         return msgspec.structs.replace(check, found=f"{check.found}; locked until it is switched off and on")
+    return check
+
+
+def stop_at_rest(robot: Robot, tried: Tried) -> Check:
+    """Emergency stop of a robot that stands."""
+    check = stop("stop, motors off", tried)
+    if check.verdict == "ok" and DRIVES.get(registry.body_name(robot.body)) == "crazyflie":  # a stop would lock it
+        return not_tried(check.check, "not tried: --stop tries it")
     return check
 
 

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from agents.body.limits import Safety
+from agents.body.measured_positions import FROZEN
 from agents.network.messages import Inspection, State, Status
 from experiments.definition.experiment import Experiment, Robot
 from experiments.definition.plan import Plan
@@ -18,8 +19,10 @@ from experiments.real_time.conductor.preflight import alone
 from experiments.real_time.conductor.preflight_checks import Observed, Tried
 
 TODAY = date(2026, 3, 1)
-DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body="radio://0/80/2M/E7E7E7E701")
-OTHER = Robot(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body="radio://0/80/2M/E7E7E7E702")
+RADIO = "radio://0/80/2M/E7E7E7E70"
+LIGHTHOUSE = {"positioning": {"system": "lighthouse"}}
+DRONE = Robot(kind="crazyflie", start=[0.0, 0.5, 0.0], hover=0.2, body=f"{RADIO}1", device=LIGHTHOUSE)
+OTHER = Robot(kind="crazyflie", start=[0.0, -0.5, 0.0], hover=0.8, body=f"{RADIO}2", device=LIGHTHOUSE)
 WHEELS = Robot(kind="khepera4", start=[1.0, 0.0], body="khepera4://192.0.2.1")
 
 
@@ -77,6 +80,53 @@ def test_swapped_robots_are_named():
     assert found(here, "start pose", CF02=there).remedy == (
         "it stands where CF02 begins: addresses, markers or robots are swapped"
     )
+
+
+def test_swapped_robots_near_each_other_are_named():
+    near = msgspec.structs.replace(OTHER, start=[0.0, 0.3, 0.0])
+    here, there = standing(place=(0.0, 0.38, 0.0)), standing(near, place=(0.0, 0.42, 0.0))
+    assert found(here, "start pose", CF02=there).remedy.startswith("it stands where CF02 begins")
+    assert found(standing(place=(0.0, 0.41, 0.0)), "start pose", CF02=there).verdict == "ok"
+
+
+@pytest.mark.parametrize(
+    ("robot", "verdict"),
+    [
+        (msgspec.structs.replace(DRONE, device={}), "unknown"),
+        (msgspec.structs.replace(DRONE, device={}, body="crazyflie-twin"), "unknown"),
+        (msgspec.structs.replace(DRONE, device={}, position="external"), "ok"),
+        (WHEELS, "unknown"),
+        (msgspec.structs.replace(WHEELS, position="external"), "ok"),
+        (msgspec.structs.replace(WHEELS, body="world"), "ok"),
+    ],
+)
+def test_robots_that_count_from_start_are_unknown(robot, verdict):
+    each = standing(robot, place=(*robot.start[:2], 0.0))
+    each.states = states((*robot.start[:2], 0.0), (*robot.start[:2], 0.001))
+    assert found(each, "start pose").verdict == verdict
+    swapped = standing(robot, place=(5.0, 5.0, 0.0))
+    assert found(swapped, "start pose").verdict == "bad"
+
+
+@pytest.mark.parametrize(
+    ("body", "position", "verdict"),
+    [(DRONE.body, "external", "bad"), ("world", "external", "ok"), (DRONE.body, "body", "ok")],
+)
+def test_captured_positions_that_never_change_are_red(body, position, verdict):
+    each = standing(msgspec.structs.replace(DRONE, body=body, position=position))
+    assert found(each, "position").verdict == verdict
+    if position == "external":
+        each.status = msgspec.structs.replace(each.status, body=f"{FROZEN}; connected")
+        each.states = []
+        assert (found(each, "position").verdict, found(each, "position").found) == ("bad", FROZEN)
+
+
+def test_a_stop_at_rest_tries_no_crazyflie():
+    tried = Tried(stopped_s=0.1)
+    assert checks.stop_at_rest(DRONE, tried) == checks.not_tried("stop, motors off", "not tried: --stop tries it")
+    for robot in (WHEELS, msgspec.structs.replace(DRONE, body="twin")):
+        assert checks.stop_at_rest(robot, tried).verdict == "ok"
+    assert checks.stop_at_rest(DRONE, Tried(failure="refused: no answer")).verdict == "bad"
 
 
 def test_robots_of_a_kind_have_the_same_firmware():
