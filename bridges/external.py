@@ -115,7 +115,7 @@ class ExternalBody:
             time=self._poses.time - self._clock_offset,
             position=self._poses.position.copy(),
             velocity=self._velocity(),
-            yaw=np.where(np.isfinite(self._poses.yaw), self._poses.yaw, self._yaw),
+            yaw=self._yaw.copy(),
             true_position=nothing,
             true_yaw=nothing[:, 0],
             battery=nothing[:, 0],
@@ -188,7 +188,8 @@ class ExternalBody:
 
     def _read_positions(self) -> None:
         for row, taken, position, yaw in self._positions.receive(self._utc, self._now()):
-            self._poses.update(row, taken, position, yaw)
+            if self._poses.update(row, taken, position, yaw) and isfinite(yaw):
+                self._yaw[row] = yaw
 
     def _missing_positions(self) -> list[str]:
         """Diagnosis and remedy for each row without a usable position."""

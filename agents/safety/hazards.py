@@ -112,6 +112,10 @@ def rules(limits: Limits) -> list[Rule]:
     """Rules of all causes, with the numbers and the choices of an experiment."""
     chosen = {
         Cause.POSITION: {"then_s": limits.blind_s if limits.hold_s is None else limits.hold_s},
+        # robots of a world, which wait longer without a position, do not move while it is paused
+        Cause.STILL: {
+            "then_s": 0.0 if limits.hold_s is None else np.where(limits.hold_s == limits.blind_s, 0.0, NEVER)
+        },
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
         Cause.ROUTER: {"after_s": limits.link_silence_s, "then_s": limits.offline_s},
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},

@@ -100,6 +100,13 @@ def test_a_ground_robot_without_a_position_stands_for_ever():
     assert bench.changes(row=1) == [(0, "HOLD")]
 
 
+def test_a_robot_that_does_not_move_lands_unless_its_world_may_be_paused():
+    assert Bench().see(20.0, Cause.STILL).changes() == [(0, "LAND")]
+    assert Bench().see(20.0, Cause.STILL).changes(row=1) == [(0, "WARN")]
+    in_world = Bench(hold_s=np.array([10.0, 10.0])).see(20.0, Cause.STILL)
+    assert in_world.changes() == [(0, "WARN")]
+
+
 def test_choices_of_an_experiment():
     for lost, outcome in (("drop", "WARN"), ("hold", "HOLD"), ("land", "LAND")):
         assert Bench(lost_neighbour=lost).see(0.1, Cause.NEIGHBOUR).changes() == [(0, outcome)]
