@@ -40,7 +40,7 @@ def taken(stamp: float, now: float) -> float:
 
 def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
     """Refuses an impossible pose: stamp in the future, position beyond `reach` (`reach_of`), no robot's velocity."""
-    if not (_counted(pose.seq) and _possible(pose.stamp, now)):
+    if not (is_count(pose.seq) and _possible(pose.stamp, now)):
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, reach)
     _refuse_motion(pose.velocity, pose.yaw)
@@ -63,7 +63,7 @@ def check_position(measured: Position, *, now: float, reach: Vector) -> None:
 
 def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> None:
     """Refuses a goal that is impossible or too old, or younger than the pose on which it rests."""
-    if not (_counted(goal.seq) and now - oldest_s <= goal.stamp and _possible(goal.stamp, now)):
+    if not (is_count(goal.seq) and now - oldest_s <= goal.stamp and _possible(goal.stamp, now)):
         raise Malformed(f"sequence number {goal.seq} or stamp {goal.stamp} is impossible, or the goal is old")
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
@@ -86,7 +86,7 @@ def check_ranges(ranges: Ranges, *, now: float) -> None:
 
 def check_command(command: Command) -> None:
     """Refuses a command that no body can carry out."""
-    if not _counted(command.seq):
+    if not is_count(command.seq):
         raise Malformed(f"sequence number {command.seq} is impossible")
     if command.action == "drive":
         x, y, z, w = command.setpoint or (math.nan,) * 4
@@ -111,7 +111,8 @@ def most_poses(since: float, rate: float) -> int:
     return math.ceil(since * rate - 1e-3)
 
 
-def _counted(seq: int) -> bool:
+def is_count(seq: int) -> bool:
+    """Whether a number can be a running number."""
     return 0 < seq < 2**53  # what JSON carries exactly
 
 

@@ -13,9 +13,9 @@ from experiments.definition.links import link_pairs
 T = TypeVar("T")
 
 
-def without_standby(experiment: Experiment) -> Experiment:
-    """Remove the robots on standby: no robot is added in virtual time, or before `./zenpark robot add`."""
-    robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby}
+def without_standby(experiment: Experiment, added: Collection[str] = ()) -> Experiment:
+    """Remove the robots on standby, but those `added`: none is in virtual time, or before `./zenpark robot add`."""
+    robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby or name in added}
     if len(robots) == len(experiment.robots):
         return experiment
     formation, channel, architecture = experiment.formation, experiment.channel, experiment.architecture

@@ -51,11 +51,10 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
     return np.bincount(goals.sent.link, minlength=rows), size.astype(np.intp)
 
 
-def deliveries(trace: Trace, sent: Index) -> int:
-    """Messages counted once per receiver, when robots `sent` (N,) poses: to each other, to the central controller, and
-    its goals."""
-    listeners = np.bincount(trace.plan.pose_links.sender, minlength=len(sent)) + received_by_centre(trace)
-    return int(sent @ listeners) + (0 if trace.goals is None else len(trace.goals.sent))
+def deliveries(trace: Trace) -> int:
+    """Messages that arrived, counted once per receiver: poses at robots and at the central controller, and its goals."""
+    goals = trace.goals
+    return len(trace.received) + (0 if goals is None else int(goals.received.sum() + goals.reached.sum()))
 
 
 def guidance(trace: Trace) -> Guidance | None:

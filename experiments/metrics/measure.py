@@ -152,7 +152,7 @@ def measure(trace: Trace) -> CaseMetrics:
         passages=passed,
         modelled=link_conditions.models_network(trace.experiment),
         missed_deadlines=int(trace.missed_deadlines.sum()),
-        missed_share=_share(trace.missed_deadlines.sum(), ticks),
+        missed_share=_share(trace.missed_deadlines.sum(), ticks + int(trace.missed_deadlines.sum())),
         collisions=touched,
         watched=trace.contacts is not None,
         near=_nearest(clearance.robots),
@@ -168,7 +168,7 @@ def measure(trace: Trace) -> CaseMetrics:
         failures=_failures(trace, robots),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
-        deliveries=centralised.deliveries(trace, np.array([robot.messages for robot in robots], dtype=np.intp)),
+        deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
     )
 
@@ -203,12 +203,16 @@ def _robots(
 ) -> tuple[RobotMetrics, ...]:
     rows, time, mine = len(trace.robots), trace.time, errors.own
     duration = float(time[-1] - time[0])
+    joined = np.zeros(rows) if trace.joined is None else trace.joined
+    present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])  # [s] of each robot
     total = errors.per_robot()
     iae, itae, rmse = integrals(total, time)
-    there = ~errors.away
-    coverage = (np.isfinite(errors.error[there]).mean(axis=0) @ mine) / np.maximum(mine.sum(axis=0), 1.0)
+    there = errors.expected()
+    covered = (np.isfinite(errors.error) & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    coverage = (covered @ mine) / np.maximum(mine.sum(axis=0), 1.0)
+    known = errors.known()
     unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
-    settled = after_last(unsettled & (there[:, None] | np.isfinite(total)), time)
+    settled = after_last(unsettled & (errors.there | np.isfinite(total)), time)
     sent, recorded = transmissions(trace)
     size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
@@ -247,16 +251,16 @@ def _robots(
         RobotMetrics(
             robot=name,
             kind=trace.experiment.robots[name].kind,
-            f_hz=float(sent[i]) / duration,
+            f_hz=float(sent[i]) / float(present[i]),
             acquired_s=phases[0][i].acquired_s,
             dropped=dropped[name],
             residual=phases[0][i].residual,
             worst=phases[0][i].worst,
             phases=tuple(phase[i] for phase in phases[1:]),
             settle_s=duration if (when := settled[i]) is None else when,
-            missed_share=_share(trace.missed_deadlines[i], trace.ticks[i]),
+            missed_share=_share(trace.missed_deadlines[i], trace.ticks[i] + trace.missed_deadlines[i]),
             coverage=float(coverage[i]),
-            known=float(errors.alive[there, i].mean()),
+            known=float(known[i]),
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
             overlap=max((each.overlap for each in own[i]), default=None),

@@ -92,12 +92,12 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     acquired_s: float | None
     lost: int  # poses that by their numbers were sent and never reached a receiver
     dropped: int  # by the modelled network, over all receivers
-    missed_deadlines: int  # ticks that began more than one period late
+    missed_deadlines: int  # ticks that were skipped: their time had passed
     residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
     worst: str  # robot at the other end of that link
     phases: tuple[Phase, ...]  # each later phase
     settle_s: float  # [s] when e enters the 2 % band of its largest value for good; the duration if never
-    missed_share: float | None  # missed deadlines over ticks
+    missed_share: float | None  # missed deadlines over the ticks that were due, made or missed
     updates: int  # goals computed anew
     gap_min_s: float | None  # [s] shortest time between two transmissions
     gap_median_s: float | None  # [s] median
@@ -184,7 +184,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     passages: tuple[Passage, ...]  # per link
     modelled: bool  # the file asks for network effects
     missed_deadlines: int  # sum over the robots
-    missed_share: float | None  # missed deadlines over ticks, of all robots
+    missed_share: float | None  # missed deadlines over the ticks that were due, of all robots
     collisions: tuple[Collision, ...]  # in order of time
     watched: bool  # a world reported contacts; else collisions come from recorded positions
     near: Approach | None  # closest approach of two robots, surface to surface
@@ -205,5 +205,5 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     failures: tuple[str, ...] = ()
     network_messages: int = 0  # poses of all robots, leaders too, and goals of the central controller
     network_bytes: int = 0  # payload of these messages
-    deliveries: int = 0  # the same messages, counted once for each receiver
+    deliveries: int = 0  # of the same messages those that arrived, counted once for each receiver
     guidance: Guidance | None = None  # None if each robot decides for itself

@@ -58,7 +58,9 @@ class LinkErrors:
     # is not there
     error: Array
     alive: Mask  # (T, N) whether the robot's own position is known
-    away: Mask  # (T,) the network was away, see `network_away`: unknown positions then tell nothing of a robot
+    # (T, N) whether a robot was to be there: not before it joined, nor while the network was away (see `network_away`),
+    # when an unknown position tells nothing of it
+    there: Mask
     gone: Mask  # (T, N) from then on neither a robot's position nor an error of its links is known any more
 
     @classmethod
@@ -66,17 +68,20 @@ class LinkErrors:
         pattern = trace.plan.formation
         alive = np.asarray(np.isfinite(trace.true_position).all(axis=2))
         own, (_, away) = own_links(pattern.links, len(trace.robots)), network_away(alive, trace.time)
+        there = np.repeat(~away[:, None], len(trace.robots), axis=1)
+        if trace.joined is not None:
+            there &= trace.time[:, None] >= trace.joined
         blind = without_position(trace)
         alive &= ~blind
         place = np.where(blind[:, :, None], np.nan, trace.true_position) if blind.any() else trace.true_position
         error = errors_over_time(trace.plan.law, pattern, trace.time, place)
         gone = ~np.maximum.accumulate((alive & (np.isfinite(error) @ own > 0.0))[::-1])[::-1]
-        return cls(trace.time, pattern.links, own, error, alive, away, np.asarray(gone))
+        return cls(trace.time, pattern.links, own, error, alive, there, np.asarray(gone))
 
     def part(self, begin: int, end: int) -> LinkErrors:
         """The same from one row in time to another."""
         rows = slice(begin, end)
-        masks = (self.alive[rows], self.away[rows], self.gone[rows])
+        masks = (self.alive[rows], self.there[rows], self.gone[rows])
         return LinkErrors(self.time[rows], self.net, self.own, self.error[rows], *masks)
 
     def per_robot(self) -> Array:
@@ -96,12 +101,12 @@ class LinkErrors:
         outside = (total > tolerance * count + 1e-12).astype(float) @ self.own > 0.0
         known = (np.isfinite(self.error) @ self.own > 0.0) & self.alive
         last = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, None], -1), axis=0)
-        before = np.take_along_axis(outside, np.maximum(last, 0), axis=0) | ((last < 0) & ~self.away[:, None])
+        before = np.take_along_axis(outside, np.maximum(last, 0), axis=0) | ((last < 0) & self.there)
         return after_last(before | self.gone, self.time)
 
     def gaps(self) -> list[tuple[int, float, float]]:
         """Times [s, s] without the position of a robot, by its row, until it is known again; no absence of all."""
-        unknown = ~self.alive & ~self.away[:, None] & np.maximum.accumulate(self.alive, axis=0)
+        unknown = ~self.alive & self.there & np.maximum.accumulate(self.alive, axis=0)
         found = []
         for row in range(self.alive.shape[1]):
             edges = np.flatnonzero(np.diff(unknown[:, row], prepend=False, append=False))
@@ -109,6 +114,14 @@ class LinkErrors:
                 if end < len(self.time):
                     found.append((row, float(self.time[begin]), float(self.time[end])))
         return found
+
+    def expected(self) -> Mask:
+        """(T, E) samples at which both ends of each link were to be there."""
+        return np.asarray(self.there[:, self.net.receiver] & self.there[:, self.net.sender])
+
+    def known(self) -> Array:
+        """(N,) share of the time at which each robot was to be there, at which its position is known; 0 without any."""
+        return np.asarray((self.alive & self.there).sum(axis=0) / np.maximum(self.there.sum(axis=0), 1))
 
     def worst(self, names: Sequence[str]) -> list[tuple[float | None, str]]:
         """Per robot the mean error of its worst link [m], and the robot at its other end."""
@@ -161,7 +174,7 @@ def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
         alive: (T, N) whether a robot's position is known.
 
     Returns:
-        Time without any known position [s], and the rows (T,) within `RETURN_S` of that at which some are not known.
+        Time without any known position [s], and the rows (T,) up to `RETURN_S` after that at which some are not known.
     """
     none_known: Mask = np.asarray(~alive.any(axis=1))
     ends = np.flatnonzero(alive.any(axis=1))
@@ -169,9 +182,8 @@ def network_away(alive: Mask, time: Array) -> tuple[float, Mask]:
     if alive.shape[1] < 2 or not none_known.any():
         return 0.0, np.zeros(len(time), dtype=bool)
     moments = time[none_known]
-    after = np.searchsorted(moments, time)
-    padded = np.concatenate([[-np.inf], moments, [np.inf]])
-    near = np.minimum(time - padded[after], padded[after + 1] - time) <= RETURN_S
+    before = np.concatenate([[-np.inf], moments])[np.searchsorted(moments, time)]
+    near = time - before <= RETURN_S
     return float(none_known.sum() * (time[1] - time[0])), np.asarray((near & ~alive.all(axis=1)) | none_known)
 
 

@@ -1,11 +1,11 @@
-"""Poses lost and dropped, by their running numbers and by the counters of robots."""
+"""Counters of robots over all lives of their processes, and poses lost and dropped."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final, Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -46,18 +46,25 @@ def count_lost(
     begin, end = run[0] - ROUNDING_S, run[1] + ROUNDING_S
     for robot, own, reports in zip(robots, poses, statuses, strict=True):
         mine = [(pose.stamp, pose.seq) for pose in own if begin <= pose.stamp <= end]
-        total[robot] += count_unrecorded(mine, rate) + _tail(own, reports, run, rate)
+        tails = sum(_tail(own, life, run, rate) for life in lives(reports, _made))
+        total[robot] += count_unrecorded(mine, rate) + tails
         total.update(_by_sender(reports, run, "lost"))
     return np.array([total[robot] for robot in robots], dtype=np.intp)
 
 
-def _tail(poses: list[SentPose], statuses: list[Status], run: tuple[float, float], rate: float) -> int:
-    reports = [status for status in statuses if run[0] < status.stamp <= run[1] + STATUS_S]
+def _made(status: Status) -> int:
+    """Counters that only grow during the life of a process."""
+    return status.sent + status.decisions
+
+
+def _tail(poses: list[SentPose], life: list[Status], run: tuple[float, float], rate: float) -> int:
+    """Poses that the last status of a process counts as sent, beyond the last recorded one."""
+    reports = [status for status in life if run[0] < status.stamp <= run[1] + STATUS_S]
     if not reports:
         return 0
     last = reports[-1]
     recorded = [(pose.seq, pose.stamp) for pose in poses if pose.stamp <= last.stamp + ROUNDING_S]
-    before = [(status.sent, run[0]) for status in statuses if status.stamp <= run[0] and status.pid == last.pid]
+    before = [(status.sent, run[0]) for status in life if status.stamp <= run[0]]
     number, stamp = max(recorded[-1:] + before[-1:], default=(0, run[0]))
     return max(0, min(last.sent - number, most_poses(last.stamp - stamp, rate)))
 
@@ -72,24 +79,78 @@ def count_dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, fl
 
 def _by_sender(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
     """Poses lost or dropped in the run by one receiver, by sender."""
-    return counter_growth(((status.pid, status.stamp, getattr(status, what)) for status in statuses), *run)
+    total: Counter[str] = Counter()
+    for life in lives(statuses, _made):
+        total += counter_growth([(status.stamp, getattr(status, what)) for status in life], *run)
+    return total
 
 
-def counter_growth(counts: Iterable[tuple[int, float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
-    """Growth of counters in a run, by their names.
+class Report(Protocol):
+    """A message with counters of a process."""
+
+    @property
+    def pid(self) -> int: ...
+
+    @property
+    def stamp(self) -> float: ...
+
+
+R = TypeVar("R", bound=Report)
+
+
+def lives(reports: Iterable[R], made: Callable[[R], int]) -> list[list[R]]:
+    """Reports in order of time, by the process that made them, in the order of the first of each.
+
+    Two processes of one robot may report in turn. A number that a later process was given again (in containers all have
+    the same) is told from the former one by counters that fell.
 
     Args:
-        counts: Reports in order of time: process, stamp [s], and what the process has counted since it began.
+        reports: In order of time.
+        made: Sum of counters that only grow during the life of a process.
+    """
+    found: list[list[R]] = []
+    newest: dict[int, tuple[list[R], int]] = {}
+    for report in reports:
+        life, most = newest.get(report.pid, ([], 0))
+        if not life or 2 * made(report) < most:  # a clock that was set back makes counters fall a little
+            life, most = [], 0
+            found.append(life)
+        life.append(report)
+        newest[report.pid] = life, max(most, made(report))
+    return found
+
+
+def count_in_run(statuses: list[Status], what: str, start: float, end: float) -> int:
+    """A counter that begins at the common start, at the end of the run, over all processes of a robot.
+
+    Statuses come once in a second: between the last one of the run and the next, the counter grows evenly.
+    """
+    total, ended = 0.0, start
+    for life in lives(statuses, _made):
+        begun = [status for status in life if status.stamp > start and status.decisions] or [
+            status for status in life if status.stamp > start
+        ]
+        if not begun:
+            continue
+        stamps = [min(ended, begun[0].stamp), *(status.stamp for status in begun)]
+        counts = np.maximum.accumulate([0, *(getattr(status, what) for status in begun)])
+        total += float(np.interp(end, stamps, counts))
+        ended = min(begun[-1].stamp, end)
+    return round(total)
+
+
+def counter_growth(counts: Sequence[tuple[float, Mapping[str, int]]], start: float, end: float) -> Counter[str]:
+    """Growth of the counters of one process in a run, by their names.
+
+    Args:
+        counts: Stamp [s], and what the process has counted since it began.
         start: Of the run [s].
         end: Of the run [s]; a report at most `STATUS_S` later counts.
     """
-    total: Counter[str] = Counter()
-    before: Mapping[str, int] = {}
-    process = None
-    for pid, stamp, now in counts:
-        if pid != process:  # started again: counts from 0
-            before, process = {}, pid
-        if start < stamp <= end + STATUS_S:
-            total.update({name: max(0, count - before.get(name, 0)) for name, count in now.items()})
-        before = now
-    return total
+    before, last = Counter[str](), Counter[str]()
+    for stamp, now in counts:
+        if stamp <= start:
+            before |= Counter(now)
+        elif stamp <= end + STATUS_S:
+            last |= Counter(now)
+    return last - before

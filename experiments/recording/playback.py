@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,10 +18,12 @@ from msgspec.structs import replace
 from agents.arrays import Array, Index, PoseTable, known_rows
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
+from agents.network.validation import FUTURE_S, is_count
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.definition.standby import without_standby
 from experiments.recording.clocks import Correction
-from experiments.recording.losses import STATUS_S, count_dropped, count_lost, counter_growth
+from experiments.recording.losses import STATUS_S, count_dropped, count_in_run, count_lost, counter_growth, lives
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
@@ -118,7 +122,10 @@ def read(path: Path) -> Playback:
 
     Positions, yaw, attitude and the poses of shadow twins are interpolated onto the grid; goals and setpoints are the
     last at or before. A robot that never reported is NaN; one that fell silent is NaN from two state periods after its
-    last sample, and inside holes of more than a second.
+    last sample, and inside holes of more than a second. A robot on standby that was never added is left out.
+
+    Counters of a robot are sums over all its processes. What robots refuse (running numbers that are not possible,
+    stamps ahead of the time) is left out.
 
     `lost` of a robot is the sum of: (1) gaps in the sequence numbers of its poses recorded in the run, where a number
     that goes back is a publisher that began anew at 1; (2) poses beyond the last recorded one that its last status of
@@ -141,7 +148,8 @@ def read(path: Path) -> Playback:
     messages = content.fill()
     records = content.records
     about = AboutRun.of(records)
-    experiment = about.experiment
+    experiment = without_standby(about.experiment, {state.robot for state in content[State]})
+    about = dataclasses.replace(about, experiment=experiment)
     start = about.start(content[Event], content[Status], path)
     length = content.length(start, experiment.duration_s)
     if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
@@ -223,7 +231,11 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         list({(pose.stamp, pose.seq): pose for pose in own}.values()) for own in _by_robot(content[SentPose], robots)
     ]
     statuses = _by_robot(content[Status], robots)
-    last = [_by_the_end(own, start + duration) for own in statuses]
+
+    def counted(what: str) -> Index:
+        """A counter of each robot at the end of the run, 0 without a status."""
+        return np.array([count_in_run(own, what, start, start + duration) for own in statuses], dtype=np.intp)
+
     sampled = [_sampled(own, start, time, HOLD_PERIODS / rate) for own in states]
     columns = {what: np.stack([own[what] for own in sampled], axis=1) for what in sampled[0]}
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
@@ -243,39 +255,56 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         lost=count_lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
         + (0 if goals is None else goals.lost),
         dropped=count_dropped(plan, statuses, (start, start + duration)),
-        missed_deadlines=_counted(last, "missed"),
-        ticks=_counted(last, "ticks"),
-        decisions=_counted(last, "decisions"),
+        missed_deadlines=counted("missed"),
+        ticks=counted("ticks"),
+        decisions=counted("decisions"),
         events=tuple(
             replace(event, stamp=event.stamp - start) for event in sorted(content[Event], key=lambda event: event.stamp)
         ),
-        interventions=_counted(last, "interventions"),
-        avoided=_counted(last, "avoided"),
+        interventions=counted("interventions"),
+        avoided=counted("avoided"),
         contacts=contacts if contacts_watched(contacts, world) else None,
         world=world,
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
+        joined=_joined(states, experiment, start),
         **known,
     )
-
-
-def _counted(last: Sequence[Status | None], what: str) -> Index:
-    """A counter of each robot, 0 without a status."""
-    return np.array([getattr(status, what) if status else 0 for status in last], dtype=np.intp)
-
-
-def _by_the_end(statuses: list[Status], end: float) -> Status | None:
-    """The last status that counts for the run; the first one after it if there is none."""
-    return next((status for status in reversed(statuses) if status.stamp <= end + STATUS_S), next(iter(statuses), None))
 
 
 def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
     """For each robot its messages in order of time."""
     found: dict[str, list[M]] = {robot: [] for robot in robots}
     for message in messages:
-        if message.robot in found and math.isfinite(message.stamp):
+        if message.robot in found and math.isfinite(message.stamp) and _possible(message):
             found[message.robot].append(message)
     return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
+
+
+def _joined(states: list[list[State]], experiment: Experiment, start: float) -> Array | None:
+    """When each robot took part at first (N,) [s]: 0, but of those on standby; None without such robots."""
+    robots = experiment.robots.values()
+    if not any(robot.standby for robot in robots):
+        return None
+    first = [
+        next((state.stamp - start for state in own if state.phase == Phase.RUNNING.word), 0.0) if robot.standby else 0.0
+        for robot, own in zip(robots, states, strict=True)
+    ]
+    return np.maximum(first, 0.0)
+
+
+def _possible(message: State | SentPose | Status) -> bool:
+    """Whether robots would take the numbers of a message: metrics refuse what robots refuse."""
+    match message:
+        case SentPose():
+            return is_count(message.seq) and 0.0 < message.stamp < message.received + FUTURE_S and 0 <= message.size
+        case Status():
+            counts = (message.sent, message.ticks, message.missed, message.decisions)
+            changed = (message.interventions, message.avoided)
+            by_name = (*message.lost.values(), *message.dropped.values())
+            return all(count == 0 or is_count(count) for count in (*counts, *changed, *by_name))
+        case _:
+            return True
 
 
 def _sampled(states: list[State], start: float, time: Array, hold: float) -> dict[str, Array]:
@@ -331,7 +360,7 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
         for row, own in enumerate(states)
         for state in own
         for each in state.received
-        if (row, each.sender) in links
+        if (row, each.sender) in links and is_count(each.seq)
     ]
     return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
 
@@ -339,21 +368,24 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
 def _goals(content: _Content, states: list[list[State]], robots: Sequence[str], start: float, duration: float) -> Goals:
     """Messages between the central controller and the robots that it guides."""
     row = {name: number for number, name in enumerate(robots)}
-    goals = sorted((g for g in content[SentGoal] if g.robot in row), key=lambda goal: (goal.stamp, row[goal.robot]))
+    own = (goal for goal in content[SentGoal] if goal.robot in row and is_count(goal.seq))
+    goals = sorted(own, key=lambda goal: (goal.stamp, row[goal.robot]))
     sent = [(row[g.robot], g.seq, g.stamp, g.received, *g.position, *NOWHERE, _number(g.yaw), g.size) for g in goals]
     receipts = sorted(
         (each.acted, row, each.pose, each.seq, each.stamp)
         for row, own in enumerate(states)
         for state in own
         for each in state.goal_receipts
+        if is_count(each.seq)
     )
     acted = _table([(row, seq, stamp, at, *NOWHERE, *NOWHERE, math.nan, 0) for at, row, _, seq, stamp in receipts])
     pose = np.array([pose for _, _, pose, *_ in receipts], dtype=float).reshape(-1, 1) - start
     reports = sorted(content[CentreState], key=lambda each: each.stamp)
-    counts = (
-        counter_growth(((each.pid, each.stamp, getattr(each, what)) for each in reports), start, start + duration)
-        for what in ("received", "lost", "dropped")
-    )
+    counts = [Counter[str](), Counter[str](), Counter[str]()]
+    for life in lives(reports, lambda each: each.decisions):
+        for total, what in zip(counts, ("received", "lost", "dropped"), strict=True):
+            growth = counter_growth([(each.stamp, getattr(each, what)) for each in life], start, start + duration)
+            total.update(growth)
     received, lost_poses, dropped_poses = (np.array([each[name] for name in row], dtype=np.intp) for each in counts)
     return Goals.of_run(
         _table(sent).since(start),

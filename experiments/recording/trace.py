@@ -164,6 +164,7 @@ class Trace:
     dropped: Index | None = None  # (E,) by the modelled network on each of `plan.pose_links`; None if unknown
     goals: Goals | None = None  # of the central controller; None if each robot decides for itself
     clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
+    joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start
 
     @cached_property
     def plan(self) -> Plan:

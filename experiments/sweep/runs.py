@@ -133,7 +133,8 @@ def _figures(trace: Trace) -> Figures:
     sent = transmissions(trace)[0].astype(float)
     waits = [float(wait.min()) for wait in transmission_gaps(trace) if len(wait)]
     leading = leaders(trace)
-    kept = [i for i, name in enumerate(trace.robots) if name not in leading and errors.alive[:, i].mean() >= KNOWN]
+    known = errors.known()
+    kept = [i for i, name in enumerate(trace.robots) if name not in leading and known[i] >= KNOWN]
     iae, itae, rmse = (_mean(each[kept].tolist()) for each in integrals(errors.per_robot(), trace.time))
     arrived = [acquired[i] for i in kept]
     return Figures(

@@ -110,7 +110,7 @@ def test_what_kept_robots_off_is_counted_until_the_end(path):
     ]
     write(path, *whole_run()[:-2], *counted)
     trace = read(path).trace
-    assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([10, 0], [4, 0])
+    assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([8, 0], [3, 0])
 
 
 def test_attitude_is_interpolated_the_short_way_on_the_side_it_was_recorded_on(path):
