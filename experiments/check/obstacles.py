@@ -13,6 +13,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Robot
+from experiments.recording.trace import finds_contacts
 from twins import scene as outlines
 from twins.scene import Obstacle
 from twins.sensing.range_sensors import OF_KIND
@@ -84,7 +85,7 @@ def contacts(analysis: Analysis) -> Iterator[Finding]:
     """Check that the engine computes the contacts for which the arena is made."""
     experiment, scene = analysis.experiment, analysis.scene
     kind, _ = registry.split(experiment.world.engine)
-    touching = getattr(registry.struct(registry.ENGINES, kind), "contacts", True)
+    touching = finds_contacts(kind)
     for name, obstacle in experiment.arena.obstacles.items():
         if obstacle.mass is not None and not touching:
             message = f"'{name}' has a mass, but in the engine '{kind}' nothing is pushed: it stands fast"

@@ -197,7 +197,7 @@ def find_shapes(
     """Places where links and anchors have what they ask for, one for each guess, until one is good.
 
     Args:
-        links: With what they ask for, see `residuals.targets_of_law`.
+        links: With what they ask for, see `targets_of_law`.
         guesses: (N, 3) each [m].
         moves: (N,) rows that may be placed elsewhere in the plane.
         climbs: (N,) rows whose heights are free as well; the others are held where they are.

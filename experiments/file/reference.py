@@ -115,6 +115,14 @@ def matching(asked: str) -> list[Entry]:
     return found + [each for each in entries() if each.key.startswith(tables) and each not in found]
 
 
+def unit(asked: str) -> str:
+    """Unit of a key as a user writes it, without its case; empty if it has none, or plug-ins differ in it."""
+    path = re.sub(r"^cases\.[^.]+\.", "", asked)
+    found = [re.search(r"\[([^\]\s]+)\]", entry.text) for entry in matching(path)]
+    units = {each[1] if each else "" for each in found}
+    return units.pop() if len(units) == 1 else ""
+
+
 def nearest(asked: str, count: int = 3) -> list[str]:
     """The keys most like `asked`, or like its last word, as users write them; the best first."""
     end = asked.rpartition(".")[2]

@@ -52,7 +52,7 @@ def goals_to(trace: Trace) -> tuple[Index, Index]:
 
 
 def deliveries(trace: Trace) -> int:
-    """Messages that arrived, counted once per receiver: poses at robots and at the central controller, and its goals."""
+    """Messages that arrived, once per receiver: poses at robots and at the central controller, and its goals."""
     goals = trace.goals
     return len(trace.received) + (0 if goals is None else int(goals.received.sum() + goals.reached.sum()))
 

@@ -67,8 +67,12 @@ def _mean_indices(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
     return mean
 
 
-def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
-    """The first thing that kept each robot from its part of the experiment, and a cut of its motors after that."""
+def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
+    """The first thing that kept each robot from its part of the experiment, and a cut of its motors after that.
+
+    Args:
+        known: (N,) share of the time at which the position of each robot is known.
+    """
     found: dict[str, str] = {}
     blind: dict[str, Event] = {}  # begin of the last loss of its own position
     for event in trace.events:
@@ -84,9 +88,9 @@ def _failures(trace: Trace, robots: Sequence[RobotMetrics]) -> tuple[str, ...]:
             found[event.source] = f"{event.source} at {max(begin.stamp, 0.0):.1f} s: {what}"
         elif event.text.startswith("cut: ") and "cut: " not in found.get(event.source, "cut: "):
             found[event.source] += f"; at {max(event.stamp, 0.0):.1f} s {event.text}"
-    for each in robots:
-        if each.known < PRESENT:
-            found.setdefault(each.robot, f"{each.robot}: its position was known for {each.known:.0%} of the time only")
+    for name, share in zip(trace.robots, known, strict=True):
+        if share < PRESENT:
+            found.setdefault(name, f"{name}: its position was known for {share:.0%} of the time only")
     return tuple(found.values())
 
 
@@ -121,14 +125,13 @@ def measure(trace: Trace) -> CaseMetrics:
     beyond = outside_arena(trace)
     farthest = int(beyond.argmax())
     ticks = int(trace.ticks.sum())
-    planned, step = trace.experiment.duration_s, float(trace.time[1] - trace.time[0])
     return CaseMetrics(
         case=trace.case,
         seed=trace.seed,
         clock=trace.clock,
         duration_s=float(trace.time[-1] - trace.time[0]),
-        planned_s=planned,
-        interrupted=float(trace.time[-1]) < planned - 1.5 * step,  # a whole one may end one sample short
+        planned_s=trace.experiment.duration_s,
+        interrupted=ended_early(trace),
         tolerance=trace.experiment.tolerance,
         starts_s=tuple(start for start, _, _ in bounds),
         robots=robots,
@@ -165,12 +168,17 @@ def measure(trace: Trace) -> CaseMetrics:
             f"{names[row]} from {begin:.1f} to {end:.1f} s" for row, begin, end in errors.gaps() if end - begin > GAP_S
         ),
         troubles=tuple(f"{event.source} {event.text}" for event in trace.events if event.kind in TROUBLES),
-        failures=_failures(trace, robots),
+        failures=failures(trace, [robot.known for robot in robots]),
         network_messages=sum(robot.messages + robot.goals for robot in robots),
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
     )
+
+
+def ended_early(trace: Trace) -> bool:
+    """Whether a run ended before its time; a whole one may end one sample short."""
+    return float(trace.time[-1]) < trace.experiment.duration_s - 1.5 * float(trace.time[1] - trace.time[0])
 
 
 def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:

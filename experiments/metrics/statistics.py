@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -13,6 +13,15 @@ from experiments.metrics.results import INDICES, CaseMetrics
 
 # indices that grow with the length of a run
 SUMS: Final = ("messages", "bytes", "iae", "itae", "lost", "dropped", "missed_deadlines")
+
+
+SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ that are compared
+
+
+def equally_long(lengths: Iterable[float]) -> bool:
+    """Whether runs of these lengths [s] can be compared: what is summed, and what fades, depends on the length."""
+    known = [*lengths]
+    return not known or max(known) - min(known) <= SAME_LENGTH * max(known)
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:

@@ -297,7 +297,7 @@ def _possible(message: State | SentPose | Status) -> bool:
     """Whether robots would take the numbers of a message: metrics refuse what robots refuse."""
     match message:
         case SentPose():
-            return is_count(message.seq) and 0.0 < message.stamp < message.received + FUTURE_S and 0 <= message.size
+            return is_count(message.seq) and 0.0 < message.stamp < message.received + FUTURE_S and message.size >= 0
         case Status():
             counts = (message.sent, message.ticks, message.missed, message.decisions)
             changed = (message.interventions, message.avoided)

@@ -24,7 +24,10 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 SHOWN: Final = 8  # characters of a digest that people compare
 # of these the version may change what a run comes to, or what is said on a wire; those not installed are left out
-LIBRARIES: Final = ("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "cflib", "djitellopy", "rosbags")
+LIBRARIES: Final = (
+    *("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core"),
+    *("cflib", "djitellopy", "rosbags"),
+)
 GIT_S: Final = 5.0
 UNSYNCHRONISED: Final = 5  # what adjtimex returns for a clock that nothing keeps right (TIME_ERROR)
 TIMEX_BYTES: Final = 256  # more than struct timex has
@@ -135,6 +138,12 @@ def installed(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def engine_versions(engine: str) -> list[str]:
+    """Installed distributions of the library that has the name of an engine, each with its version."""
+    names = (engine, f"{engine}-core")  # MuJoCo's engine without its viewer is a distribution of its own
+    return [f"{name} {found}" for name in names if (found := installed(name)) is not None]
 
 
 @cache

@@ -12,7 +12,7 @@ from experiments.report.page import Finding, PageFigure, Section, Table, date_of
 from experiments.report.page import Row as Line
 from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult
-from experiments.sweep.pareto import front, pareto
+from experiments.sweep.pareto import by_environment, front, pareto
 from experiments.sweep.sweep import SweepResult
 from experiments.sweep.table import NUMBERS, CellRow, parameter_columns
 
@@ -22,14 +22,19 @@ LEVELS: Final = (1.01, 1.02, 1.05)  # of IAE: the fewest messages within each ar
 TERMS: Final = (
     ("Messages", "Transmissions of a robot, mean over all but the leaders; relative to the reference, seed by seed."),
     ("IAE, ITAE", "Of the formation error of a robot, mean over all but the leaders; likewise."),
-    ("Acquired", "Share of the seeds in which all robots but the leaders acquired before the first leg."),
+    ("Acquired", "Mean time of the robots but the leaders, over the seeds in which all of them acquired before the "
+     "first leg; in brackets how many seeds these are, if not all."),
+    ("Environment", "Parameters that are not chosen, such as loss, delay and disturbance, and those that the reference "
+     "shares. Only cells of the same environment are compared with each other."),
+    ("Failed", "Runs in which a robot did not do its part, that ended early or never began. They are in no figure, and "
+     "a cell with one is on no front. Ratios are of runs of equal length."),
     ("Gap", "Shortest time between two transmissions of any robot in any seed."),
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
 CAPTIONS: Final = (
-    "Messages against IAE; towards the lower left is better. Full: no other has fewer messages and no more error (grey "
-    "line). Along a curve the named parameter changes, markers tell the others; more than 7 curves or markers are not "
-    "joined. Whiskers: 95 % confidence.",
+    "Messages against IAE; towards the lower left is better. Full: no other of the same environment has fewer messages "
+    "and no more error (grey line); hollow: another has, or runs failed. Along a curve the named parameter changes, "
+    "markers tell the others; more than 7 curves or markers are not joined. Whiskers: 95 % confidence.",
     "Messages against ITAE, likewise.",
 )
 
@@ -54,7 +59,8 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         if found.missing:
             notes.append(Finding("bad", f"interrupted: {found.missing} runs are missing; the same command goes on"))
         if found.failures:
-            notes.append(Finding("bad", f"{len(found.failures)} runs failed; the first: {found.failures[0]}"))
+            text = f"{len(found.failures)} runs failed, and count in no figure; the first: {found.failures[0]}"
+            notes.append(Finding("bad", text))
         notes += _fewest(found.rows)
     return render(
         found.folder / PAGE,
@@ -131,22 +137,34 @@ def pictures(
 
 
 def _fewest(rows: Sequence[CellRow]) -> list[Finding]:
-    """The cell with the fewest messages within each level of error; the nearest one if all are worse."""
+    """Per environment the cell with the fewest messages within each level of error; the nearest one if none is."""
+    others = [row for row in rows if not row.reference and not row.failed and row.ratio["iae"].mean is not None]
+    parts = by_environment(others)
+    found: list[Finding] = []
+    for where, part in parts.items():
+        levels = LEVELS if len(parts) == 1 else LEVELS[-1:]
+        found += _fewest_within(part, levels, f"With {where}: " if len(parts) > 1 else "")
+    return found
+
+
+def _fewest_within(rows: Sequence[CellRow], levels: Sequence[float], where: str) -> list[Finding]:
+    """As `_fewest`, of one environment, with words about that in front."""
     found: dict[str, Finding] = {}
-    others = [row for row in rows if not row.reference and row.ratio["iae"].mean is not None]
-    for level in LEVELS:
-        within = [row for row in front(rows) if not row.reference and (row.ratio["iae"].mean or 0.0) <= level]
+    for level in levels:
+        within = [row for row in front(rows) if (row.ratio["iae"].mean or 0.0) <= level]
         if within:
-            text = f"Fewest messages with an IAE ratio of at most {level:g}: {within[0].label}: {_saved(within[0])}"
+            what = f"{where}fewest messages with an IAE ratio of at most {level:g}"
+            text = f"{what[0].upper()}{what[1:]}: {within[0].label}: {_saved(within[0])}"
             found.setdefault(within[0].label, Finding("good" if within[0].acquired == 1.0 else "fair", text))
-    if others and not found:
-        nearest = min(others, key=lambda row: row.ratio["iae"].mean or 0.0)
-        text = f"No cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest: {nearest.label}: {_saved(nearest)}"
+    if not found:
+        nearest = min(rows, key=lambda row: row.ratio["iae"].mean or 0.0)
+        what = f"{where}no cell has an IAE ratio of at most {LEVELS[-1]:g}; the nearest"
+        text = f"{what[0].upper()}{what[1:]}: {nearest.label}: {_saved(nearest)}"
         return [Finding("fair", text)]
     return list(found.values())
 
 
 def _saved(row: CellRow) -> str:
     messages = row.ratio["messages"].mean
-    less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %"
+    less = "?" if messages is None else f"{100.0 * (messages - 1.0):+.1f} %".replace("-", "\N{MINUS SIGN}")
     return f"{less} messages, IAE {ratio_words(row.ratio['iae'])}, ITAE {ratio_words(row.ratio['itae'])}"

@@ -30,9 +30,10 @@ SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, width: float = WIDTH) -> Figure:
     """Messages against an error, both over the reference with the same seeds; one curve for each trigger.
 
-    Of several parameters the first runs along the curves, markers tell the others. Full markers: no other cell has
-    fewer messages and no more error; these are joined by a grey line. Hollow: another one is better. Whiskers are
-    95 % confidence intervals. The reference is the cross at (1, 1).
+    Of several parameters the first runs along the curves, markers tell the others. Full markers: no other cell of the
+    same environment has fewer messages and no more error; these are joined by a grey line for each environment.
+    Hollow: another one is better, or runs failed. Whiskers are 95 % confidence intervals. The reference is the cross
+    at (1, 1).
 
     Args:
         rows: The cells; those whose ratios are unknown are left out.
@@ -40,10 +41,12 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
     """
     known = [row for row in rows if not row.reference and _point_of(row, index) is not None]
-    best = {id(row) for row in front(known, index)}
+    fronts = [front(rows, index) for rows in by_environment(known).values()]
+    best = {id(row) for rows in fronts for row in rows}
     figure = Drawing(figsize=(width, min(2.9, 0.83 * width)), layout="constrained")
     axes = figure.subplots()
-    _draw_front(axes, [row for row in known if id(row) in best], index)
+    for k, of_one in enumerate(fronts):
+        _draw_front(axes, of_one, index, named=k == 0)
     cases = list(dict.fromkeys(row.case for row in known))
     found = curves(known)
     marks = list(dict.fromkeys(other for _, other in found))
@@ -86,14 +89,26 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
 
 
 def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
-    """Cells than which none has fewer messages and no more error, or less error and no more messages."""
+    """Cells than which none has fewer messages and no more error, or less error and no more messages.
+
+    Cells are those of one environment. A cell with failed runs is not among them: those that failed are not counted in
+    its figures.
+    """
     found: list[CellRow] = []
     last = (math.inf, math.inf)
-    points = [(at, row) for row in rows if (at := _point_of(row, index)) is not None]
+    points = [(at, row) for row in rows if not row.failed and (at := _point_of(row, index)) is not None]
     for at, row in sorted(points, key=lambda point: point[0]):
         if at[1] < last[1] or at == last:
             found.append(row)
             last = at
+    return found
+
+
+def by_environment(rows: Sequence[CellRow]) -> dict[str, list[CellRow]]:
+    """Cells that can be compared with each other, by their environment in words."""
+    found: dict[str, list[CellRow]] = {}
+    for row in rows:
+        found.setdefault(row.surroundings, []).append(row)
     return found
 
 
@@ -103,7 +118,7 @@ def curves(rows: Sequence[CellRow]) -> dict[tuple[str, str], list[CellRow]]:
     for row in rows:
         along = _varied_parameter(rows, row.case)
         others = [path for path in row.parameters if path != along and _varies(rows, row.case, path)]
-        fixed = ", ".join(f"{short(path)} = {words_of(row.parameters[path])}" for path in others)
+        fixed = ", ".join(f"{short(path)} = {row.value_of(path)}" for path in others)
         found.setdefault((row.case, fixed), []).append(row)
     return found
 
@@ -133,11 +148,11 @@ def _points(rows: Sequence[CellRow], index: str) -> Array:
     return np.array(found, dtype=float).reshape(-1, 4)
 
 
-def _draw_front(axes: Axes, rows: Sequence[CellRow], index: str) -> None:
+def _draw_front(axes: Axes, rows: Sequence[CellRow], index: str, *, named: bool) -> None:
     points = _points(rows, index)
     x, y = points[points[:, 0].argsort(), :2].T
     line: dict[str, Any] = {"color": "#9a9a9a", "linewidth": 2.2, "alpha": 0.5}
-    axes.plot(x, y, drawstyle="steps-post", label="front (full markers)", zorder=1, **line)
+    axes.plot(x, y, drawstyle="steps-post", label="front (full markers)" if named else "", zorder=1, **line)
 
 
 def _draw_curve(
@@ -168,8 +183,8 @@ def _name_points(axes: Axes, rows: Sequence[CellRow], along: str, points: Array,
         away = float(np.abs(np.log(at / last)).max()) if np.isfinite(last).all() else np.inf
         if not (ends or few) or (not ends and away < CLOSE):
             continue
-        value = words_of(row.parameters[along])
-        words = (f"{short(along)} = {value}" if k == 0 else value).replace("-", "\N{MINUS SIGN}")
+        first = f"{short(along)} = {row.value_of(along)}"
+        words = (first if k == 0 else words_of(row.parameters[along])).replace("-", "\N{MINUS SIGN}")
         halo = [withStroke(linewidth=1.2, foreground=PAPER)]
         style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color": colour, "path_effects": halo}
         left = at[0] >= 1.0  # beside the right edge

@@ -33,6 +33,8 @@ from experiments.sweep.runs import digest
 SEEDS: Final = 20  # if no number is given
 FIRST_TUNING: Final = 1001  # the first seed on which parameters are sought, if none is named
 DIGITS: Final = 4  # of a value in a range
+# tables of the file that make the environment of a run: not chosen, but met
+ENVIRONMENT: Final = ("arena", "channel", "disturbance", "duration_s", "hosts", "robots", "start", "timeline", "world")
 MOST_CELLS: Final = 20_000
 MOST_SEEDS: Final = 100_000
 HOW: Final = "write PATH=LOW:HIGH:log12 (or lin12), or PATH=A,B,C; for example trigger.threshold=0.002:0.05:log12"
@@ -87,6 +89,8 @@ class Cell:
     # trigger
     reference: str
     digest: str  # of what is run
+    # those of `parameters` that the reference has too, or that are no choice: cells are compared where these are equal
+    environment: Mapping[str, Any]
 
 
 def arguments(given: Sequence[str]) -> tuple[list[Axis], dict[str, str]]:
@@ -163,13 +167,15 @@ def combination(
     changed = _changed(file, settings, values)
     compared_with = changed if others == values else _changed(file, settings, others)
     reference = digest(compared_with[first])
+    shared = [axis for axis in others if _has(first, compared_with[first], paths[axis])]
     for name, experiment, given in (
         (first, compared_with[first], others),
         *((name, changed[name], values) for name in names),
     ):
         own = [axis for axis in given if _has(name, experiment, paths[axis])]
         mine = {axis.path: paths[axis].value for axis in own}
-        yield Cell(name, mine, experiment, reference, digest(experiment))
+        met = {axis.path: paths[axis].value for axis in own if axis in shared or paths[axis].path[0] in ENVIRONMENT}
+        yield Cell(name, mine, experiment, reference, digest(experiment), met)
 
 
 def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> dict[str, Experiment]:

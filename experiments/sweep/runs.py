@@ -6,9 +6,7 @@ import hashlib
 import math
 import statistics
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
@@ -20,10 +18,10 @@ from agents.plugins import registry
 from experiments.definition.experiment import Experiment
 from experiments.definition.standby import without_standby
 from experiments.file.structure import plugin_files
-from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of
+from experiments.metrics.measure import KNOWN, WINDOW_S, bounds_of, ended_early, failures
 from experiments.metrics.signals import LinkErrors, integrals, leaders, transmission_gaps, transmissions
 from experiments.recording.trace import Trace
-from experiments.recording.version import ROOT
+from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import Logbook
@@ -47,6 +45,9 @@ class Figures(msgspec.Struct, frozen=True):
     gap_min_s: float | None  # shortest time between two transmissions of any robot [s]; None if none sent twice
     updates: float | None  # times that a goal was computed anew; a mean as those above
     dropped: int  # samples that the modelled network dropped on all links
+    duration_s: float  # of the run [s]
+    # what kept robots from their parts, or ended the run before its time; empty: nothing. Such a run has failed
+    failure: str = ""
 
 
 class WorkResult(msgspec.Struct, frozen=True):
@@ -76,14 +77,18 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
     if mine != code:
         return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
     runs, failed = _flown(without_standby(experiment), tuple(seeds))
-    runs.sort(key=lambda run: seeds.index(run.seed))
-    return msgspec.json.encode(WorkResult(runs, failed))
+    failed |= {run.seed: run.failure for run in runs if run.failure}
+    whole = sorted((run for run in runs if not run.failure), key=lambda run: seeds.index(run.seed))
+    return msgspec.json.encode(WorkResult(whole, failed))
 
 
 def digest(experiment: Experiment) -> str:
-    """The same for experiments that run in the same way: title, source, cases and the file's own seed are left out."""
+    """The same for experiments that run in the same way: title, source, cases and the file's own seed are left out.
+
+    Robots and links count in the order of the file, by which starts are drawn and sums are formed.
+    """
     bare = msgspec.structs.replace(experiment, title="", source="", cases={}, seed=0)
-    return hashlib.sha256(msgspec.json.encode(bare, order="sorted")).hexdigest()[:20]
+    return hashlib.sha256(msgspec.json.encode(bare)).hexdigest()[:20]
 
 
 def code_of(experiment: Experiment) -> str:
@@ -94,11 +99,10 @@ def code_of(experiment: Experiment) -> str:
     """
     files = plugin_files(experiment)
     engine = registry.split(experiment.world.engine)[0]
-    with suppress(PackageNotFoundError):
-        engine += version(engine)
+    engines = [engine, *engine_versions(engine)]
     others = sorted(_file_digest(file) for file in files if file.parent.parent != ROOT)
     return hashlib.sha256(
-        ":".join((digest_of_code(packages=PACKAGES), np.__version__, engine, *others)).encode()
+        ":".join((digest_of_code(packages=PACKAGES), np.__version__, *engines, *others)).encode()
     ).hexdigest()[:20]
 
 
@@ -148,7 +152,14 @@ def _figures(trace: Trace) -> Figures:
         gap_min_s=min(waits, default=None),
         updates=_mean(trace.decisions[kept].astype(float).tolist()),
         dropped=0 if trace.dropped is None else int(trace.dropped.sum()),
+        duration_s=float(trace.time[-1] - trace.time[0]),
+        failure="; ".join(failures(trace, known.tolist())) or _early_end(trace),
     )
+
+
+def _early_end(trace: Trace) -> str:
+    """How much of its time a run took, if it ended early."""
+    return f"ended at {trace.time[-1]:.1f} s of {trace.experiment.duration_s:g} s" if ended_early(trace) else ""
 
 
 def _mean(values: Sequence[float]) -> float | None:

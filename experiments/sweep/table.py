@@ -9,7 +9,8 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.metrics.statistics import Spread, ratio, spread
+from experiments.file import reference as reference_of_file
+from experiments.metrics.statistics import Spread, equally_long, ratio, spread
 from experiments.report.page import NONE, interval
 from experiments.report.tables import ratio_words
 from experiments.sweep.plan import Cell
@@ -17,6 +18,7 @@ from experiments.sweep.runs import Figures
 
 MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
 RATIOS: Final = ("messages", "iae", "itae", "rmse")
+SHORT: Final = 5  # letters of a unit that stands behind a value
 
 
 class CellRow(msgspec.Struct, frozen=True):
@@ -24,11 +26,14 @@ class CellRow(msgspec.Struct, frozen=True):
 
     case: str
     parameters: dict[str, Any]  # values of the axes that it has, by path
+    environment: dict[str, Any]  # those of them that are no choice, see `Cell`: only cells of equal ones are compared
+    units: dict[str, str]  # of the parameters that have a short one, by path
     reference: bool  # the ratios of others are taken over it
     seeds: int  # runs that succeeded
-    failed: int  # runs that failed
+    failed: int  # runs that failed, or in which a robot did; the statistics leave them out
     mean: dict[str, Spread]  # over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired
-    ratio: dict[str, Spread]  # of each of `RATIOS` over the reference with the same seed, then over the seeds
+    # of each of `RATIOS` over the reference with the same seed, then over the seeds; only of runs of equal length
+    ratio: dict[str, Spread]
     acquired: float | None  # share of the seeds in which every robot but the leaders acquired
     gap_min_s: float | None  # shortest time between two transmissions of any robot, in all seeds [s]
 
@@ -38,8 +43,17 @@ class CellRow(msgspec.Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """The parameters in a few words: `threshold=0.01`."""
-        return ", ".join(f"{short(path)}={words_of(value)}" for path, value in self.parameters.items())
+        """The parameters in a few words: `threshold=0.01 m`."""
+        return ", ".join(f"{short(path)}={self.value_of(path)}" for path in self.parameters)
+
+    def value_of(self, path: str) -> str:
+        """The value of a parameter, with its unit."""
+        return f"{words_of(self.parameters[path])} {self.units.get(path, '')}".strip()
+
+    @property
+    def surroundings(self) -> str:
+        """The environment in a few words: `loss=0.1`."""
+        return ", ".join(f"{short(path)}={self.value_of(path)}" for path in self.environment)
 
     @property
     def label(self) -> str:
@@ -50,12 +64,18 @@ class CellRow(msgspec.Struct, frozen=True):
 def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures], failed: int = 0) -> CellRow:
     """A cell's runs, by seed, and those of its reference."""
     mine = [runs[seed] for seed in sorted(runs)]
-    paired = [(runs[seed], reference[seed]) for seed in sorted(runs) if seed in reference]
+    paired = [
+        (runs[seed], reference[seed])
+        for seed in sorted(runs)
+        if seed in reference and equally_long((runs[seed].duration_s, reference[seed].duration_s))
+    ]
     acquired = [run.acquired_s is not None for run in mine]
     gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
     return CellRow(
         case=cell.case,
         parameters=dict(cell.parameters),
+        environment=dict(cell.environment),
+        units={path: unit for path in cell.parameters if 0 < len(unit := reference_of_file.unit(path)) <= SHORT},
         reference=cell.digest == cell.reference,
         seeds=len(mine),
         failed=failed,
@@ -111,12 +131,26 @@ def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
         raise ValueError(str(error)) from None
 
 
+def _of_seeds(row: CellRow, text: str, index: str) -> str:
+    """A ratio in words, and of how many seeds it is, unless it is of all."""
+    known = row.ratio[index].n
+    return text if known in {0, row.seeds} else f"{text} ({known} of {row.seeds})"
+
+
+def _acquired(row: CellRow) -> str:
+    """Mean time of acquisition over the seeds in which all acquired, and how many these are, unless all did."""
+    known = row.mean["acquired_s"].n
+    if not known:
+        return f"never ({row.seeds} seeds)" if row.seeds else NONE
+    return interval(row.mean["acquired_s"]) + (f" ({known} of {row.seeds})" if known < row.seeds else "")
+
+
 NUMBERS: Final[Mapping[str, tuple[str, Callable[[CellRow], str]]]] = {  # for people, by the name behind `--metrics`
     "f": ("f [Hz]", lambda row: interval(row.mean["f_hz"])),
-    "messages": ("messages ratio", lambda row: ratio_words(row.ratio["messages"])),
-    "iae": ("IAE ratio", lambda row: ratio_words(row.ratio["iae"])),
-    "itae": ("ITAE ratio", lambda row: ratio_words(row.ratio["itae"])),
-    "acquired": ("acquired", lambda row: NONE if row.acquired is None else f"{100.0 * row.acquired:.0f} %"),
+    "messages": ("messages ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["messages"]), "messages")),
+    "iae": ("IAE ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["iae"]), "iae")),
+    "itae": ("ITAE ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["itae"]), "itae")),
+    "acquired": ("acquired [s]", _acquired),
     "gap": ("gap [ms]", lambda row: NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}"),
     "dropped": ("dropped", lambda row: interval(row.mean["dropped"])),
 }
@@ -146,8 +180,11 @@ def parameter_columns(rows: Sequence[CellRow]) -> dict[str, list[str]]:
     for head, mine in paths.items():
         alone = all(len(row.parameters.keys() & set(mine)) < 2 for row in rows)
         columns |= {head: mine} if alone else {path: [path] for path in mine}
+    units = {path: unit for row in rows for path, unit in row.units.items()}
     return {
-        head: [next((words_of(row.parameters[path]) for path in mine if path in row.parameters), NONE) for row in rows]
+        f"{head} [{units[mine[0]]}]" if mine[0] in units else head: [
+            next((words_of(row.parameters[path]) for path in mine if path in row.parameters), NONE) for row in rows
+        ]
         for head, mine in columns.items()
     }
 

@@ -14,7 +14,7 @@ SHORT = ["duration_s=4.0"]
 def row(**ratios):
     found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in RATIOS}
     mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in MEANS}
-    return CellRow("event", {}, False, 9, 0, mean, found, 1.0, 0.02)
+    return CellRow("event", {}, {}, {}, False, 9, 0, mean, found, 1.0, 0.02)
 
 
 def test_a_wish():

@@ -109,9 +109,9 @@ def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
 
 def test_the_version_of_the_engines_library_counts(park, monkeypatch):
     """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
-    real = runs.version
+    real = runs.engine_versions
     pymunk = msgspec.structs.replace(park, world=World(engine="pymunk"))
     before = code_of(park), code_of(pymunk)
-    monkeypatch.setattr(runs, "version", lambda name: "0.0" if name == "pymunk" else real(name))
+    monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "pymunk" else real(name))
     assert code_of(park) == before[0]
     assert code_of(pymunk) != before[1]

@@ -202,21 +202,21 @@ def test_curves_go_along_the_first_parameter(tmp_path):
     assert [row.parameters["trigger.threshold"] for row in drawn["event", "gain = 2"]] == [0.005, 0.02]
     axes = pareto(found.rows).axes[0]
     assert axes.get_xlabel() == "messages relative to periodic"
-    assert [text.get_text() for text in axes.texts] == ["threshold = 0.005", "0.02"]
+    assert [text.get_text() for text in axes.texts] == ["threshold = 0.005 m", "0.02"]
     assert axes.get_legend_handles_labels()[1][1:] == ["event", "gain = 2", "gain = 3", "periodic (reference)"]
     page = sweep_page.table(found.rows, "a title")
-    assert page.head[:3] == ("Case", "threshold", "gain")
+    assert page.head[:3] == ("Case", "threshold [m]", "gain")
     assert page.keys == 3
     assert "In all cells: " in page.note
 
 
 def test_cells_that_tie_are_all_on_the_front_and_share_a_column_of_parameters(done):
     (row, *_) = [row for row in done.rows if not row.reference]
-    other = msgspec.structs.replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3})
+    other = msgspec.structs.replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3}, units={})
     assert front([row, other]) == [row, other]
-    assert parameter_columns([row, other]) == {"threshold": ["0.005", "0.3"]}
+    assert parameter_columns([row, other]) == {"threshold [m]": ["0.005", "0.3"]}
     both = msgspec.structs.replace(row, parameters={**row.parameters, **other.parameters})
-    assert list(parameter_columns([row, both])) == ["trigger.threshold", "cases.other.trigger.threshold"]
+    assert list(parameter_columns([row, both])) == ["trigger.threshold [m]", "cases.other.trigger.threshold"]
 
 
 def test_figures_of_a_search_are_drawn_at_any_width(done, tmp_path):
