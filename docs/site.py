@@ -102,7 +102,9 @@ def commands() -> Iterator[str]:
     yield "and folders of runs; in zsh and fish where a `zenpark` is on the PATH. `ZENPARK_CONNECT` is the default"
     yield "of `--connect` (several routers with spaces between them).\n"
     yield from ("| exit code | meaning |", "|---|---|", "| 0 | done |", "| 1 | it ran, and something failed |")
-    yield "| 2 | wrong input: the message names the place and the remedy |\n| 130 | ended by Ctrl-C |\n"
+    yield "| 2 | wrong input: the message names the place and the remedy |"
+    yield "| 3 | a run was spoiled: its figures are compared with nothing ([why](../runs.md)) |"
+    yield "| 130 | ended by Ctrl-C |\n"
     every = getattr(typer.main.get_command(app), "commands", {})
     for title, names in PANELS.items():
         yield f"\n## {title}\n"

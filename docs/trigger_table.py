@@ -86,7 +86,7 @@ def written(choice: dict[str, Any] | None) -> str:
 
 def communication(base: Experiment, seeds: Sequence[int]) -> None:
     """Who speaks when, on a good network and on a bad one."""
-    print("| trigger | with | messages/s | saved | IAE | ITAE | belief | shortest | formed | IAE, bad | formed, bad |")
+    print("| trigger | with | f [Hz] | saved | IAE | ITAE | belief | shortest | formed | IAE, bad | formed, bad |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     reference = measured(msgspec.structs.replace(base, trigger=MATCHED["periodic"]), seeds)
     f, iae, itae = (mean(reference, index) for index in ("f_hz", "iae", "itae"))
@@ -104,7 +104,7 @@ def communication(base: Experiment, seeds: Sequence[int]) -> None:
 
 def control(base: Experiment, seeds: Sequence[int]) -> None:
     """When the law is computed, with the chosen trigger for the messages."""
-    print("| update | with | computed | messages/s | IAE | ITAE | J2 | formed |")
+    print("| update | with | computed | f [Hz] | IAE | ITAE | J2 | formed |")
     print("|---|---|---|---|---|---|---|---|")
     base = msgspec.structs.replace(base, trigger=CHOSEN)
     reference = measured(base, seeds)

@@ -22,7 +22,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
-from experiments.metrics import measure
+from experiments.metrics import comparable, measure
 from experiments.metrics.results import CaseMetrics
 from experiments.recording import playback
 from experiments.recording.reader import RecordingError
@@ -89,7 +89,8 @@ class Run:
 
     def __repr__(self) -> str:
         where = f" in {self.folder}" if self.folder else ""
-        return f"<Run of {self.title!r}, seed {self.seed}, cases {', '.join(self.traces) or 'none'}{where}>"
+        alone = next((f"; {note}" for note in self.notes if note.startswith(ALONE)), "")
+        return f"<Run of {self.title!r}, seed {self.seed}, cases {', '.join(self.traces) or 'none'}{where}{alone}>"
 
     def _repr_html_(self) -> str:
         """Verdict and table of the report, at the end of a cell."""
@@ -197,6 +198,9 @@ def _pass_progress(progress: Progress, case: str, duration_s: float, elapsed: fl
     progress(case, int(min(elapsed, duration_s)) if elapsed > 0.0 else 0, math.ceil(duration_s))
 
 
+ALONE: Final = "this is seed"
+
+
 def reopen(folder: str | Path) -> Run:
     """The run in a folder, read back from its recordings; without traces if no case had begun.
 
@@ -210,7 +214,13 @@ def reopen(folder: str | Path) -> Run:
     files.sort(key=lambda file: order.index(file.stem) if file.stem in order else len(order))
     if not files:
         raise RecordingError(f"{folder}: holds no recording (.mcap); name the folder of a run")
-    return read_back(folder, {file.stem: file for file in files}, [])
+    told = origin.failures if (origin := read_origin(folder)) else []
+    found = read_back(folder, {file.stem: file for file in files}, [], told)
+    seeds = list(dict.fromkeys(each.seed for each in case_figures(folder / METRICS)))
+    if len(seeds) > 1:
+        note = f"{ALONE} {found.seed} of {len(seeds)}: of the others metrics are kept, `reopen_seeds` gives them"
+        return replace(found, notes=(*found.notes, note))
+    return found
 
 
 def reopen_seeds(folder: str | Path) -> list[Run]:
@@ -232,14 +242,19 @@ def reopen_seeds(folder: str | Path) -> list[Run]:
             f"{file}: was written by another version ({error}), and most of its seeds are not recorded; "
             "repeat the run, or keep this report"
         ) from None
+    recorded = replace(recorded, notes=tuple(note for note in recorded.notes if not note.startswith(ALONE)))
     runs = {seed: Run(recorded.title, seed, {}, {}, recorded.folder, recorded.source) for seed in seeds}
     for case in kept:
         runs[case.seed].metrics[case.case] = case
     return [recorded, *(run for seed, run in runs.items() if seed != recorded.seed)]
 
 
-def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]) -> Run:
-    """A run from its recordings, by case; those of killed recorders too, as far as they go."""
+def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str], failures: Sequence[str] = ()) -> Run:
+    """A run from its recordings, by case; those of killed recorders too, as far as they go.
+
+    Args:
+        failures: What the conductor knows to have failed, each with its case in front.
+    """
     traces: dict[str, Trace] = {}
     remarks, made = list(notes), []
     for case, file in recordings.items():
@@ -248,15 +263,27 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
         except playback.NotStarted as nothing:
             remarks.append(f"{case}: {nothing}")
             continue
-        traces[played.trace.case] = played.trace
+        if (name := played.trace.case) in traces:
+            remarks.append(f"{name}: several recordings are of this case; shown is {file.name}")
+        traces[name] = played.trace
         made.append(played.started if played.trace.clock == "real" else file.stat().st_mtime)
         if not played.complete:
             remarks.append(f"{case}: the recording was cut off; `./zenpark recover {file}` mends it")
+    seeds = {case: trace.seed for case, trace in traces.items()}
+    if len({*seeds.values()}) > 1:
+        remarks.append(
+            f"the recordings are of different seeds: {', '.join(f'{case} {k}' for case, k in seeds.items())}"
+        )
     source = folder / SOURCE
     arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
     text = document.join_texts([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
     title = next((trace.experiment.title for trace in traces.values()), "")
-    return replace(_measured(title, traces, folder, text, remarks), made=min(made, default=0.0))
+    run = _measured(title, traces, folder, text, remarks)
+    told = {
+        case: [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")] for case in traces
+    }
+    failed = {case: comparable.with_failures(found, told[case]) for case, found in run.metrics.items()}
+    return replace(run, metrics=failed, made=min(made, default=0.0))
 
 
 def _measured(

@@ -175,7 +175,7 @@ def totals(rows: Sequence[Row], shown: int) -> Row:
     )
 
 
-HEADS: Final = ("robot", "phase", "error, m", "1/s", "late", "lost", "CPU", "battery", "sent", "")
+HEADS: Final = ("robot", "phase", "error, m", "f, Hz", "late", "lost", "CPU", "battery", "sent", "")
 LEFT: Final = (0, 1, len(HEADS) - 1)  # columns that begin at the left
 
 

@@ -40,7 +40,7 @@ run = simulate(document)
 assert list(run.traces) == ["periodic", "event", "predictive"]
 for name, case in run.metrics.items():
     mean = case.mean
-    print(f"{name:>10}: {mean['f_hz']:5.2f} messages/s, IAE {mean['iae']:.2f} m s, ITAE {mean['itae']:.1f} m s²")
+    print(f"{name:>10}: f {mean['f_hz']:5.2f} Hz, IAE {mean['iae']:.2f} m s, ITAE {mean['itae']:.1f} m s²")
 
 # %% [markdown]
 # These are means over the six followers. Two of the three figures are worth doing by hand. f is the number of
@@ -131,7 +131,7 @@ calm = simulate(load("robotic-park", "disturbance.crazyflie={}"), cases=["event"
 rate = {robot.robot: robot.f_hz for robot in run.metrics["event"].robots}
 calm_rate = {robot.robot: robot.f_hz for robot in calm.robots}
 for robot in ("CF01", "CF02", "CF03"):
-    print(f"{robot}: {rate[robot]:.2f} messages/s, without jitter {calm_rate[robot]:.2f}")
+    print(f"{robot}: f {rate[robot]:.2f} Hz, without jitter {calm_rate[robot]:.2f} Hz")
     assert calm_rate[robot] < 0.5 * rate[robot]
 
 # %%

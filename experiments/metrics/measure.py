@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from agents.arrays import norm
@@ -24,6 +25,7 @@ from experiments.definition import link_conditions
 from experiments.definition.formation import compile_anchors
 from experiments.metrics import centralised
 from experiments.metrics.clearance import Clearance, collisions
+from experiments.metrics.comparable import reasons
 from experiments.metrics.results import INDICES, Approach, Belief, CaseMetrics, Collision, Passage, Phase, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
@@ -125,7 +127,7 @@ def measure(trace: Trace) -> CaseMetrics:
     beyond = outside_arena(trace)
     farthest = int(beyond.argmax())
     ticks = int(trace.ticks.sum())
-    return CaseMetrics(
+    found = CaseMetrics(
         case=trace.case,
         seed=trace.seed,
         clock=trace.clock,
@@ -174,6 +176,7 @@ def measure(trace: Trace) -> CaseMetrics:
         deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
     )
+    return msgspec.structs.replace(found, spoiled=reasons(found))
 
 
 def ended_early(trace: Trace) -> bool:

@@ -207,3 +207,5 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     network_bytes: int = 0  # payload of these messages
     deliveries: int = 0  # of the same messages those that arrived, counted once for each receiver
     guidance: Guidance | None = None  # None if each robot decides for itself
+    # why the figures are compared with none of another case, one clause each, see `metrics.comparable`
+    spoiled: tuple[str, ...] = ()

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
 
+from experiments.metrics.comparable import SAME_COVERAGE, coverage, equally_long
 from experiments.metrics.results import INDICES, CaseMetrics
 
-# indices that grow with the length of a run
-SUMS: Final = ("messages", "bytes", "iae", "itae", "lost", "dropped", "missed_deadlines")
-
-
-SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ that are compared
-
-
-def equally_long(lengths: Iterable[float]) -> bool:
-    """Whether runs of these lengths [s] can be compared: what is summed, and what fades, depends on the length."""
-    known = [*lengths]
-    return not known or max(known) - min(known) <= SAME_LENGTH * max(known)
+# indices that grow with the known part of a run
+INTEGRALS: Final = ("iae", "itae")
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:
@@ -32,11 +24,17 @@ def ratio(value: float | None, reference: float | None) -> float | None:
 def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
     """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean.
 
-    None for what grows with the length of a run if the runs are of different length: one was interrupted.
+    None for runs that were spoiled, for those that are shorter than others, and of integrals for those of which less is
+    known than of others; such a run of the reference is left out.
     """
-    if index in SUMS and not same_length([*runs, *reference]):
-        return [None] * len(runs)
-    return ratios_by_seed(*({run.seed: run.mean[index] for run in each} for each in (runs, reference)))
+    every = [*runs, *reference]
+    longest, most = max(run.duration_s for run in every), max(coverage(run) for run in every)
+
+    def value(run: CaseMetrics) -> float | None:
+        less = index in INTEGRALS and most - coverage(run) > SAME_COVERAGE
+        return None if run.spoiled or less or not equally_long((run.duration_s, longest)) else run.mean[index]
+
+    return ratios_by_seed(*({run.seed: value(run) for run in each} for each in (runs, reference)))
 
 
 def ratios_by_seed(values: Mapping[int, float | None], reference: Mapping[int, float | None]) -> list[float | None]:
@@ -47,9 +45,8 @@ def ratios_by_seed(values: Mapping[int, float | None], reference: Mapping[int, f
 
 
 def same_length(runs: Sequence[CaseMetrics]) -> bool:
-    """Whether runs can be compared: equally long within 2 %, or as long as each was to be."""
-    lengths = [run.duration_s for run in runs]
-    return not any(run.interrupted for run in runs) or max(lengths) - min(lengths) <= 0.02 * max(lengths)
+    """Whether all runs are equally long."""
+    return equally_long(run.duration_s for run in runs)
 
 
 def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:

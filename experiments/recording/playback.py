@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from agents.arrays import Array, Index, PoseTable, known_rows
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
-from agents.network.validation import FUTURE_S, is_count
+from agents.network.validation import ABSURD, FUTURE_S, is_count
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
@@ -211,7 +211,8 @@ class _Content:
         # robots that were there until the end are known until the first of them falls silent: some messages of the
         # others only came later into the file, which is no reason to call them dead
         end = min((at for at in last.values() if at > end - HOLE_S), default=end)
-        return duration if end > duration - EARLY_S else end
+        landed = any(state.phase in LANDED for state in self[State])  # else the recording broke off
+        return duration if not last or end > duration - (EARLY_S if landed else 0.0) else end
 
     def _choose(self, channel: int) -> Callable[[bytes], None] | None:
         if (topic := topic_of(self.records, channel)) is None:
@@ -313,7 +314,8 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
     grid = (time, hold)
 
     def column(what: str, width: int) -> Array:
-        return known_rows((getattr(state, what) for state in states), width)
+        values = known_rows((getattr(state, what) for state in states), width)
+        return np.where(np.abs(values) < ABSURD, values, np.nan)
 
     measured, truth = column("position", 3), column("true_position", 3)
     return {
@@ -355,13 +357,14 @@ def _received(states: list[list[State]], plan: Plan, start: float, duration: flo
     ends, names = plan.pose_links, plan.names
     pairs = zip(ends.receiver.tolist(), ends.sender.tolist(), strict=True)
     links = {(receiver, names[sender]): link for link, (receiver, sender) in enumerate(pairs)}
-    rows = [
-        (links[row, each.sender], each.seq, each.stamp, each.arrived, *each.position, *each.velocity, math.nan, 0)
+    found = {
+        (links[row, each.sender], each.seq, each.stamp, each.arrived): each
         for row, own in enumerate(states)
         for state in own
         for each in state.received
         if (row, each.sender) in links and is_count(each.seq)
-    ]
+    }  # a state that is recorded twice repeats its receipts
+    rows = [(*about, *each.position, *each.velocity, math.nan, 0) for about, each in found.items()]
     return received_in_run(replace(_table(rows), yaw=None, bytes=None).since(start), duration)
 
 

@@ -44,6 +44,7 @@ class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     ended: float | None = None  # [s] UTC; None while it goes on, or if it was killed
     load_after: float | None = None  # see `Provenance.load`
     made_by: Provenance | None = None  # code, versions and machine
+    failures: list[str] = []  # that its recordings do not tell, each with its case in front
 
 
 def read_origin(folder: Path) -> RunOrigin | None:
@@ -117,6 +118,9 @@ class PastRun(msgspec.Struct, frozen=True):
     recorded: bool  # whether it has a recording
     seeds: list[int]
     cases: dict[str, dict[str, dict[int, float | None]]]  # `KEY_FIGURES` of each case, by seed; None: not known
+    # of each case and seed what a reader of its figures must know: how much of its time it took, what spoiled it
+    remarks: dict[str, dict[int, str]] = {}
+    lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
 
     def matches(self, words: Sequence[str]) -> bool:
         """Whether each word is one of its tags, or stands in its folder's name, its title or a case, in any case."""
@@ -150,6 +154,12 @@ def _past_run(folder: Path) -> PastRun | None:
     if not (recorded or cases or origin.begun):
         return None
     figures: dict[str, dict[str, dict[int, float | None]]] = {}
+    remarks: dict[str, dict[int, str]] = {}
+    lengths: dict[str, dict[int, float]] = {}
+    for each in cases:
+        lengths.setdefault(each.case, {})[each.seed] = each.duration_s
+        if each.remark:
+            remarks.setdefault(each.case, {})[each.seed] = each.remark
     for case in dict.fromkeys(each.case for each in cases):
         means = {each.seed: each.mean for each in cases if each.case == case}
         figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in KEY_FIGURES}
@@ -158,7 +168,7 @@ def _past_run(folder: Path) -> PastRun | None:
         made = origin.begun or source.stat().st_mtime
     except OSError:  # removed meanwhile
         return None
-    return PastRun(str(folder), origin, made, 1e-6 * _size(folder), recorded, seeds, figures)
+    return PastRun(str(folder), origin, made, 1e-6 * _size(folder), recorded, seeds, figures, remarks, lengths)
 
 
 def _size(folder: Path) -> int:
@@ -176,6 +186,17 @@ class CaseFigures(msgspec.Struct, frozen=True):
     case: str
     seed: int
     mean: dict[str, float | None]
+    duration_s: float = 0.0  # [s]; 0 in those of another version
+    planned_s: float = 0.0  # [s]
+    interrupted: bool = False
+    spoiled: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
+
+    @property
+    def remark(self) -> str:
+        """What a reader of the figures must know; empty: nothing."""
+        early = [f"{self.duration_s:.1f} s of {self.planned_s:g} s"] if self.interrupted else []
+        return "; ".join([*early, *self.spoiled])
 
 
 def case_figures(file: Path) -> list[CaseFigures]:

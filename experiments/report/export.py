@@ -58,7 +58,7 @@ UNITS: Final[dict[str, Any]] = {
         "bearing": "1, from the speaker to the listener",
     },
     "metrics": {
-        "f_hz": "1/s",
+        "f_hz": "Hz",
         "bytes": "bytes",
         "iae": "m s",
         "itae": "m s^2",

@@ -35,6 +35,7 @@ from experiments.report.style import (
     INK,
     MAGENTA,
     MANY,
+    MARKERS,
     PAPER,
     SHORTEST_S,
     WIDTH,
@@ -158,10 +159,13 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
             robots = [robot for run in runs for robot in run.robots]
             found = [spread([getattr(each, index) for each in robots if each.robot == name]) for name in names]
             x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * share
-            _bars(axes, x, found, width=share, k=k, label=plain(name))
+            if wide:
+                _points(axes, x, found, k=k)
+            else:
+                _bars(axes, x, found, width=share, k=k, label=plain(name))
         axes.set_ylabel(f"{label} [{unit}]")
         axes.tick_params(axis="x", length=0)
-        if wide:  # beside fifty messages a second two are seen on a logarithmic axis alone
+        if wide:  # beside fifty messages a second two are seen on a logarithmic axis alone, which has no zero for bars
             axes.set_yscale("log")
             axes.set_ylim(0.5 * min(known), 1.3 * max(known))
             axes.yaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
@@ -175,7 +179,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     panels[-1].set_xticks(range(len(names)), words, rotation=upright, fontsize=size)
     panels[-1].set_xlim(-0.6, len(names) - 0.4)
     figure.align_ylabels(list(panels))
-    legend_above(figure, panels[0].get_legend_handles_labels(), columns=3)
+    legend_above(figure, panels[-1].get_legend_handles_labels(), columns=3)
     return figure
 
 
@@ -389,6 +393,18 @@ def _bars(
     if any(error):
         axes.errorbar(x, height, error, fmt="none", ecolor=INK, elinewidth=0.7, capsize=1.5, capthick=0.7)
     return height, error
+
+
+def _points(axes: Axes, x: NDArray[np.floating], found: Sequence[Spread], *, k: int) -> None:
+    """Means as points with their confidence intervals; those of zero are written at the lower edge."""
+    colour = CASES[k % len(CASES)]
+    for at, each in zip(x, found, strict=True):
+        if each.mean:
+            style: Line = {"color": colour, "marker": MARKERS[k % len(MARKERS)], "markersize": 3.5, "linestyle": ""}
+            axes.errorbar(at, each.mean, each.ci95 or 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7, **style)
+        elif each.mean is not None:
+            edge: Line = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
+            axes.annotate("0", (at, 0.02), fontsize=6, color=colour, **edge)
 
 
 def first_seed(traces: Sequence[Trace]) -> list[Trace]:

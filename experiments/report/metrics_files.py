@@ -36,6 +36,7 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
                 **({} if case.guidance is None else {"guidance": msgspec.to_builtins(case.guidance)}),
                 "near_m": None if case.near is None else case.near.gap,
                 **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
+                **({"spoiled": list(case.spoiled)} if case.spoiled else {}),
             }
             for case in cases
         },
@@ -49,7 +50,8 @@ def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
         table.writeheader()
         for case in cases:
             table.writerows(_robot_rows(case))
-            table.writerow({"seed": case.seed, "case": case.case, "robot": "mean", **case.mean})
+            known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
+            table.writerow({**known, "robot": "mean", **case.mean})
 
 
 def rows(cases: Sequence[CaseMetrics]) -> Iterator[dict[str, object]]:
@@ -65,7 +67,7 @@ def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
     shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
-    return ["seed", "case", "in_mean", *_PLAIN, *phases, *near, *shadows]
+    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows]
 
 
 _PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
@@ -81,7 +83,8 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
             if near is not None:
                 row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
         row |= _flat_shadow(robot.shadow) if robot.shadow else {}
-        yield {"seed": case.seed, "case": case.case, "in_mean": int(robot.robot not in out), **row}
+        known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
+        yield {**known, "in_mean": int(robot.robot not in out), **row}
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:

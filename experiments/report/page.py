@@ -59,7 +59,9 @@ def number(value: float | None, scale: float = 1.0) -> str:
 
 def interval(values: Spread, scale: float = 1.0) -> str:
     """A mean and, if the values differ, its 95 % half-width with as many decimals as its first digit needs."""
-    if values.mean is None or not values.ci95:
+    if (
+        values.mean is None or not values.ci95 or values.ci95 <= 1e-9 * abs(values.mean)
+    ):  # values that differ by rounding
         return number(values.mean, scale)
     mean, half = values.mean * scale, values.ci95 * scale
     decimals = min(6, max(0, -math.floor(math.log10(half)), 2 - math.floor(math.log10(max(abs(mean), half)))))

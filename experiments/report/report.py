@@ -35,7 +35,7 @@ from experiments.report.tables import (
     summary_table,
     whole_tables,
 )
-from experiments.report.verdict import failures, findings, interruptions, left_out
+from experiments.report.verdict import failures, findings, interruptions, left_out, spoiled
 
 PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Received poses are counted over all receivers "
@@ -138,7 +138,7 @@ def write(
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
         _DEFINED,
     ]
-    first_of_all, verdict = [*failures(cases), *interruptions(cases)], findings(cases)
+    first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
         verdict.append(Finding("plain", SAME_STARTS))
     return render(

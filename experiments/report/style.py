@@ -20,6 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.path import Path as Outline
+from matplotlib.text import Annotation
+from matplotlib.transforms import Bbox
 
 from agents.arrays import Array
 from experiments.metrics.signals import phase_starts
@@ -41,9 +43,11 @@ CASES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 # robots: Tol's muted colours, so that none of them is taken for a case
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
+CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
 KIND_COLOURS: Final = {"turtlebot3": "#000000", "khepera4": "#44AA99", "crazyflie": "#AA4499", "tello": "#999933"}
 OTHER_KIND: Final = "#7a7a7a"  # of a kind that has no colour of its own
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MANY` robots
 BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
 
 STYLE: Final[Mapping[Any, Any]] = {
@@ -168,6 +172,27 @@ def robot_legend(
     shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
     entries = [*shown.values(), *more[0]], [*shown, *more[1]]
     legend_above(figure, entries, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(entries[1]), 5))
+
+
+def spread_texts(axes: Axes) -> None:
+    """Move texts that lie on others to another corner of their points, and leave out those that find none."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()
+    taken: list[Bbox] = []
+    inside = axes.get_window_extent()
+    for text in list(axes.texts):
+        assert isinstance(text, Annotation)
+        for x, y in CORNERS:
+            text.xyann = (x, y)
+            text.set(ha="left" if x > 0 else "right", va="bottom" if y > 0 else "top")
+            box = text.get_window_extent()
+            whole = inside.x0 <= box.x0 and box.x1 <= inside.x1 + 1.0
+            if whole and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+        else:
+            text.remove()
 
 
 def legend_above(figure: Figure, entries: tuple[Sequence[Any], Sequence[str]], columns: int) -> None:

@@ -32,6 +32,7 @@ from experiments.report.style import (
     KIND_COLOURS,
     MAGENTA,
     MANY,
+    MARKERS,
     OTHER_KIND,
     PAPER,
     ROBOTS,
@@ -60,8 +61,8 @@ FLAT: Final = 0.15  # of its width is how high a picture of robots on the floor 
 def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     """The trajectories from above, and of the arena what is near them; start hollow, end full, links of the end.
 
-    A few cases in the same arena are laid upon each other, with a colour each, their robots named; more are side by
-    side, and their robots have a colour each.
+    A few cases in the same arena are laid upon each other, with a colour each; their robots are named, and few of them
+    have a marker each. More cases are side by side, and their robots have a colour each.
     """
     arenas = {msgspec.json.encode(trace.experiment.arena) for trace in traces}
     overlaid = 1 < len(traces) <= OVERLAID and len(arenas) == 1
@@ -120,16 +121,18 @@ def _label_plane(figure: Figure) -> None:
 def _draw_from_above(axes: Axes, trace: Trace, few: slice, style: Line | None) -> None:
     """Paths of a case from above: in one style, robots named, or with a colour for each robot."""
     place, last = trace.true_position, last_known(trace)
+    first = place[np.isfinite(place).all(axis=2).argmax(axis=0), np.arange(place.shape[1])]
     ink = "#8a8a8a" if style is None else style["color"]
     for pair in edges(trace.plan.links):
         axes.plot(*last[pair, :2].T, color=ink, linewidth=0.5, alpha=1.0 if style is None else 0.6, zorder=1)
     small = 3.0 if len(trace.robots) <= MANY else 2.0
     for i, line in enumerate(robot_lines(trace)):
         colour = line["color"] if style is None else ink
+        marker = MARKERS[i] if style is not None and len(trace.robots) <= MANY else "o"
         path = {**line, "linewidth": 0.8} if style is None else style
         axes.plot(place[few, i, 0], place[few, i, 1], **path)
-        axes.plot(*last[i, :2], "o", ms=small + 0.5, mec="none", color=colour)
-        axes.plot(*place[0, i, :2], "o", ms=small, mec=colour, mfc="none", mew=0.7)
+        axes.plot(*last[i, :2], marker, ms=small + 0.5, mec="none", color=colour)
+        axes.plot(*first[i, :2], marker, ms=small, mec=colour, mfc="none", mew=0.7)
         if style is not None and "alpha" in style and len(trace.robots) <= MANY and np.isfinite(last[i, :2]).all():
             halo = [withStroke(linewidth=1.5, foreground=PAPER)]
             axes.annotate(

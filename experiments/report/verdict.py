@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Sequence
 
+from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoils
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
 from experiments.report.page import Finding, Mark, interval, number
@@ -16,12 +17,13 @@ NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 
 
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """The verdict over all cases, the first one being the reference."""
+    """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled."""
     formation = any(case.belief for case in cases)
-    return [
+    found = [
         *failures(cases),
+        *spoiled(cases),
         *interruptions(cases),
-        *(Finding("bad", f"In {case.case}: {_first_few(case.troubles)}.") for case in cases if case.troubles),
+        *_troubles(cases),
         *_lost_poses(cases),
         *_of_each_case(cases, _modelled),
         *_deadlines(cases),
@@ -36,6 +38,9 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_pace(cases),
         *_shadows(cases),
     ]
+    if any(case.spoiled or case.failures for case in cases):
+        return [Finding("plain", each.text) if each.mark == "good" else each for each in found]
+    return found
 
 
 def _of_each_case(
@@ -48,6 +53,27 @@ def _of_each_case(
 def failures(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Robots that did not do their part; nothing else in a report means much before that is known."""
     return [Finding("bad", f"Failed in {case.case}: {_first_few(case.failures)}.") for case in cases if case.failures]
+
+
+def spoiled(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Which cases are compared with none, and why."""
+    found = []
+    for name, runs in by_case(cases).items():
+        bad = [run for run in runs if run.spoiled]
+        if bad:
+            which = name if len(runs) == 1 else f"{name} ({len(bad)} of {len(runs)} seeds)"
+            why = "; ".join(dict.fromkeys(reason for run in bad for reason in run.spoiled))
+            found.append(Finding("bad", f"Spoiled, and compared with nothing: {which}: {why}."))
+    return found
+
+
+def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """What conductor and recorder found."""
+    return [
+        Finding("bad" if any(map(spoils, case.troubles)) else "fair", f"In {case.case}: {_first_few(case.troubles)}.")
+        for case in cases
+        if case.troubles
+    ]
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -83,11 +109,22 @@ def left_out(cases: Sequence[CaseMetrics]) -> str:
 def _lost_poses(cases: Sequence[CaseMetrics]) -> list[Finding]:
     sent = sum(robot.messages for case in cases for robot in case.robots)
     lost = {name: sum(run.lost for run in runs) for name, runs in by_case(cases).items()}
-    if not any(lost.values()):
-        mark: Mark = "plain" if any(case.failures for case in cases) else "good"
-        return [Finding(mark, f"No pose was lost: {number(sent)} were sent, and no running number is missing.")]
-    where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
-    return [Finding("bad", f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
+    if any(lost.values()):
+        where = _list([f"{number(count)} in {name}" for name, count in lost.items() if count])
+        mark: Mark = "bad" if max(map(lost_share, cases)) >= LOST else "fair"
+        return [Finding(mark, f"Samples were lost: {where}, of {number(sent)} poses sent in all.")]
+    if not sent:
+        return [Finding("plain", "No pose was sent: whether any would have been lost is unknown.")]
+    if silent := _without_status(cases):
+        text = f"No pose is known to be lost of {number(sent)} sent; what {_list(silent)} received is unknown."
+        return [Finding("plain", text)]
+    return [Finding("good", f"No pose was lost: {number(sent)} were sent, and no running number is missing.")]
+
+
+def _without_status(cases: Sequence[CaseMetrics]) -> list[str]:
+    """Robots of runs in real time without a single status, so that nothing of their counters is known."""
+    real = (robot for case in cases if case.clock == "real" for robot in case.robots)
+    return list(dict.fromkeys(robot.robot for robot in real if robot.missed_share is None))
 
 
 def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
@@ -110,14 +147,16 @@ def _deadlines(cases: Sequence[CaseMetrics]) -> list[Finding]:
     if all(case.clock == "virtual" for case in cases):
         return []
     if not any(case.missed_deadlines for case in cases):
+        if silent := _without_status(cases):
+            return [Finding("plain", f"Whether {_list(silent)} missed deadlines is unknown: no status was recorded.")]
         return [Finding("good", "No deadline was missed.")]
     words = []
     for name, runs in by_case(cases).items():
         if missed := sum(run.missed_deadlines for run in runs):
             share = spread([run.missed_share for run in runs]).mean or 0.0
-            words.append(f"{number(missed)} in {name} ({100.0 * share:.2g} % of its ticks)")
+            words.append(f"{number(missed)} in {name} ({100.0 * share:.2g} %)")
     worst = max(case.missed_share or 0.0 for case in cases)
-    return [Finding("fair" if worst < 0.01 else "bad", f"Deadlines were missed: {_list(words)}.")]
+    return [Finding("fair" if worst < MISSED else "bad", f"Deadlines were missed: {_list(words)}.")]
 
 
 def _gaps(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -207,25 +246,30 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
     found = []
     for name, runs in others:
         rate = spread(ratios(runs, first, "f_hz"))
+        some = f" (seeds compared: {rate.n} of {len(runs)})" if rate.n < len(runs) else ""
         if rate.mean is not None:
             fewer = 100.0 * (1.0 - rate.mean)
             share = f"{abs(fewer):.1f}"
             how = f"{share} % {'fewer' if fewer > 0.0 else 'more'}" if float(share) else "as many"
             how += f" transmissions {'than' if float(share) else 'as'} {reference}"
             means = [interval(spread([run.mean["f_hz"] for run in group])) for group in (runs, first)]
-            text = f"{name} needs {how}: {means[0]} rather than {means[1]} per second and robot"
-            text += f"{_with_leaders(runs, first)}."
-            found.append(Finding("good" if fewer > 0.0 and float(share) else "plain", text))
+            text = f"{name} needs {how}: f {means[0]} rather than {means[1]} Hz"
+            text += f"{_with_leaders(runs, first)}{some}."
+            found.append(Finding("good" if fewer > 0.0 and float(share) and not some else "plain", text))
         errors = [(index.upper(), spread(ratios(runs, first, index))) for index in ("iae", "itae", "rmse")]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
-            text = f"{name} and {reference} are of different length: their errors are not compared."
-            found.append(Finding("plain", text))
-        elif known:
+            text = f"Runs of different length of {name} and {reference} are not compared."
+            found.append(Finding("fair", text))
+        if known:
             parts = [f"{label} {ratio_words(each)}" for label, each in known]
             worse = max(each.mean for _, each in known if each.mean is not None)
-            text = f"Its errors relative to {reference}: {_list(parts)}."
-            found.append(Finding("good" if worse <= 1.0 else "plain" if worse < 1.25 else "fair", text))
+            text = f"Its errors relative to {reference}: {_list(parts)}{some}."
+            mark: Mark = "good" if worse <= 1.0 and not some else "plain" if worse < 1.25 else "fair"
+            found.append(Finding(mark, text))
+        if "IAE" not in dict(known) and rate.mean is not None:
+            text = f"Less is known of one of {name} and {reference}: integrals of errors are not compared."
+            found.append(Finding("fair", text))
     return found
 
 
@@ -263,6 +307,10 @@ def contacts(cases: Sequence[CaseMetrics]) -> list[Finding]:
             pair = "–".join(closest.between)
             where = f", {case}" if len(by_case(cases)) > 1 else ""
             gaps.append(f"{number(closest.gap, 100.0)} cm between {what} ({pair} at {closest.at_s:.1f} s{where})")
+    unseen = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots if robot.known < 1.0))
+    if unseen and not all(case.watched for case in cases):
+        text = f"No contact is known; the closest approach was {_list(gaps)}. Of {_list(unseen)} not all is known."
+        return [Finding("plain", text)]
     return [Finding("good", f"No robot touched another or the arena; the closest approach was {_list(gaps)}.")]
 
 
@@ -288,7 +336,7 @@ def _pace(cases: Sequence[CaseMetrics]) -> list[Finding]:
     if factor >= KEPT_UP:
         return []
     text = f"The world fell behind: at its slowest it ran at {factor:.2f} of real time, in {case}."
-    return [Finding("fair" if factor >= 0.9 else "bad", text)]
+    return [Finding("fair" if factor >= SLOW else "bad", text)]
 
 
 def _shadows(cases: Sequence[CaseMetrics]) -> list[Finding]:

@@ -13,16 +13,27 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from agents.arrays import Array
-from experiments.report.style import CASES, INK, PAPER, WIDTH, Drawing, fitting, legend_above, plain, styled
+from experiments.report.style import (
+    CASES,
+    CORNERS,
+    INK,
+    MARKERS,
+    PAPER,
+    WIDTH,
+    Drawing,
+    fitting,
+    legend_above,
+    plain,
+    spread_texts,
+    styled,
+)
 from experiments.sweep.table import CellRow, short, words_of
 
-MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be told apart, and are drawn as clouds
 LEGEND_LINE: Final = 0.14  # [in]
 GREY: Final = "#7a7a7a"
 THIN: Final[dict[str, Any]] = {"linewidth": 0.8, "markersize": 3.6, "markeredgewidth": 0.8, "zorder": 3}
-NAMED: Final = 12  # points of a curve that all have their value beside them, if it is the first one,
-CLOSE: Final = 0.06  # and are farther apart than this share
+NAMED: Final = 12  # points of a curve that all have their value beside them, if it is the first one
 SPAN: Final = 8.0  # a wider range of messages is drawn on a logarithmic axis
 
 
@@ -82,9 +93,10 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid()
     entries = axes.get_legend_handles_labels()
-    lines = math.ceil(len(entries[1]) / fitting(width, entries[1], 3))
-    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 2))
-    legend_above(figure, entries, columns=3)
+    lines = math.ceil(len(entries[1]) / fitting(width, entries[1], 4))
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, lines - 1))
+    legend_above(figure, entries, columns=4)
+    spread_texts(axes)
     return figure
 
 
@@ -177,16 +189,10 @@ def _draw_curve(
 def _name_points(axes: Axes, rows: Sequence[CellRow], along: str, points: Array, colour: str) -> None:
     """Name and value of a parameter at the first point of a curve, then its values; at all points if they are few."""
     few = len(axes.texts) == 0 and len(rows) <= NAMED
-    last = np.array([np.inf, np.inf])
     for k, (row, at) in enumerate(zip(rows, points, strict=True)):
-        ends = k in {0, len(rows) - 1}
-        away = float(np.abs(np.log(at / last)).max()) if np.isfinite(last).all() else np.inf
-        if not (ends or few) or (not ends and away < CLOSE):
-            continue
-        first = f"{short(along)} = {row.value_of(along)}"
-        words = (first if k == 0 else words_of(row.parameters[along])).replace("-", "\N{MINUS SIGN}")
-        halo = [withStroke(linewidth=1.2, foreground=PAPER)]
-        style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color": colour, "path_effects": halo}
-        left = at[0] >= 1.0  # beside the right edge
-        axes.annotate(plain(words), tuple(at), (-3.0 if left else 3.0, 4.0), ha="right" if left else "left", **style)
-        last = at
+        if k in {0, len(rows) - 1} or few:
+            first = f"{short(along)} = {row.value_of(along)}"
+            words = (first if k == 0 else words_of(row.parameters[along])).replace("-", "\N{MINUS SIGN}")
+            halo = [withStroke(linewidth=1.2, foreground=PAPER)]
+            style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 6, "color": colour}
+            axes.annotate(plain(words), tuple(at), CORNERS[0], path_effects=halo, **style)

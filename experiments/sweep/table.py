@@ -10,7 +10,8 @@ from typing import Any, Final
 import msgspec
 
 from experiments.file import reference as reference_of_file
-from experiments.metrics.statistics import Spread, equally_long, ratio, spread
+from experiments.metrics.comparable import equally_long
+from experiments.metrics.statistics import Spread, ratio, spread
 from experiments.report.page import NONE, interval
 from experiments.report.tables import ratio_words
 from experiments.sweep.plan import Cell

@@ -195,7 +195,7 @@ def css(colour: Sequence[int]) -> str:
     return f"rgb({red},{green},{blue})"
 
 
-HEADS: Final = ("error", "tx/s", "battery", "missed", "delay")
+HEADS: Final = ("error", "f [Hz]", "battery", "missed", "delay")
 
 
 def _cells(row: Row) -> tuple[str, ...]:

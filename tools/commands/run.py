@@ -37,6 +37,7 @@ from tools.terminal import say
 
 if TYPE_CHECKING:
     from experiments.file.document import Document
+    from experiments.metrics.results import CaseMetrics
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording.run_folder import RunOrigin
     from experiments.run import Run, Watch
@@ -45,6 +46,7 @@ app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
 FAILED: Final = 1  # and of one in which a robot did not do its part
+SPOILED: Final = 3  # of a run whose figures cannot be compared
 FEW: Final = 6  # hazards of runs in virtual time that are printed
 
 
@@ -170,6 +172,8 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
             failures = verdict.failures([case for each in runs for case in each.metrics.values()])
             warn([finding.text for finding in failures])
             code = FAILED if failures or stopped else 0
+            if not code and any(case.spoiled for each in runs for case in each.metrics.values()):
+                code = SPOILED
         return code if former is None else max(code, _print_differences(folder, former, quiet=show.as_json))
     finally:
         remove_unused(folder)
@@ -182,7 +186,7 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
 
     import msgspec
 
-    from experiments.recording.run_folder import keep_origin
+    from experiments.recording.run_folder import keep_origin, read_origin
     from experiments.recording.version import load, provenance
     from experiments.report.page import date_of
 
@@ -201,7 +205,7 @@ def _kept_origin(folder: Path, origin: RunOrigin, read: Document, options: RunOp
     try:
         yield
     finally:
-        keep_origin(folder, msgspec.structs.replace(made, ended=time.time(), load_after=load()))
+        keep_origin(folder, msgspec.structs.replace(read_origin(folder) or made, ended=time.time(), load_after=load()))
 
 
 def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> int:
@@ -226,6 +230,7 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
             command=f"./zenpark run {asked.file}" + " --virtual" * (asked.virtual and not origin.virtual),
             virtual=origin.virtual or asked.virtual,
             tags=asked.tags,
+            failures=[],
             ended=None,
             load_after=None,
         )
@@ -278,9 +283,12 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
         The run, none if it was ended at once; the reason of an emergency stop or of a failure, else empty; the exit
         code.
     """
+    import msgspec
+
     from agents.runtime.command_line import interrupts
     from experiments.real_time.conductor.conduct import Supervision, conduct
     from experiments.real_time.conductor.emergency import Emergency
+    from experiments.recording.run_folder import keep_origin, read_origin
     from experiments.run import read_back
     from tools.progress import shown
 
@@ -289,7 +297,9 @@ def _conduct(read: Document, folder: Path, options: RunOptions, *, quiet: bool) 
         try:
             user = Supervision(shown(quiet=quiet), interrupted, emergency, tell=warn)
             ended = conduct(read, folder, options, user)
-            runs = [read_back(folder, ended.recordings, ended.notes)]
+            if ended.failures and (made := read_origin(folder)) is not None:
+                keep_origin(folder, msgspec.structs.replace(made, failures=ended.failures))
+            runs = [read_back(folder, ended.recordings, ended.notes, ended.failures)]
         except KeyboardInterrupt:
             print(f"\nended at once; `./zenpark report {folder}` shows what was recorded", file=sys.stderr)
             return [], "", 130
@@ -367,9 +377,11 @@ def _command(origin: RunOrigin, options: RunOptions) -> str:
 
 def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Iterator[str]:
     """The results in a few lines."""
+    from experiments.report import page as page_of
     from experiments.report import verdict
 
     cases = [case for each in runs for case in each.metrics.values()]
+    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.spoiled(cases))
     yield from (finding.text for finding in verdict.interruptions(cases))
     yield from _hazards(runs)
     yield from (_case_line(name, runs, found) for name in found["cases"])
@@ -388,7 +400,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
 def _hazards(runs: Sequence[Run]) -> Iterator[str]:
     """The first hazards of runs in virtual time, in the words of a run in real time, which prints each as it comes."""
     found = [
-        f"{case}: hazard {event.source}: {event.text} (at {event.stamp:.1f} s)"
+        f"{case}: hazard {event.source}: {event.text} (at {event.stamp:.1f} s{f', seed {run.seed}' * (len(runs) > 1)})"
         for run in runs
         for case, trace in run.traces.items()
         for event in trace.events
@@ -412,23 +424,27 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         means, shares = ({k: Spread(**v) for k, v in across[what].items()} for what in ("mean", "ratio"))
     mean, ratio = {k: interval(v) for k, v in means.items()}, {k: ratio_words(v) for k, v in shares.items()}
     measured = [each.metrics[name] for each in runs if name in each.metrics]
-    line = f"{name:>12}: {mean['f_hz']} messages/s per robot"
+    line = f"{name:>12}: f {mean['f_hz']} Hz per robot"
     if case["mean"]["iae"] is None:
         line += ", no link was measured"
     else:
-        line += f", IAE {mean['iae']}, RMSE {mean['rmse']} m"
-        line += f", acquired {_acquired(mean['acquired_s'], [each.mean['acquired_s'] for each in measured])}"
+        line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
     line += f", lost {sum(each.lost for each in measured)}"
-    for field, words in (("missed_deadlines", "deadlines missed"), ("dropped", "dropped by the modelled network")):
-        if count := sum(getattr(each, field) for each in measured):
-            line += f", {count} {words}"
-    if name != next(iter(found["cases"])):
+    if missed := sum(each.missed_deadlines for each in measured):
+        share = spread([each.missed_share for each in measured]).mean or 0.0
+        line += f", {missed} deadlines missed ({100.0 * share:.2g} %)"
+    if dropped := sum(each.dropped for each in measured):
+        line += f", {dropped} dropped by the modelled network"
+    if name != next(iter(found["cases"])) and shares["f_hz"].mean is not None:
         line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']})"
     return line
 
 
-def _acquired(mean: str, seeds: Sequence[float | None]) -> str:
-    """Time of acquisition in words, over the seeds: `mean` is over those that acquired."""
-    n = sum(each is not None for each in seeds)
-    of = "mean" if n == len(seeds) else f"mean of {n} of {len(seeds)} seeds, the others never"
-    return f"{mean} s ({of})" if n else "never (mean)"
+def _acquired(mean: str, runs: Sequence[CaseMetrics]) -> str:
+    """Time of acquisition in words, over the seeds: `mean` is over those in which all robots acquired."""
+    n, of = sum(run.mean["acquired_s"] is not None for run in runs), len(runs)
+    if n:
+        return f"acquired after {mean} s (mean{f' of {n} of {of} seeds, the others never' * (n < of)})"
+    judged = [robot for run in runs for robot in run.robots if robot.robot not in {*run.leaders, *run.died}]
+    some = sum(robot.acquired_s is not None for robot in judged)
+    return f"not acquired by all{f' in any of {of} seeds' * (of > 1)} ({some} of {len(judged)} robots were there)"

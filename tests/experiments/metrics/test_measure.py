@@ -287,8 +287,8 @@ def test_who_died_before_the_interruption_died():
 
 def test_what_grows_with_time_is_not_compared_with_an_interrupted_run():
     whole, half = measure.measure(park("a")), measure.measure(cut(park("b"), 20.0))
-    assert statistics.ratios([half], [whole], "iae") == statistics.ratios([half], [whole], "messages") == [None]
-    assert statistics.ratios([half], [whole], "f_hz") == [pytest.approx(1.0)]
+    for index in ("iae", "messages", "f_hz", "rmse"):  # what fades depends on the length, too
+        assert statistics.ratios([half], [whole], index) == [None]
     assert metrics_files.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
 
 

@@ -111,7 +111,7 @@ def test_the_table_has_what_the_recording_has_and_no_empty_columns(flown):
     film = Film(read)
     assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
     text = table(film.rows(read.end), film.stage)
-    assert "tx/s" in text
+    assert "f [Hz]" in text
     assert not {word for word in ("battery", "missed", "delay", "nan", "None") if word in text}
     status = msgspec.structs.replace(read.tracks[0].statuses[0], stamp=1.0, battery=0.8, missed=3)
     told = (replace(read.tracks[0], statuses=(status,)), *read.tracks[1:])

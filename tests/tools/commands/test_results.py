@@ -7,13 +7,17 @@ import os
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
 from tests.experiments.recording.test_bundle import SHORT
+from tools.commands.options import known_words
 from tools.commands.run import _acquired
 from tools.main import app
 
@@ -78,7 +82,7 @@ def test_tables_for_papers_are_over_all_seeds(three: tuple[Path, str]) -> None:
 
 def test_the_console_gives_the_digits_that_an_interval_bears(three: tuple[Path, str]) -> None:
     lines = three[1].splitlines()
-    half = re.search(r"IAE (\d\.\d+) ± (\d\.\d+), ", lines[0])
+    half = re.search(r"IAE (\d\.\d+) ± (\d\.\d+) m s, ", lines[0])
     assert half is not None
     assert len(half[1]) == len(half[2])
     assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
@@ -105,7 +109,7 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
     assert r"\caption{Cases, Two, for three seconds." in text
     assert "event & 0.05 & " in text
     chosen = zenpark("report", str(folder), "--latex", "--metrics", "messages,iae").splitlines()
-    assert r"Case & threshold & messages ratio & IAE ratio \\" in chosen
+    assert r"Case & threshold [m] & messages ratio & IAE ratio \\" in chosen
     wrong = CliRunner().invoke(app, ["report", str(folder), "--latex", "--metrics", "speed"])
     assert "--metrics speed: is not known" in str(wrong.exception)
     assert f"a sweep: `./zenpark report {folder}`" in zenpark("runs", "--past", "--in", str(tmp_path))
@@ -184,13 +188,41 @@ def test_an_interrupted_run_over_seeds_says_what_is_kept(
     assert "`./zenpark sweep` keeps every seed" in done.stderr
 
 
+def _measured(*acquired: float | None) -> Any:
+    """One case of two robots: when each acquired, None in `mean` if one did not."""
+    mean = None if None in acquired else 1.0
+    robots = [SimpleNamespace(robot=f"R{k}", acquired_s=when) for k, when in enumerate(acquired)]
+    return SimpleNamespace(mean={"acquired_s": mean}, robots=robots, leaders=(), died=())
+
+
 @pytest.mark.parametrize(
-    ("mean", "seeds", "words"),
+    ("runs", "words"),
     [
-        ("5.45 ± 0.01", [5.4, 5.5], "5.45 ± 0.01 s (mean)"),
-        ("7.79", [7.79, None, None], "7.79 s (mean of 1 of 3 seeds, the others never)"),
-        ("?", [None], "never (mean)"),
+        ([_measured(5.4, 5.5)] * 2, "acquired after 7.8 s (mean)"),
+        ([_measured(5.4, 5.5), _measured(5.4, None)], "acquired after 7.8 s (mean of 1 of 2 seeds, the others never)"),
+        ([_measured(5.4, None)], "not acquired by all (1 of 2 robots were there)"),
+        ([_measured(5.4, None)] * 2, "not acquired by all in any of 2 seeds (2 of 4 robots were there)"),
     ],
 )
-def test_seeds_that_never_acquire_are_counted(mean: str, seeds: list[float | None], words: str) -> None:
-    assert _acquired(mean, seeds) == words
+def test_seeds_that_never_acquire_are_counted(runs: list[Any], words: str) -> None:
+    assert _acquired("7.8", runs) == words
+
+
+def test_a_spoiled_run_is_not_compared(three: tuple[Path, str], tmp_path: Path) -> None:
+    file, out = str(three[0].parent / "short.toml"), str(tmp_path / "x")
+    options = ["--virtual", "--no-report", "--out", out, "--set", "cases.event.safety.battery_low=0.999999", "--anyway"]
+    done = CliRunner().invoke(app, ["run", file, *options])
+    assert done.exit_code == 1
+    assert "✗ Spoiled, and compared with nothing: event: robots failed." in done.stdout
+    assert "ratios" not in done.stdout
+    compared = zenpark("compare", str(three[0]), out)
+    assert "×" not in next(line for line in compared.splitlines() if re.match(rf"{re.escape(out)} +event", line))
+    assert f"{out}, event, seed 1: " in compared
+    assert "robots failed" in zenpark("runs", "--past", "--in", out)
+    pooled = CliRunner().invoke(app, ["report", out, str(three[0]), "--pool"])
+    assert "is no whole run that nothing spoiled" in str(pooled.exception)
+
+
+def test_an_index_of_files_is_not_a_word() -> None:
+    with pytest.raises(DocumentError, match="did you mean 'acquired'"):
+        known_words("--metrics", ["acquired_s"], ["f", "iae", "acquired"])

@@ -1,0 +1,75 @@
+"""Which runs can be compared: those that nothing spoiled, of equal length, of which as much is known."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Final
+
+import msgspec
+
+from experiments.metrics.results import CaseMetrics
+
+MISSED: Final = 0.01  # share of missed deadlines from which on a run is spoiled
+LOST: Final = 0.01  # share of lost poses from which on a run is spoiled
+SLOW: Final = 0.9  # real-time factor of a world below which a run is spoiled
+SPOILING: Final = ("began", "could not read")  # what troubles that spoil a run say
+SAME_LENGTH: Final = 0.005  # share of the longest by which lengths of runs may differ
+SAME_COVERAGE: Final = 0.01  # by which known shares of errors may differ where integrals are compared
+
+
+def reasons(case: CaseMetrics) -> tuple[str, ...]:
+    """Why the figures of a run are compared with none of another, one clause each; empty if nothing spoiled it."""
+    lost, missed, factor = lost_share(case), case.missed_share or 0.0, case.world_factor
+    found = []
+    if case.failures:
+        found.append("robots failed")
+    elif case.died:
+        found.append(f"too little is known of {', '.join(case.died)}")
+    if missed >= MISSED:
+        found.append(f"{100.0 * missed:.2g} % of the deadlines were missed")
+    if lost >= LOST:
+        found.append(f"{100.0 * lost:.2g} % of the poses were lost")
+    if any(spoils(each) for each in case.troubles):
+        found.append("robots began late, or messages could not be read")
+    if factor is not None and factor < SLOW:
+        found.append(f"the world ran at {factor:.2f} of real time")
+    return tuple(found)
+
+
+def with_failures(case: CaseMetrics, told: Iterable[str]) -> CaseMetrics:
+    """A case with failures that its recording does not tell: its conductor saw them, and its recorder had ended.
+
+    Those whose robots have failed by the recording already are left out.
+    """
+    failed = {text.split(" ")[0].rstrip(":") for text in case.failures}
+    names = {robot.robot for robot in case.robots}
+    more = [text for text in told if not (named := names & {*re.split(r"[\s,:]+", text)}) or named - failed]
+    if not more:
+        return case
+    case = msgspec.structs.replace(case, failures=(*case.failures, *more))
+    return msgspec.structs.replace(case, spoiled=reasons(case))
+
+
+def lost_share(case: CaseMetrics) -> float:
+    """Poses that were lost over those that receivers were to get; 0 without any."""
+    due = case.lost + sum(robot.heard for robot in case.robots)
+    return case.lost / due if due else 0.0
+
+
+def spoils(trouble: str) -> bool:
+    """Whether a trouble of a run spoils its figures; a robot that was ordered twice and began in time does not."""
+    return any(word in trouble for word in SPOILING)
+
+
+def equally_long(lengths: Iterable[float]) -> bool:
+    """Whether runs of these lengths [s] can be compared: what is summed, and what fades, depends on the length."""
+    known = [*lengths]
+    return not known or max(known) - min(known) <= SAME_LENGTH * max(known)
+
+
+def coverage(case: CaseMetrics) -> float:
+    """Known share of the errors of the robots in the means; 1 without any."""
+    out = {*case.leaders, *case.died}
+    known = [robot.coverage for robot in case.robots if robot.robot not in out and robot.iae is not None]
+    return sum(known) / len(known) if known else 1.0

@@ -1,0 +1,139 @@
+"""A run that was spoiled gives no ratio and no praise; runs of other length or coverage are not compared."""
+
+import csv
+import dataclasses
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.network.messages import Event
+from experiments.metrics.comparable import reasons, with_failures
+from experiments.metrics.measure import measure
+from experiments.metrics.signals import network_away
+from experiments.metrics.statistics import ratios
+from experiments.report import metrics_files
+from experiments.report.verdict import findings
+from tests.experiments.traces import crowd, cut
+
+
+@pytest.fixture(scope="module")
+def trace():
+    return dataclasses.replace(crowd(3, "periodic", duration=4.0), clock="real")
+
+
+def _with(trace, **columns):
+    arrays = {name: np.full(3, value) for name, value in columns.items()}
+    return measure(dataclasses.replace(trace, **arrays))
+
+
+def _marks(*cases):
+    return {each.mark for each in findings(cases)}
+
+
+def _texts(*cases):
+    return " ".join(each.text for each in findings(cases))
+
+
+@pytest.mark.parametrize(
+    ("columns", "reason"),
+    [
+        ({"missed_deadlines": 10, "ticks": 90}, "10 % of the deadlines were missed"),
+        ({"missed_deadlines": 300, "ticks": 100}, "75 % of the deadlines were missed"),
+        ({"missed_deadlines": 1, "ticks": 999}, ""),
+        ({"lost": 100}, "of the poses were lost"),
+        ({"lost": 1}, ""),
+    ],
+)
+def test_what_spoils_a_run(trace, columns, reason):
+    spoiled = _with(trace, **columns).spoiled
+    assert reason in spoiled[0] if reason else not spoiled
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "spoils"),
+    [
+        ("late", "began 0.70 s after the common start", True),
+        ("late", "still waits for the start; ordered again", False),
+        ("unread", "could not read 3 messages on park/A/pose", True),
+    ],
+)
+def test_troubles_that_spoil_a_run(trace, kind, text, spoils):
+    troubled = measure(dataclasses.replace(trace, events=(*trace.events, Event(1.0, kind, "CF01", text))))
+    assert bool(troubled.spoiled) == spoils
+
+
+def test_a_lost_robot_or_slow_world_spoils(trace):
+    lost = measure(dataclasses.replace(trace, events=(Event(2.0, "lost", "CF01", "its process ended"),)))
+    assert reasons(lost) == lost.spoiled == ("robots failed",)
+    assert reasons(msgspec.structs.replace(measure(trace), world_factor=0.5)) == ("the world ran at 0.50 of real time",)
+
+
+def test_losses_that_no_recorder_saw_spoil(trace):
+    good = measure(trace)
+    assert with_failures(good, []) is good
+    told = with_failures(good, ["lost CF01, CF02", "the recorder ended"])
+    assert (told.failures, told.spoiled) == (("lost CF01, CF02", "the recorder ended"), ("robots failed",))
+    known = msgspec.structs.replace(good, failures=("CF01 at 2.0 s: was lost: killed",))
+    assert with_failures(known, ["lost CF01"]) is known
+
+
+def test_spoiled_runs_have_neither_ratio_nor_praise(trace, tmp_path):
+    good, bad = measure(trace), _with(trace, missed_deadlines=50)
+    other = msgspec.structs.replace(bad, case="event")
+    assert "good" in _marks(good, msgspec.structs.replace(good, case="event"))
+    assert "good" not in _marks(good, other)
+    for pair in ((good, other), (other, good)):
+        assert ratios([pair[1]], [pair[0]], "f_hz") == [None]
+        assert "Its errors relative" not in _texts(*pair)
+    document = metrics_files.document("x", 1, [good, other])["cases"]["event"]
+    assert document["spoiled"] == list(bad.spoiled)
+    assert set(document["ratio"].values()) == {None}
+    metrics_files.write_csv(tmp_path / "m.csv", [good, other])
+    rows = list(csv.DictReader((tmp_path / "m.csv").read_text("utf-8").splitlines()))
+    assert [row["spoiled"] for row in rows] == ["0"] * 4 + ["1"] * 4
+    metrics_files.write_json(tmp_path / "m.json", [other])
+    assert json.loads((tmp_path / "m.json").read_bytes())[0]["spoiled"] == list(bad.spoiled)
+
+
+def test_a_spoiled_seed_is_left_out_of_ratios(trace):
+    first = [msgspec.structs.replace(measure(trace), seed=seed) for seed in (1, 2, 3)]
+    others = [msgspec.structs.replace(each, case="event") for each in first]
+    others[1] = msgspec.structs.replace(others[1], spoiled=("robots failed",))
+    assert ratios(others, first, "iae") == [1.0, None, 1.0]
+    assert ratios(first, others, "iae") == [1.0, None, 1.0]
+    assert "seeds compared: 2 of 3" in _texts(*first, *others)
+
+
+def test_integrals_over_holes_are_not_compared(trace):
+    place = trace.true_position.copy()
+    place[40:48] = np.nan  # of the whole formation, too short to be dead
+    whole, holed = measure(trace), measure(dataclasses.replace(trace, true_position=place, position=place))
+    assert ratios([holed], [whole], "iae") == [pytest.approx(1.0, abs=0.1)]  # an absence of all does not count
+    place = trace.true_position.copy()
+    place[40:48, 0] = np.nan
+    holed = measure(dataclasses.replace(trace, true_position=place, position=place))
+    assert ratios([holed], [whole], "iae") == ratios([whole], [holed], "itae") == [None]
+    assert ratios([holed], [whole], "f_hz") == [pytest.approx(1.0)]
+
+
+def test_what_was_never_measured_is_unknown(trace):
+    silent = measure(dataclasses.replace(trace, ticks=np.array([0, 100, 100])))
+    assert "Whether CF01 missed deadlines is unknown" in _texts(silent)
+    assert "what CF01 received is unknown" in _texts(silent)
+    mute = measure(dataclasses.replace(trace, sent=trace.sent.take(trace.sent.stamp < 0.0)))
+    assert "No pose was sent: whether any would have been lost is unknown." in _texts(mute)
+
+
+def test_a_shorter_run_is_not_compared(trace):
+    whole, short = measure(trace), measure(cut(trace, 2.0))
+    assert {ratios([short], [whole], index)[0] for index in ("f_hz", "iae", "rmse", "messages")} == {None}
+
+
+def test_a_hole_excuses_nobody_before_it():
+    alive = np.ones((100, 2), dtype=bool)
+    alive[20:60, 0] = alive[50:70, 1] = False  # one robot was gone long before the network was
+    away_s, away = network_away(alive, np.arange(100) * 0.1)
+    assert away_s == pytest.approx(1.0)
+    assert np.flatnonzero(away).tolist() == list(range(50, 70))
