@@ -265,18 +265,14 @@ class LinkTracker:
         return error if present is None else np.where(present, error, np.nan)
 
     def of_robots(self, error: Array) -> Array:
-        """Sum of the known errors of the links on which each robot receives (N,) [m], or sends if it receives on none.
+        """Sum of the known errors of the links on which each robot receives (N,) [m].
 
-        NaN where none is known.
+        NaN where none is known, as of a leader, which receives on none.
         """
-        net, rows, known = self._stage.links, len(self._stage.names), np.isfinite(error)
-
-        def total(ends: Index) -> Array:
-            there = np.bincount(ends[known], minlength=rows) > 0
-            return np.where(there, np.bincount(ends[known], error[known], minlength=rows), np.nan)
-
-        receives = np.bincount(net.receiver, minlength=rows) > 0
-        return np.where(receives, total(net.receiver), total(net.sender))
+        rows, known = len(self._stage.names), np.isfinite(error)
+        ends = self._stage.links.receiver[known]
+        there = np.bincount(ends, minlength=rows) > 0
+        return np.where(there, np.bincount(ends, error[known], minlength=rows), np.nan)
 
 
 class Trail:

@@ -37,6 +37,7 @@
     const words = [];
     if (silent > OLD_S + 1) words.push(`no answer of zenpark for ${silent.toFixed(0)} s`);
     if (age !== null) words.push(`picture is ${age.toFixed(age < 10 ? 1 : 0)} s old`);
+    if (picture?.over) words.length = 0;
     if (picture?.words) words.push(picture.words);
     const old = !picture?.over && (silent > OLD_S + 1 || (age !== null && offset !== null && age > OLD_S));
     const style = document.documentElement.style;

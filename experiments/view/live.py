@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from experiments.view.serving import Server
 
 FRAME_S: Final = 1.0 / 25.0
+FAREWELL_S: Final = 0.5  # until the last words have reached the pages
 IDLE_S: Final = 0.2  # between two rounds while no page is open
 TABLE_S: Final = 0.5
 FOV: Final = 0.8  # [rad] upright
@@ -175,6 +176,13 @@ class LiveView:
             period = heartbeat.frame_s(self._server.gate.lag(time.time()), FRAME_S) if pages else IDLE_S
             time.sleep(max(0.001, begun + period - time.monotonic()))
 
+    def close(self, words: str) -> None:
+        """Tells open pages, in words, why they get no more pictures."""
+        if self._server.get_clients():
+            self._mark.content = heartbeat.mark(self._stages, time.time(), 0.0, words, over=True)
+            self._server.flush()
+            time.sleep(FAREWELL_S)
+
     def _begin(self) -> None:
         """Another case."""
         stage = self.observer.stage
@@ -204,7 +212,7 @@ class LiveView:
         age, over = observer.age.seconds(utc, now), False
         words = "of a recording" if observer.age.recorded else "" if age is not None else "no pose of a robot yet"
         if age is not None and connected(self._session) and not any(r.alive for r in observer.robots.values()):
-            words, over = "no robot is there any more: the last picture stays", True
+            words, over = f"no robot is there any more: the last picture, {age:.0f} s old", True
         self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=over)
 
     def _tabulate(self, moment: Moment) -> None:

@@ -36,6 +36,8 @@ CURVES: Final = 12  # of more robots, the largest, the median and the smallest v
 TABLE: Final = 20  # rows; of more robots, those that need attention first, then the worst
 EVENTS: Final = 12
 LINKS: Final = 30  # rows
+FEW_MISSED: Final = 0.01  # share of ticks; more are shown in red
+NONE: Final = "–"  # error of a robot that receives on no link
 QUIET: Final = ("says",)  # kinds of events that are not shown
 # the panel of a narrow page, which viser makes 20 em wide
 WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width:100%!important}}</style>"
@@ -51,6 +53,7 @@ class Row:
     rate: float | None = None  # [1/s]
     battery: float | None = None  # 0 to 1
     missed: int | None = None  # ticks
+    missed_share: float = 0.0  # of all ticks
     delay: float | None = None  # [s] largest of its links
     note: str = ""
 
@@ -71,7 +74,8 @@ def robot_row(
     note = status.hazard or (status.reason if condition > Condition.DONE else "")
     if not note and status.missing:
         note = "misses " + ", ".join(status.missing)
-    return Row(name, condition, error, rate, status.battery, status.missed if ticks else None, delay, note)
+    missed, share = status.missed if ticks else None, status.missed / max(1, status.ticks + status.missed)
+    return Row(name, condition, error, rate, status.battery, missed, share, delay, note)
 
 
 def known(value: float) -> float | None:
@@ -97,11 +101,15 @@ class History:
             for column in (self.time, self.error, self.rate):
                 column.pop(0)
 
-    def curves(self, values: Sequence[Array]) -> tuple[Array, ...]:
-        """Time before now [s], then one curve a robot; of many, the largest, the median and the smallest."""
+    def curves(self, values: Sequence[Array], rows: Sequence[int] | None = None) -> tuple[Array, ...]:
+        """Time before now [s], then one curve for each of `rows`, all if None.
+
+        Of many robots these are the largest, the median and the smallest.
+        """
         time = np.array(self.time) - (self.time[-1] if self.time else 0.0)
-        table = np.array(values).reshape(len(time), self._rows)
-        if self._rows > CURVES:
+        table = np.nan_to_num(np.array(values).reshape(len(time), self._rows))
+        table = table if rows is None else table[:, list(rows)]
+        if table.shape[1] > CURVES:
             return time, table.max(axis=1), np.median(table, axis=1), table.min(axis=1)
         return (time, *table.T)
 
@@ -118,6 +126,7 @@ class Panel:
         self._plot_folder = self._gui.add_folder("Last 30 s", order=20.0)
         self._error: Any = None
         self._rate: Any = None
+        self._followers: Sequence[int] = ()  # rows of the robots that receive on a link, whose errors are plotted
         with self._gui.add_folder("Links", order=25.0, expand_by_default=False):
             self._links = self._gui.add_html("")
         with self._gui.add_folder("Events", order=30.0):
@@ -136,20 +145,23 @@ class Panel:
         self._error = self._rate = None
         if not stage.names:
             return
-        many = len(stage.names) > CURVES
-        names = ("largest", "median", "smallest") if many else stage.names
-        colours = [(213, 94, 0), (0, 114, 178), (0, 158, 115)] if many else stage.colours.tolist()
-        lines: Any = [{"label": name, "stroke": css(c), "width": 1.5} for name, c in zip(names, colours, strict=True)]
-        series: Any = ({"label": "s"}, *lines)
-        empty = (np.zeros(1), *(np.zeros(1) for _ in lines))
+        every = range(len(stage.names))
+        self._followers = sorted(set(stage.links.receiver.tolist())) or list(every)
         with self._plot_folder:
-            self._error = self._plot("error [m]", empty, series)
-            self._rate = self._plot("transmissions [1/s]", empty, series)
+            self._error = self._plot("error of each robot's links", "m", self._followers)
+            self._rate = self._plot("transmissions", "1/s", every)
 
-    def _plot(self, title: str, data: Any, series: Any) -> Any:  # noqa: ANN401 - viser's own types
+    def _plot(self, title: str, unit: str, rows: Sequence[int]) -> Any:  # noqa: ANN401 - viser's own type
+        many = len(rows) > CURVES
+        names = ("largest", "median", "smallest") if many else [self.stage.names[row] for row in rows]
+        colours = [(213, 94, 0), (0, 114, 178), (0, 158, 115)] if many else self.stage.colours[list(rows)].tolist()
+        lines: Any = [{"label": name, "stroke": css(c), "width": 1.5} for name, c in zip(names, colours, strict=True)]
         return self._gui.add_uplot(
-            data, series, title=title, height=140, padding=(8, 12, 0, 0), legend={"show": False},
+            (np.zeros(1), *(np.zeros(1) for _ in lines)), ({"label": "s"}, *lines),
+            title=title, height=170, padding=(8, 12, 0, 0), legend={"show": False},
             scales={"x": {"time": False, "range": (-HISTORY_S, 0.0)}},
+            axes=({"label": "time before now [s]", "labelSize": 20, "size": 34},
+                  {"label": unit, "labelSize": 18, "size": 44}),
         )  # fmt: skip
 
     def show_head(self, case: str, phase: str, elapsed: float | None, duration: float, where: str) -> None:
@@ -177,7 +189,7 @@ class Panel:
     def show_plots(self) -> None:
         if self._error is None or len(self.history.time) < 2:
             return
-        self._error.data = self.history.curves(self.history.error)
+        self._error.data = self.history.curves(self.history.error, self._followers)
         self._rate.data = self.history.curves(self.history.rate)
 
     def show_events(self, events: Sequence[Event], start: float | None) -> None:
@@ -202,12 +214,25 @@ def _cells(row: Row) -> tuple[str, ...]:
     """Row of a robot in the table, below `HEADS`."""
     error = row.error
     return (
-        "" if error is None else f"<span style='color:{css(_graded(error))}'>{100 * error:.1f} cm</span>",
+        "" if error is None else _coloured(f"{100 * error:.1f} cm", _graded(error)),
         "" if row.rate is None else f"{row.rate:.1f}",
         "" if row.battery is None else f"{100 * row.battery:.0f} %",
-        "" if row.missed is None else f"{row.missed}",
-        "" if row.delay is None else f"{1e3 * row.delay:.1f} ms",
+        "" if row.missed is None else _coloured(f"{row.missed}", _graded_share(row.missed_share)),
+        "" if row.delay is None else _milliseconds(row.delay),
     )
+
+
+def _coloured(text: str, colour: Colour | None) -> str:
+    return text if colour is None else f"<span style='color:{css(colour)}'>{text}</span>"
+
+
+def _graded_share(missed: float) -> Colour | None:
+    """Colour of a share of missed ticks; none for none."""
+    return None if missed == 0.0 else FAIR if missed <= FEW_MISSED else BAD
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{round(1e3 * seconds, 1) + 0.0:.1f} ms"  # a sum, for it has no negative zero
 
 
 def table(rows: Sequence[Row], stage: Stage) -> str:
@@ -221,6 +246,11 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         shown = shown[:TABLE]
     filled = [_cells(row) for row in shown]
     columns = [k for k in range(len(HEADS)) if not filled or any(cells[k] for cells in filled)]
+    leading = {stage.names[row] for row in range(len(stage.names))} - {
+        stage.names[row] for row in stage.links.receiver.tolist()
+    }
+    filled = [(NONE, *cells[1:]) if row.name in leading and not cells[0] else cells
+              for row, cells in zip(shown, filled, strict=True)]  # fmt: skip
     heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{HEADS[k]}</th>" for k in columns)
     lines = []
     for row, cells in zip(shown, filled, strict=True):
@@ -229,7 +259,8 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         badge = f" <span style='color:{css(colour)};font-weight:600'>{word}</span>" if word else ""
         note = ""
         if row.note:
-            note = f"<tr><td colspan='6' style='color:{css(colour)};padding-left:1.2em'>{escape(row.note)}</td></tr>"
+            noted = FAIR if row.condition == Condition.ACTIVE else colour  # a warning is never green
+            note = f"<tr><td colspan='6' style='color:{css(noted)};padding-left:1.2em'>{escape(row.note)}</td></tr>"
         lines.append(
             f"<tr><td style='white-space:nowrap'>{dot} {escape(row.name)}{badge}</td>"
             + "".join(f"<td style='text-align:right;white-space:nowrap'>{cells[k]}</td>" for k in columns)
@@ -248,7 +279,7 @@ def link_table(stage: Stage, error: Array, delay: Sequence[float | None]) -> str
     lines = []
     for k in order:
         ends = (stage.names[int(stage.links.sender[k])], stage.names[int(stage.links.receiver[k])])
-        late = "" if (seconds := delay[k]) is None else f"{1e3 * seconds:.1f} ms"
+        late = "" if (seconds := delay[k]) is None else _milliseconds(seconds)
         shown = f"<span style='color:{css(_graded(float(error[k])))}'>{100 * error[k]:.1f} cm</span>"
         cells = (" &rarr; ".join(map(escape, ends)), shown, late)
         lines.append("<tr>" + "".join(f"<td style='text-align:right'>{cell}</td>" for cell in cells) + "</tr>")

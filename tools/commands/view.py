@@ -344,8 +344,12 @@ def _live(watched: Watched, ended: threading.Event, *, port: int, dark: bool, op
         acting = Acting(session, watched) if may_act(watched) else None
         page = live.LiveView(server, session, watched, dark=dark, acting=acting)
         declared.append(page)
-        _tell(server, f"{watched.words}{'' if with_run else '; Ctrl-C ends it'}", open_page=open_page)
+        _tell(
+            server, f"{watched.words}; {'closes with the run' if with_run else 'Ctrl-C ends it'}", open_page=open_page
+        )
         page.run(lambda: ended.is_set() or (with_run and watched.run is not None and not watched.run.alive))
+        folder = watched.run.folder if with_run and watched.run is not None else ""
+        page.close(f"the view has ended{f' with the run: ./zenpark view {folder} plays it' if folder else ''}")
 
 
 def _tell(server: Server, what: str, *, open_page: bool, to: TextIO | None = None) -> None:

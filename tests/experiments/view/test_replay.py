@@ -13,8 +13,8 @@ from experiments.recording.playback import NotStarted
 from experiments.recording.reader import RecordingError
 from experiments.run import simulate
 from experiments.scene import tracks
-from experiments.scene.stage import Condition
-from experiments.view.panel import History, Row, event_list, link_table, table
+from experiments.scene.stage import BAD, FAIR, Condition
+from experiments.view.panel import History, Row, css, event_list, link_table, table
 from experiments.view.replay import Clock, Film, marks
 
 GUIDED = ("architecture=centralised",)
@@ -78,7 +78,7 @@ def test_history_has_errors_and_rates_of_the_whole_case(flown):
     history = film.history()
     k = int(np.searchsorted(history.time, 2.0))
     moment = film.moment(history.time[k])
-    assert history.error[k] == pytest.approx(film._links.of_robots(moment.error), abs=1e-6)
+    assert history.error[k] == pytest.approx(film._links.of_robots(moment.error), abs=1e-6, nan_ok=True)
     assert sum(rate.sum() for rate in history.rate) > 0
 
 
@@ -154,3 +154,19 @@ def test_the_table_shows_the_worst_first_and_escapes_names(flown):
     links = link_table(stage, error, [0.0123] * len(error))
     assert links.index("10.0 cm") < links.index("0.0 cm")
     assert "12.3 ms" in links
+
+
+def test_warnings_misses_and_leaders_look_so(flown):
+    stage = Film(tracks.read(flown[1])).stage
+    leader = next(name for row, name in enumerate(stage.names) if row not in stage.links.receiver)
+    follower = next(name for name in stage.names if name != leader)
+    rows = [
+        Row(leader, Condition.ACTIVE, missed=0, delay=-1e-6),
+        Row(follower, Condition.ACTIVE, error=0.01, missed=7, missed_share=0.5, note="warn: a neighbour is lost"),
+    ]
+    text = table(rows, stage)
+    assert ">–<" in text
+    assert "-0.0" not in text
+    assert f"color:{css(BAD)}'>7<" in text
+    assert f"color:{css(FAIR)};padding-left:1.2em'>warn" in text
+    assert ">0<" in text
