@@ -200,6 +200,8 @@ class Acting:
         if event.client is None:  # moved by this program, not by a hand
             return
         value, what = parameter.limited(float(event.target.value)), parameter.name
+        if value != event.target.value:
+            event.target.value = value  # on all pages
         if self._refuse(event.client_id, what):
             return
         order = messages.Order("set", name=parameter.name, value=value)

@@ -42,7 +42,7 @@
     const old = !picture?.over && (silent > OLD_S + 1 || (age !== null && offset !== null && age > OLD_S));
     const style = document.documentElement.style;
     style.setProperty("--zenpark-age", JSON.stringify(words.join("; ")));
-    style.setProperty("--zenpark-age-colour", old ? "rgb(213,50,30)" : "inherit");
+    style.setProperty("--zenpark-age-colour", old ? "rgb(213,50,30)" : "currentColor");
     style.setProperty("--zenpark-age-weight", old ? "700" : "400");
     document.documentElement.dataset.age = words.join("; ");
     document.documentElement.dataset.old = old ? "1" : "";

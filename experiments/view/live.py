@@ -211,8 +211,9 @@ class LiveView:
         utc, observer = time.time(), self.observer
         age, over = observer.age.seconds(utc, now), False
         words = "of a recording" if observer.age.recorded else "" if age is not None else "no pose of a robot yet"
-        if age is not None and connected(self._session) and not any(r.alive for r in observer.robots.values()):
-            words, over = f"no robot is there any more: the last picture, {age:.0f} s old", True
+        run, here = self._watched.run, any(report.alive for report in observer.robots.values())
+        if age is not None and (not run.alive if run is not None else connected(self._session) and not here):
+            words, over = f"the run is over; this was its last picture, {age:.0f} s ago", True
         self._mark.content = heartbeat.mark(self._stages, utc, age, words, over=over)
 
     def _tabulate(self, moment: Moment) -> None:

@@ -148,10 +148,10 @@ class Panel:
         every = range(len(stage.names))
         self._followers = sorted(set(stage.links.receiver.tolist())) or list(every)
         with self._plot_folder:
-            self._error = self._plot("error of each robot's links", "m", self._followers)
-            self._rate = self._plot("transmissions", "1/s", every)
+            self._error = self._plot("error of each robot's links [m]", self._followers)
+            self._rate = self._plot("transmissions [1/s]", every)
 
-    def _plot(self, title: str, unit: str, rows: Sequence[int]) -> Any:  # noqa: ANN401 - viser's own type
+    def _plot(self, title: str, rows: Sequence[int]) -> Any:  # noqa: ANN401 - viser's own type
         many = len(rows) > CURVES
         names = ("largest", "median", "smallest") if many else [self.stage.names[row] for row in rows]
         colours = [(213, 94, 0), (0, 114, 178), (0, 158, 115)] if many else self.stage.colours[list(rows)].tolist()
@@ -160,8 +160,7 @@ class Panel:
             (np.zeros(1), *(np.zeros(1) for _ in lines)), ({"label": "s"}, *lines),
             title=title, height=170, padding=(8, 12, 0, 0), legend={"show": False},
             scales={"x": {"time": False, "range": (-HISTORY_S, 0.0)}},
-            axes=({"label": "time before now [s]", "labelSize": 20, "size": 34},
-                  {"label": unit, "labelSize": 18, "size": 44}),
+            axes=({"label": "time before now [s]", "labelSize": 20, "size": 50}, {}),
         )  # fmt: skip
 
     def show_head(self, case: str, phase: str, elapsed: float | None, duration: float, where: str) -> None:
