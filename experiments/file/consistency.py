@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
@@ -62,6 +62,7 @@ _WALL: Final = "wall"  # name of the border of the arena in contacts
 def faults(experiment: Experiment) -> Iterator[Fault]:
     """All contradictions between fields, with their paths in the file."""
     yield from _rates(experiment)
+    yield from _case_names(experiment.cases)
     yield from arena_faults(experiment.arena)
     for name, robot in experiment.robots.items():
         yield from _robot(experiment, ("robots", name), robot)
@@ -80,6 +81,16 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
         if name not in known:
             message = f"'{name}' is neither a robot nor a kind of robots"
             yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
+
+
+def _case_names(names: Iterable[str]) -> Iterator[Fault]:
+    """Faults of cases whose files are one on systems whose file names do not tell capitals apart."""
+    former: dict[str, str] = {}
+    for name in names:
+        other = former.setdefault(name.lower(), name)
+        if other != name:
+            message = f"'{name}' and '{other}' differ by capitals only, and so would their recordings"
+            yield Fault(("cases", name), message, "rename one of them", on_key=True)
 
 
 def arena_faults(arena: Arena) -> Iterator[Fault]:

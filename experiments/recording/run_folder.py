@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
@@ -22,6 +22,7 @@ RUNS: Final = Path("runs")
 SOURCE: Final = KEPT
 ORIGIN: Final = "run.json"
 METRICS: Final = "metrics.json"
+LATEST: Final = 1e11  # [s] UTC that a date can be made of
 KEY_FIGURES: Final = ("f_hz", "iae", "rmse", "acquired_s")  # means over the robots of a case, see `metrics.json`
 
 
@@ -35,7 +36,7 @@ class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
     virtual: bool = False  # in virtual time
     cases: list[str] = []  # that were chosen; empty: all
     changes: list[str] = []  # behind `--set` and `--seed`
-    seeds: int = 1  # so many, from that of the file on
+    seeds: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1  # so many, from that of the file on
     bodies: str | None = None  # behind `--bodies`
     here: bool = False  # all robots on this machine
     anyway: bool = False  # although the check found errors
@@ -165,7 +166,7 @@ def _past_run(folder: Path) -> PastRun | None:
         figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in KEY_FIGURES}
     seeds = sorted({each.seed for each in cases})
     try:
-        made = origin.begun or source.stat().st_mtime
+        made = origin.begun if 0.0 < origin.begun < LATEST else source.stat().st_mtime
     except OSError:  # removed meanwhile
         return None
     return PastRun(str(folder), origin, made, 1e-6 * _size(folder), recorded, seeds, figures, remarks, lengths)

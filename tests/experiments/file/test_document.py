@@ -24,6 +24,7 @@ MINIMAL = 'title = "One"\nduration_s = 10.0\n[robots.KH01]\nkind = "khepera4"\ns
 # file, line, column, part of the message, part of the remedy; a file may have several
 EXPECTED = [
     ("arena-file-folder", 9, 8, "'labs/lab.toml' is no name of a file", "beside the experiment file"),
+    ("cases-by-capitals", 9, 8, "differ by capitals only", "rename one"),
     ("arena-file-missing", 9, 8, "there is no arena file", "known: gate.arena.toml"),
     ("avoidance-parameter", 10, 1, "unknown parameter 'margn' of 'barrier'", "did you mean 'margin'?"),
     ("avoidance-without-kind", 8, 1, "'avoidance' needs its kind", 'add kind = "barrier"'),

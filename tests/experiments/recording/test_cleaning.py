@@ -115,3 +115,11 @@ def test_dangling_links_count_nothing(tmp_path: Path) -> None:
     (folder / "gone.mcap").symlink_to(tmp_path / "nowhere")
     (run,) = past_runs([tmp_path])
     assert run.megabytes < 1e-3
+
+
+@pytest.mark.parametrize("begun", [1e300, -1e300, 1e18, -5.0])
+def test_absurd_times_are_no_error(begun: float, tmp_path: Path) -> None:
+    keep_origin(past(tmp_path / "run"), RunOrigin(begun=begun))
+    (run,) = past_runs([tmp_path])
+    assert run.made == (tmp_path / "run" / SOURCE).stat().st_mtime
+    assert CliRunner().invoke(app, ["runs", "--past", "--in", str(tmp_path)]).exit_code == 0
