@@ -118,6 +118,10 @@ class Agent:
         """
         return self._external.believes(row, t, position, watched=self.lifecycle.in_motion(row))
 
+    def believed_yaw(self, row: int, t: float, yaw: float) -> float:
+        """The `yaw` [rad] of a position that is believed, or NaN: then the body's own goes on."""
+        return self._external.believed_yaw(row, t, yaw, watched=self.lifecycle.in_motion(row))
+
     def go(self, row: int, goal: tuple[float, float], t: float) -> str:
         """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
 

@@ -354,7 +354,7 @@ class Runtime:
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
                 if agent.believes(row, taken, position):
-                    self._body.locate(row, taken, position, yaw)
+                    self._body.locate(row, taken, position, agent.believed_yaw(row, taken, yaw))
         for row, orders in enumerate(self._orders):
             for query, order in orders.read() if orders.waiting else ():
                 self._obey(row, query, order, t)

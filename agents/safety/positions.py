@@ -7,6 +7,7 @@ hand. One that is not believed reaches neither the decision nor, where it is mea
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite, nan, remainder, tau
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,8 @@ from agents.body.kinds import Kind
 JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
 GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
 REACH: Final = 1.5  # share of a kind's speed: what it can move
+FLIP: Final = 0.5  # [rad] beyond what a robot can turn between two measurements: its markers are mistaken
+MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the time between them
 
 
 class Continuity:
@@ -71,6 +74,10 @@ class ExternalPositions:
         self._time = np.full(len(kinds), -np.inf)
         self.jump: Array = np.full(len(kinds), np.nan)  # (N,) lengths of the jumps of rows [m], NaN of other rows
         self.deceived: Mask = np.zeros(len(kinds), dtype=bool)  # (N,) rows whose positions are wrong for good
+        self._turn_rate = [REACH * kind.turn_rate for kind in kinds]
+        # (N,) last measured yaw [rad], its time [s], and the sum of its jumps [rad]
+        self._yaw, self._yaw_time = np.full((2, len(kinds)), np.nan)
+        self._flipped = np.zeros(len(kinds))
         self.doubted = False  # whether a row has a position that is not believed
 
     def believes(self, row: int, time: float, position: Array, *, watched: bool) -> bool:
@@ -87,6 +94,21 @@ class ExternalPositions:
         jump = self._rows[row].jumps(np.array([time]), position[None], np.array([watched]))
         self._note(row, np.nan if jump is None else float(jump[0]))
         return jump is None and not self.deceived[row]
+
+    def believed_yaw(self, row: int, time: float, yaw: float, *, watched: bool) -> float:
+        """The `yaw` [rad] of a row that is measured at `time` [s]; NaN while it is known to be wrong.
+
+        Markers that look the same when turned make it flip; it is wrong until it has flipped back.
+        """
+        if not isfinite(yaw):
+            return nan
+        jump, since = remainder(yaw - self._yaw[row], tau), time - self._yaw_time[row]
+        if not watched:
+            self._flipped[row] = 0.0
+        elif abs(jump) > min(FLIP + self._turn_rate[row] * since, MOST_TURNED):  # not of the first one, which is NaN
+            self._flipped[row] = remainder(self._flipped[row] + jump, tau)
+        self._yaw[row], self._yaw_time[row] = yaw, time
+        return yaw if abs(self._flipped[row]) < FLIP else nan
 
     def disbelieve(self, row: int) -> None:
         """What a row is told about its position is wrong, for as long as it is in motion."""

@@ -80,3 +80,20 @@ def test_a_jump_at_take_off_is_seen():
         for k, (x, watched) in enumerate(places)
     ]
     assert found == [True, True, True, False]
+
+
+def test_a_yaw_that_flips_is_unknown_until_it_is_back():
+    external = ExternalPositions([CRAZYFLIE])
+
+    def known(since, until, off, watched=True):
+        """Of a robot that turns at 1.5 rad/s, whose yaw is `off` [rad] from one tick to another: which are believed."""
+        ticks = 0.01 * np.arange(since, until)
+        yaws = [external.believed_yaw(0, t, math.remainder(1.5 * t + off, math.tau), watched=watched) for t in ticks]
+        return np.isfinite(yaws)
+
+    assert known(0, 300, 0.0).all()
+    assert not known(300, 1000, math.pi).any()  # it turns right round meanwhile
+    assert known(1000, 1100, 0.0).all()
+    assert not known(1100, 1200, -math.pi / 2).any()
+    assert known(1200, 1300, -math.pi / 2, watched=False).all()  # it stands: it may have been turned
+    assert np.isnan(external.believed_yaw(0, 99.0, math.nan, watched=True))
