@@ -25,6 +25,7 @@ DESCENT: Final = 0.1  # [m/s] a robot that sinks faster may be landing,
 DESCENT_S: Final = 2.0  # and is in the way wherever it can be within this time
 OUTLINE: Final = 0.05  # [m] a reading that ends this near to a received robot has hit that robot,
 OUTLINE_SHARE: Final = 0.05  # and this share of its length, as long ones are measured worse
+INSIDE: Final = 0.5  # share of its radius: a shorter reading of a robot is none
 STEEP: Final = 0.5  # cosine of the elevation above which a ray looks up or down, not around
 
 
@@ -122,7 +123,8 @@ class Perception:
 
     def _ends(self, rays: Rays, fresh: Mask, state: BodyState) -> _Points:
         """End points of the fresh readings that hit something near."""
-        hit = fresh & (rays.distance <= REACH) & (rays.distance >= 0.0)  # NaN: nothing was hit
+        # NaN: nothing was hit; nothing is inside the robot either
+        hit = fresh & (rays.distance <= REACH) & (rays.distance > INSIDE * self._radius[rays.row])
         # one point that is not finite would spoil the sum over all things near its row
         hit &= np.isfinite(rays.bearing) & np.isfinite(rays.elevation)
         hit &= np.isfinite(state.position[rays.row]).all(axis=1) & np.isfinite(state.yaw[rays.row])

@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, every, norm, some
+from agents.arrays import Array, Index, Mask, clamp, every, norm, some
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
@@ -60,6 +60,7 @@ STEP: Final = 0.05  # [m]
 SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
+NOT_UNIT: Final = 0.1  # quaternions whose squared norm is further than this from 1 are no attitude
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
@@ -194,15 +195,18 @@ class Detector:
     def _position_and_arena(self, now: Situation) -> Iterator[Observation]:
         t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
-        def age(row: int) -> str:
+        def lost(row: int) -> str:
             if now.jump is not None and np.isfinite(now.jump[row]):
                 return f"it jumped by {now.jump[row]:.2f} m"
-            return f"the last is {t - state.time[row]:.2f} s old" if np.isfinite(state.position[row]).all() else "none"
+            if not np.isfinite(state.position[row]).all():
+                return "none"
+            age = t - state.time[row]
+            return f"the last is {age:.2f} s old" if age >= 0.0 else f"it is stamped {-age:.3g} s ahead"
 
         def excess(limit: float, row: int) -> str:
             return f"{where.excess[row]:.2f} m outside (limit {limit:g} m)"
 
-        yield Observation(Cause.POSITION, where.invalid, age)
+        yield Observation(Cause.POSITION, where.invalid, lost)
         yield Observation(Cause.MARGIN, where.outside_wall & ~where.outside, partial(excess, 0.0))
         yield Observation(Cause.OUTSIDE, where.outside, partial(excess, OUTSIDE_M))
         yield Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, partial(excess, cut))
@@ -334,8 +338,10 @@ def clock_text(names: Sequence[str], ahead: Array, row: int) -> str:
 
 def tilted(attitude: Array, limit: float) -> Mask:
     """Rows that lean more than `limit` [rad]; `attitude` (N, 4) as in `BodyState`, unknown ones do not."""
-    around = attitude[:, 1:3]  # a turn about the vertical has neither; sin² of half the angle, else
-    return np.asarray(np.vecdot(around, around) > sin(0.5 * limit) ** 2)
+    squared = np.square(clamp(attitude, -2.0, 2.0))
+    unit = np.abs(squared.sum(axis=1) - 1.0) < NOT_UNIT  # else it is no attitude
+    # a turn about the vertical has neither of these; sin² of half the angle, else
+    return np.asarray(unit & (squared[:, 1] + squared[:, 2] > sin(0.5 * limit) ** 2))
 
 
 def tilt_angle(attitude: Array, row: int) -> float:

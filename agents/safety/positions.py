@@ -49,11 +49,13 @@ class Continuity:
             return None
         watched = watched | self._out
         gap, unknown = np.sqrt(squared), watched & np.isnan(position).any(axis=1)
-        plausible = self._jump + np.where(self._out, 0.0, self._fastest * np.clip(time - self._time, 0.0, GAP_S))
+        known = np.isfinite(time) & np.isfinite(self._time)
+        since = np.clip(np.subtract(time, self._time, out=np.zeros_like(time), where=known), 0.0, GAP_S)
+        plausible = self._jump + np.where(self._out, 0.0, self._fastest * since)
         self._out = watched & ((gap > plausible) | (unknown & self._out))
         kept = self._out | unknown
         self._place = np.where(kept[:, None], self._place, position)
-        self._time = np.where(kept | np.isinf(time), self._time, time)
+        self._time = np.where(kept, self._time, time)
         return np.where(self._out, gap, np.nan) if some(self._out) else None
 
     def forget(self, row: int) -> None:

@@ -70,9 +70,12 @@ class SetpointFilter:
         self._sure = PoseValidity(True, *(self._no_row,) * 4, np.zeros(len(kinds)))
 
     def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
-        """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s]."""
+        """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s].
+
+        A pose of the future would never become old: its time is wrong.
+        """
         off = np.abs(position - self._centre)
-        known, fresh = np.abs(yaw) < ABSURD, age <= self.limits.own_silence_s
+        known, fresh = np.abs(yaw) < ABSURD, np.abs(age) <= self.limits.own_silence_s
         if every(off <= self._half) and every(known) and every(fresh):
             return self._sure
         invalid = ~np.asarray(known & fresh & (np.abs(position) < ABSURD).all(axis=1))

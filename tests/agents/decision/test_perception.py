@@ -191,10 +191,16 @@ def test_a_ray_ends_where_it_points_from_the_pose_of_the_robot():
     assert len(placed(alone(), 0.0, state([0, 0, 0], rays=rays([0], [0.0], [REACH + 0.1])))) == 0
 
 
-@pytest.mark.parametrize("wrong", [{"bearing": np.nan}, {"elevation": np.nan}, {"bearing": np.inf}])
-def test_a_ray_without_direction_is_no_point(wrong):
-    scan = {"bearing": [0.0, 1.0], "elevation": 0.0} | {name: [value, 0.0] for name, value in wrong.items()}
-    seen = rays([0, 0], scan["bearing"], [0.4, 0.9], elevation=scan["elevation"])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"bearing": np.nan}, {"elevation": np.nan}, {"bearing": np.inf}),
+        *({"distance": value} for value in (0.0, -0.1, -np.inf, 0.01)),
+    ],
+)
+def test_a_ray_without_direction_or_length_is_no_point(wrong):
+    scan = {"bearing": 1.0, "elevation": 0.0, "distance": 0.4} | wrong
+    seen = rays([0, 0], [scan["bearing"], 0.0], [scan["distance"], 0.9], elevation=[scan["elevation"], 0.0])
     _, near = alone().sense(0.0, state([0.0, 0.0, 0.0], rays=seen), NeighbourPoses(0))
     assert near.position.shape == (1, 2)
     assert np.isfinite(near.position).all()

@@ -105,6 +105,15 @@ def test_wheels_whose_position_is_old_know_no_error():
     assert np.isfinite(swarm.agent("B").error).all()
 
 
+@pytest.mark.parametrize("ahead_s", [0.3, 100.0, np.inf])
+def test_a_silent_body_whose_clock_is_ahead_lands(ahead_s):
+    swarm = drone().running().run(0.3)
+    before = swarm.groups[0].state
+    spoiled(swarm, time=before.time + ahead_s, position=before.position, velocity=before.velocity)
+    swarm.run(1.5)
+    assert swarm.phase("F") >= LANDING
+
+
 def jumped(swarm, name, at, until, off=1.0):
     """The measured position of a robot is `off` [m] from `at` [s] on, before `until`."""
     group = next(group for group in swarm.groups if name in group.names)
@@ -332,6 +341,13 @@ def test_a_landing_that_takes_long_is_given_its_time():
     swarm.run(30.0)
     assert swarm.phase("F") == LANDING
     assert not any("land" in text for text in happened(swarm)["F"])
+
+
+@pytest.mark.parametrize(
+    "attitude", [[1.0, 0.7, 0.0, 0.0], [10.0, 0.8, 0.0, 0.0], [0.0] * 4, [np.nan] * 4, [1e200] * 4]
+)
+def test_what_is_no_rotation_is_no_tilt(attitude):
+    assert not tilted(np.array([attitude]), 1.2).any()
 
 
 def test_leaning_is_an_angle_to_the_vertical():

@@ -50,7 +50,7 @@ def test_whatever_comes_in_a_lawful_setpoint_goes_out(setpoint, position, yaw, a
         np.testing.assert_array_equal(kept, now)
     safe, blind = verdict.setpoint, verdict.invalid_pose
     believable = (np.abs(position) < 1e6).all(axis=1) & (np.abs(yaw) < 1e6)
-    np.testing.assert_array_equal(blind, ~(believable & (age <= LIMITS.own_silence_s)))
+    np.testing.assert_array_equal(blind, ~(believable & (np.abs(age) <= LIMITS.own_silence_s)))
     by_position = TAKES == "position"
     assert np.isnan(safe[blind & by_position]).all()
     assert np.isfinite(safe[~(blind & by_position)]).all()
