@@ -66,6 +66,11 @@ class Keys:
         return f"{alive}/**"
 
     @staticmethod
+    def owner_tokens(alive: str) -> list[str]:
+        """Keys of all tokens that the owner of a name may hold."""
+        return [alive, Keys.life(alive, "*"), Keys.claim(alive, "*/*")]
+
+    @staticmethod
     def life(alive: str, session: str) -> str:
         """Token of the session that owns the name of a liveliness key."""
         return f"{alive}/life/{session}"

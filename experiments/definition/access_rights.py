@@ -71,7 +71,7 @@ def _rights(experiment: Experiment) -> Rights:
             subscribe=[*inputs, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
             answer=own,
             queried=[keys.pose("*"), keys.order("*")],
-            tokens=[*own, *tokens],
+            tokens=[*(key for name in group for key in keys.owner_tokens(keys.alive(name))), *tokens],
             watch=[
                 *own,
                 *(keys.lives(keys.alive(other)) for other in others),

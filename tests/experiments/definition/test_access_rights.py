@@ -68,7 +68,8 @@ def wanted(who, action, robot, what, *, hears, mates, guided):
         )
     if who.startswith("R"):
         return (
-            (own and action in ("put", "keep", "answer", "be", "watch"))
+            (own and action in ("put", "keep", "answer", "watch"))
+            or (own and what == "alive" and action == "be")
             or (own and what in ("position", "ranges") and action in ("hear", "last"))
             or (own and what == "goal" and robot in guided and action in ("hear", "last"))
             or (robot in hears and what == "pose" and action in ("hear", "last"))
@@ -139,6 +140,23 @@ def test_what_keeps_an_experiment_going_is_allowed(who, action, key):
 )
 def test_what_a_centre_needs_is_allowed(who, action, key):
     assert may(control(experiment({(0, 1)}, architecture="centralised")), who, action, key)
+
+
+@pytest.mark.parametrize(
+    ("token", "granted"),
+    [
+        (KEYS.alive("R0"), True),
+        (KEYS.life(KEYS.alive("R0"), "f00d"), True),
+        (KEYS.claim(KEYS.alive("R0"), KEYS.rank(1e9, "f00d")), True),
+        ("park/R0/alive/x/1", False),
+        ("park/R0/pose", False),
+        ("park/R0/**", False),
+        (KEYS.alive("R1"), False),
+    ],
+)
+def test_a_robot_holds_its_own_tokens_alone(token, granted):
+    made = held(control(experiment({(0, 1)})), "R0")
+    assert permitted(made, "ingress", "liveliness_token", token) == granted
 
 
 NO_OPERATORS = ("R0", "R1", *(role for role in ROLES[1:] if role != "operator"), OUTSIDER)
