@@ -14,6 +14,9 @@ from typing import Final
 
 BEAT_S: Final = 0.5  # period of the heartbeat
 SILENCE_S: Final = 3.0
+# Of a process on another machine. TCP sends again 0.2, 0.6, 1.4, 3.0 and 6.2 s after a cable was cut: one that is back
+# within 3 s is noticed after 3 s.
+FAR_SILENCE_S: Final = 4.5
 LONGEST: Final = 4096  # of a line [bytes]
 
 

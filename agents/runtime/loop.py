@@ -39,6 +39,7 @@ from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
 from agents.runtime.command_line import on_termination
 from agents.runtime.goal_inbox import GoalInbox
+from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
 from agents.runtime.lifeline import Lifeline
 from agents.runtime.orders import LAND, STOP, carry_out
 from agents.runtime.pose_inbox import PoseInbox
@@ -77,6 +78,7 @@ class Setup:
     rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
     # [s] without a tick after which the watchdog lands the robots
     loop_silence_s: float = SILENCE_S
+    lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
 
 
 class Runtime:
@@ -127,7 +129,7 @@ class Runtime:
         belongs to that process and is left as it is.
         """
         lost = threading.Event()
-        lifeline = Lifeline(lost, on_line=self._setup.clock.follow)
+        lifeline = Lifeline(lost, self._setup.lifeline_s, on_line=self._setup.clock.follow)
         if self._setup.lifeline:
             lifeline.start()
         asked = threading.Event()

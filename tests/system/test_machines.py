@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,7 @@ LACKING = why_not()
 pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(LACKING), reason=LACKING)]
 
 ROBOTS = {"lab1": ["TB01", "KH01"], "lab2": ["KH02", "CF01"], "lab3": ["KH03", "CF02", "CF03"]}
+CUT_S = 2.0
 OFFSET_S, DRIFT = 0.2, 50e-6  # of the second machine
 
 
@@ -181,6 +183,20 @@ def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Ma
     assert flight.returncode == 1, out
     assert re.search(r"Failed in event: CF01 at \d+\.\d s: was lost: its process ended", out), out
     assert "done (finished)" in said(folder / "logs", "KH01")
+    until(lambda: not busy(lab), "nothing is left")
+
+
+def test_a_short_cut_of_the_cable_lands_nobody(lab: Machines, tmp_path: Path) -> None:
+    """TCP sends what was lost again 3 s after the cut, although the cable is back after 2 s."""
+    file, folder = triangle(lab, tmp_path, 10.0), tmp_path / "run"
+    flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")
+    until(lambda: "running" in said(folder / "logs", "CF01"), "it runs", 60.0)
+    lab["lab3"].unplug()
+    threading.Event().wait(CUT_S)
+    lab["lab3"].plug_in_again()
+    out, _ = flight.communicate(timeout=60)
+    assert "lost CF01" not in out
+    assert "done (finished)" in said(folder / "logs", "CF01")
     until(lambda: not busy(lab), "nothing is left")
 
 

@@ -12,12 +12,12 @@ from agents.network.endpoints import UNIX, Endpoint
 CONNECT_S: Final = 10
 BROKEN: Final = 255  # exit code of ssh when it is ssh itself that failed
 
-# BatchMode: no user could answer a question. Three missed replies end a connection, as silence ends a robot's lifeline.
+# BatchMode: no user could answer a question. Four missed replies end a connection, as silence ends a robot's lifeline.
 OPTIONS: Final = {
     "BatchMode": "yes",
     "ConnectTimeout": str(CONNECT_S),
     "ServerAliveInterval": "1",
-    "ServerAliveCountMax": "3",
+    "ServerAliveCountMax": "4",
     "ExitOnForwardFailure": "yes",
     "ControlPath": "none",  # a connection that is shared takes all of its robots along when it ends
     "IPQoS": "af21",  # what has no terminal is marked as bulk otherwise, which a radio sends last

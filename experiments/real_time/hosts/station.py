@@ -27,7 +27,7 @@ from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network import session as network
 from agents.plugins import registry
-from agents.runtime.lifeline import SILENCE_S
+from agents.runtime.lifeline import FAR_SILENCE_S
 from experiments.definition.bodies import missing_library
 from experiments.real_time.hosts import certificates
 from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
@@ -176,7 +176,7 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     waiting.register(fd, select.POLLIN)
     rest = b""
     with contextlib.suppress(OSError):  # the other end is closed
-        while waiting.poll(SILENCE_S * 1e3):
+        while waiting.poll(FAR_SILENCE_S * 1e3):
             data = os.read(fd, 65536)
             clock = here.utc()
             if not data:

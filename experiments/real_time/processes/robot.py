@@ -32,6 +32,7 @@ from agents.network.lab import secured
 from agents.network.shutdown import end
 from agents.plugins import registry
 from agents.runtime import command_line
+from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
 from agents.runtime.loop import Ranging, Runtime, Setup
 from experiments.definition import bodies, link_conditions, mesh
 from experiments.definition.endpoints import router_endpoints
@@ -101,6 +102,7 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         encoding=experiment.network.encoding,
         state_hz=experiment.rates.state_hz,
         lifeline=launch.lifeline,
+        lifeline_s=FAR_SILENCE_S if launch.file == STDIN else SILENCE_S,
         located=[experiment.robots[name].position == "external" for name in names],
         exact=[name not in Plan(experiment).externally_measured for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],

@@ -5,6 +5,7 @@ import shlex
 import pytest
 
 from agents.network.endpoints import Endpoint
+from agents.runtime.lifeline import BEAT_S, FAR_SILENCE_S
 from experiments.real_time.hosts import ssh
 
 
@@ -60,3 +61,11 @@ def test_which_ports_sshd_chose():
         "Allocated port 41000 for remote forward to 127.0.0.1:7448\n"
     )
     assert ssh.allocated(said) == [36225, 41000]
+
+
+def test_a_far_lifeline_outlasts_a_short_cut() -> None:
+    sent_again_s = [0.2 * (2**k - 1) for k in range(1, 6)]  # after a cut: TCP doubles its pauses
+    in_time = [at for at in sent_again_s if at + BEAT_S < FAR_SILENCE_S]
+    assert in_time[-1] == pytest.approx(3.0)
+    interval, count = (int(ssh.OPTIONS[f"ServerAlive{word}"]) for word in ("Interval", "CountMax"))
+    assert interval * (count + 1) > FAR_SILENCE_S, "the connection lives as long"
