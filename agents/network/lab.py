@@ -10,6 +10,8 @@ router tells how to be let in.
 
 from __future__ import annotations
 
+import hashlib
+import secrets
 import stat
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +29,7 @@ ROLES: Final[tuple[Role, ...]] = get_args(Role)
 REGISTER: Final = "lab.json"
 AUTHORITY: Final = "ca"
 MARK: Final = "#lab="
+MARK_BYTES: Final = 8  # of an id of 16
 SECURE: Final = ("tls", "quic")
 DEFAULT_SECURE: Final = "tls/127.0.0.1:7447"
 
@@ -149,6 +152,27 @@ def lab_of(endpoints: Sequence[str]) -> Path | None:
     return Path(folder)
 
 
+def session_id(name: str) -> str:
+    """A Zenoh id, as text, for a session of an identity: random, and with the mark of its name at the end.
+
+    A router has one session of an id, whoever asks first: by the mark it knows an id that was taken from another.
+    """
+    first = secrets.choice("123456789abcdef")  # an id has no leading zero
+    return first + secrets.token_hex(16)[: 31 - len(_mark(name))] + _mark(name)
+
+
+def _mark(name: str) -> str:
+    return hashlib.blake2s(name.encode(), digest_size=MARK_BYTES).hexdigest()
+
+
+def robbed(known: Register, zid: str, common_name: str | None) -> str | None:
+    """The identity whose mark a session's id has, although its certificate is another one; None if all is well."""
+    for name, identity in known.identities.items():
+        if zid.endswith(_mark(name)):
+            return None if common_name == identity.common_name else name
+    return None
+
+
 def settings(folder: Path, name: str, *, listens: bool) -> dict[str, object]:
     """Zenoh settings with which an identity shows its certificate and asks for that of the other end."""
     authority, certificate, key = (str(file) for file in files(folder, name))
@@ -162,4 +186,4 @@ def settings(folder: Path, name: str, *, listens: bool) -> dict[str, object]:
     }
     if listens:
         tls |= {"listen_certificate": certificate, "listen_private_key": key}
-    return {"transport/link/tls": tls}
+    return {"transport/link/tls": tls, "id": session_id(name)}

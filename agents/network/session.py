@@ -18,11 +18,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from math import inf
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 import zenoh
 from zenoh.handlers import RingChannel
@@ -38,18 +38,24 @@ _NO_LINGER: Final = struct.pack("ii", 0, 0)  # struct linger
 _INET: Final = (socket.AF_INET, socket.AF_INET6)
 
 
+class _Connection(NamedTuple):
+    """A TCP connection, by a descriptor of our own: Zenoh may close its own at any moment."""
+
+    socket: socket.socket
+    near: str  # address of its end here, as Zenoh writes it
+    far: str
+
+
 def forbid_lingering() -> int:
     """Lets the TCP connections of this process close at once, with data still on their way; returns their number.
 
     Zenoh sets SO_LINGER to 10 s: closing the connection to a process that is frozen, or cut off, stops the thread that
     serves all others for as long.
     """
-    changed = 0
-    for each in _connections():
-        with each:
-            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
-            changed += 1
-    return changed
+    with _connections() as found:
+        for each in found:
+            each.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+        return len(found)
 
 
 def hang_up(session: zenoh.Session) -> int:
@@ -57,46 +63,56 @@ def hang_up(session: zenoh.Session) -> int:
 
     Returns their number; the network is not waited for. Only TCP and TLS have connections that can be ended so.
     """
-    forbid_lingering()
     own = {str(link.src).partition("/")[2] for link in session.info.links()}
-    ended = 0
+    with _connections() as found:
+        peers = {each.far for each in found if each.near in own}
+        return _shut_down([each for each in found if each.far in peers])
+
+
+def hang_up_on(link: zenoh.Link) -> bool:
+    """Ends the TCP connection of one link of this process; returns whether it has one."""
+    far = str(link.dst).partition("/")[2].partition("?")[0].partition("#")[0]
+    with _connections() as found:
+        return _shut_down([each for each in found if each.far == far]) > 0
+
+
+def _shut_down(connections: Sequence[_Connection]) -> int:
+    for each in connections:
+        each.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+        with suppress(OSError):  # the other end was faster
+            each.socket.shutdown(socket.SHUT_RDWR)
+    return len(connections)
+
+
+@contextmanager
+def _connections() -> Iterator[list[_Connection]]:
+    """The TCP connections of this process."""
     with ExitStack() as opened:
-        found = [opened.enter_context(each) for each in _connections()]
-        peers = {each.getpeername() for each in found if _address(each) in own}
-        for each in found:
-            if each.getpeername() in peers:
-                each.shutdown(socket.SHUT_RDWR)
-                ended += 1
-    return ended
+        found = []
+        for name in list(_OPEN.iterdir()) if _OPEN.is_dir() else ():
+            try:
+                own = os.dup(int(name.name))
+            except OSError:  # closed meanwhile
+                continue
+            try:
+                one = opened.enter_context(socket.socket(fileno=own))
+            except OSError:  # no socket
+                os.close(own)
+                continue
+            with suppress(OSError):  # it listens, or is not connected any more
+                if one.family in _INET and one.type == socket.SOCK_STREAM:
+                    found.append(_Connection(one, *(_address(end, one.family) for end in _ends(one))))
+        yield found
 
 
-def _connections() -> Iterator[socket.socket]:
-    """The TCP connections of this process, by descriptors of our own: theirs may be closed at any moment."""
-    for name in list(_OPEN.iterdir()) if _OPEN.is_dir() else ():
-        try:
-            own = os.dup(int(name.name))
-        except OSError:  # closed meanwhile
-            continue
-        try:
-            one = socket.socket(fileno=own)
-        except OSError:  # no socket
-            os.close(own)
-            continue
-        try:
-            one.getpeername()
-            good = one.family in _INET and one.type == socket.SOCK_STREAM
-        except OSError:  # it listens, or is not connected any more
-            good = False
-        if good:
-            yield one
-        else:
-            one.close()
+def _ends(connection: socket.socket) -> tuple[tuple[str, int], tuple[str, int]]:
+    return connection.getsockname(), connection.getpeername()
 
 
-def _address(connection: socket.socket) -> str:
-    """The local address, as Zenoh writes it."""
-    host, port = connection.getsockname()[:2]
-    return f"[{host}]:{port}" if connection.family == socket.AF_INET6 else f"{host}:{port}"
+def _address(name: tuple[str, int], family: int) -> str:
+    """The address of one end of a connection, as Zenoh writes it."""
+    host, port = name[:2]
+    return f"[{host}]:{port}" if family == socket.AF_INET6 else f"{host}:{port}"
 
 
 SLICE_NS: Final = 100_000  # the shortest that is granted

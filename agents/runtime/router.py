@@ -15,12 +15,13 @@ from typing import Annotated, Final
 import msgspec
 import zenoh
 from msgspec import Meta
+from zenoh.handlers import Callback
 
 from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
-from agents.network.session import deserted, forbid_lingering, prompt_threads
+from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads
 from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
 from agents.runtime import command_line
@@ -101,7 +102,9 @@ def serve_router(
     read = _stamp(register)  # before reading: a change in between is detected
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
-        with held(_routing(chosen, endpoints, patience_s, stop)) as (session, _):
+        with held(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
+            if register is not None:
+                declared.append(Guard(session, lab.register(register.parent)))
             ready(session)
             patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
@@ -118,6 +121,35 @@ def serve_router(
                 break
             else:
                 return
+
+
+class Guard:
+    """Disconnects sessions of a lab's router whose ids were taken from others (`lab.session_id`).
+
+    Zenoh compares ids with no certificates: who connects first with the id of a robot, as after a restart of the
+    router, keeps that robot out.
+    """
+
+    def __init__(self, session: zenoh.Session, known: lab.Register) -> None:
+        self._known = known
+        self._told: set[tuple[str, str | None, bool]] = set()
+        # in the receiving thread: each moment that a thief stays is one in which the robot is refused
+        callback = Callback(self._check, indirect=False)
+        self._listener = session.info.declare_link_events_listener(callback, history=True)
+
+    def _check(self, event: zenoh.LinkEvent) -> None:
+        link = event.link
+        if event.kind == zenoh.SampleKind.DELETE:
+            return
+        victim = lab.robbed(self._known, str(link.zid), link.auth_identifier)
+        if victim is None:
+            return
+        told = (victim, link.auth_identifier, hang_up_on(link))
+        if told not in self._told:
+            self._told.add(told)
+            done = "is disconnected" if told[-1] else f"cannot be disconnected: only TLS can; {victim} is kept out"
+            who = f"with the certificate of {link.auth_identifier}"
+            print(f"router: a session {who} came with the id of {victim}; it {done}", file=sys.stderr, flush=True)
 
 
 def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:

@@ -1,10 +1,16 @@
+from threading import Event, Thread
+
 import pytest
+import zenoh
 
 from agents.network import lab
 from agents.network.access_control import Grant, Rights
-from agents.network.endpoints import EndpointError
+from agents.network.endpoints import EndpointError, free_endpoint
 from agents.network.lab import LabError, bare, files, lab_of, options, register, require, secured
+from agents.network.session import connected
+from agents.network.shutdown import leave
 from agents.network.zenoh_config import config, settings
+from agents.runtime.router import serve_router
 from tools.commands import authority
 
 
@@ -95,3 +101,53 @@ def test_a_key_that_others_can_read_is_refused(tmp_path):
     (tmp_path / "lab" / "CF01.key").chmod(0o640)
     with pytest.raises(LabError, match="chmod 600"):
         files(tmp_path / "lab", "CF01")
+
+
+def test_an_id_belongs_to_one_certificate():
+    certificates = {"CF01": "CF01.2", "KH01": "KH01", "observer": "observer"}
+    known = lab.Register({name: lab.Identity("robot", common, "1", "2100") for name, common in certificates.items()})
+    zid = lab.session_id("CF01")
+    assert (len(zid), zid[0] != "0", zid != lab.session_id("CF01")) == (32, True, True)
+    assert lab.robbed(known, zid, "CF01.2") is None
+    assert lab.robbed(known, zid, "CF01") == "CF01", "it was revoked"
+    assert lab.robbed(known, zid, "KH01") == "CF01"
+    assert lab.robbed(known, zid, None) == "CF01"
+    assert lab.robbed(known, "f00d", "observer") is None, "a foreign program chooses its own"
+
+
+@pytest.mark.mechanism("stolen Zenoh id")
+@pytest.mark.system
+def test_a_thief_of_an_id_keeps_nobody_out(tmp_path, eventually):
+    """It comes first, as at a restart of the router, and again and again."""
+    folder = tmp_path / "lab"
+    authority.create(folder, {"router": "router", "operator": "operator", "CF01": "robot"})
+    (endpoint,) = secured([free_endpoint(preferred_port=0, protocol="tls")], folder)
+    rights, stop, ready = Rights("park", {"CF01": Grant(publish=["park/CF01/**"])}, {}), Event(), Event()
+    router = Thread(
+        target=serve_router, args=([endpoint], stop), kwargs={"rights": rights, "ready": lambda _: ready.set()}
+    )
+    router.start()
+    assert ready.wait(30.0)
+    zid = lab.session_id("CF01")
+    made = [
+        config({**settings("client", connect=[endpoint], name=name, identity=name), "id": zid})
+        for name in ("operator", "CF01")
+    ]
+    thief = zenoh.open(made[0])
+    opened = []
+
+    def let_in():
+        try:
+            opened.append(zenoh.open(made[1]))
+        except zenoh.ZError:
+            return False
+        return True
+
+    try:
+        eventually(let_in)
+        eventually(lambda: connected(opened[0]) and not connected(thief))
+    finally:
+        for session in (thief, *opened):
+            leave(session)
+        stop.set()
+        router.join()

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from math import inf
 from pathlib import Path
 
@@ -577,9 +576,8 @@ def test_a_router_closes_no_connection_slowly(eventually) -> None:
             port = int(endpoint.rpartition(":")[2])
 
             def ends() -> list[bool]:
-                with ExitStack() as opened:
-                    found = [opened.enter_context(each) for each in connections()]
-                    return [lingers(each) for each in found if each.getsockname()[1] == port]
+                with connections() as found:
+                    return [lingers(each.socket) for each in found if each.near.endswith(f":{port}")]
 
             eventually(lambda: ends() == [False])
     finally:
