@@ -18,6 +18,7 @@ from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.run_view import NetworkView, Progress, RobotView
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, status
+from tests.waiting import until
 
 KEYS = Keys()
 
@@ -56,6 +57,8 @@ def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProc
     ):
         storage.declare_queryable(KEYS.everything, recall, complete=True)
         told = {name: pubsub.Orders(robots, KEYS.order(name), messages.Order) for name in names}
+        _token = pubsub.alive_token(robots, KEYS.alive("A"))
+        until(lambda: network.tokens_present(conductor, KEYS.alive("A")), "robots are there, with their keys")
         thread = threading.Thread(target=answer)
         thread.start()
         try:
