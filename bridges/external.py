@@ -34,6 +34,7 @@ WORLD: Final = "world"  # the address of robots in the shared world process
 REPEAT_S: Final = 0.1  # period of repeated orders: the publisher drops samples when its queue is full
 HALT_S: Final = 3.0  # how long `land` is repeated to a robot on wheels
 ANSWER_S: Final = 2.5  # the note reports a robot that is not measured to stand so long after a stop
+SUPERSEDED_S: Final = 1.0  # a shorter standstill costs no process its name
 STANDSTILL_S: Final = 1.0  # how long `close` waits until stopped robots are measured to stand
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
 
@@ -75,6 +76,7 @@ class ExternalBody:
         self._stopped_since = np.full(rows, np.inf)
         # sequence numbers grow over restarts: a simulator that outlives this process can tell new orders from old
         self._seq = [round(1e3 * self._utc)] * rows
+        self._read_at = np.inf  # last call of `read`
         self._repeated: dict[int, _RepeatedOrder] = {}
         self._next_repeat = 0.0
         self._lock = threading.Lock()  # of the sequence numbers: `land` and `stop` are called from other threads too
@@ -105,6 +107,7 @@ class ExternalBody:
             raise BodyError("\n".join(missing))
 
     def read(self, t: float) -> BodyState:
+        self._outnumber_successor()
         self._clock_offset = min(self._clock_offset, self._now() - t)  # a late call only makes the difference larger
         self._read_positions()
         self._update_flying()
@@ -269,6 +272,14 @@ class ExternalBody:
             order = self._next_command(row, action, height=height)
             self._repeated[row] = _RepeatedOrder(order, self._now() + seconds)
             self._put(row, order)
+
+    def _outnumber_successor(self) -> None:
+        """After a standstill, go on with numbers beyond those of a process that had the name meanwhile."""
+        before, self._read_at = self._read_at, self._now()
+        if self._read_at - before > SUPERSEDED_S:
+            least = round(1e3 * (self._utc + self._read_at))
+            with self._lock:
+                self._seq = [max(seq, least) for seq in self._seq]
 
     def _next_command(
         self, row: int, action: Action, setpoint: messages.Setpoint | None = None, height: float | None = None

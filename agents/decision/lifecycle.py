@@ -95,6 +95,7 @@ class Lifecycle:
         """Motors off."""
         self.phase[row], self._climbing[row], self.reason[row] = DONE, False, reason
         self._forget("takeoff", row)
+        self._forget("land", row)  # the body would get it after the stop
         self._due["stop"].append(row)
         self._settled_until = -np.inf
 

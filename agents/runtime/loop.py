@@ -549,7 +549,10 @@ class Runtime:
         if commands is not None:
             orders = ((self._body.stop, commands.stop), (self._body.land, commands.land))
             call_all(partial(order, rows) for order, rows in orders if len(rows))
-            if len(commands.takeoff) and not overruled:
+            if stale:  # the order is old now
+                for row in commands.takeoff.tolist():
+                    self.agent.lifecycle.land(row, "its process stood still at its take-off")
+            elif len(commands.takeoff) and not overruled:
                 self._airborne = True
                 self._body.takeoff(commands.takeoff, self._assignment.hover[commands.takeoff])
         if not overruled and not stale:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -302,6 +303,36 @@ def test_without_a_world_it_says_what_to_start(router: RouterProcess, monkeypatc
         "CF01: nothing is published on park/CF01/position: is `./zenpark world serve` with this experiment running and "
         f"connected to {router.endpoint}?"
     )
+
+
+def test_numbers_after_standstill_exceed_those_of_successor(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(time, "clock_gettime", lambda _clock: now[0])
+
+    def process() -> ExternalBody:
+        made = ExternalBody(request("tcp/127.0.0.1:1", {"CF01": "crazyflie"}))
+        monkeypatch.setattr(made, "_read_positions", lambda: None)
+        positions = SimpleNamespace(ahead=np.zeros(1), malformed=[0])
+        ranges = SimpleNamespace(read=lambda *_: None, malformed=0)
+        monkeypatch.setattr(made, "_positions", positions, raising=False)
+        monkeypatch.setattr(made, "_ranges", ranges, raising=False)
+        return made
+
+    def numbers(of: ExternalBody) -> list[int]:
+        seen: list[int] = []
+        monkeypatch.setattr(of, "_put", lambda _row, command: seen.append(command.seq))
+        for _ in range(100):
+            now[0] += 0.01
+            of.read(now[0] - 1000.0)
+            of.command(np.zeros((1, 4)))
+        return seen
+
+    first = process()
+    before = numbers(first)
+    assert np.diff(before).tolist() == [1] * 99
+    now[0] += 30.0  # it stands still; another process takes the name, and ends
+    between = numbers(process())
+    assert numbers(first)[0] > between[-1] > before[-1]
 
 
 @pytest.mark.system

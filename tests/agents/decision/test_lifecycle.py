@@ -187,6 +187,16 @@ def test_stop_in_the_same_tick_as_take_off_stays_on_the_ground():
     assert robots.life.phase[0] == DONE
 
 
+def test_stop_in_the_tick_of_landing_is_the_last_order():
+    robots = Robots([True])
+    robots.life.phase[:] = RUNNING
+    robots.life.land(0, "ordered to land")
+    robots.life.stop(0, "ordered to stop")
+    robots.step()
+    ((_, duties),) = robots.told
+    assert (duties.stop.tolist(), duties.land.tolist()) == ([0], [])
+
+
 def test_a_second_landing_keeps_the_first_reason():
     robots = airborne()
     robots.life.land(0, "first")

@@ -180,3 +180,23 @@ def test_stop_while_body_opens_keeps_it_down(monkeypatch):
         stage.run(visit)
     assert [order for _, order in stage.orders] == ["stop"]
     assert stage.runtime.agent.lifecycle.reason[0].startswith(messages.EMERGENCY)
+
+
+def test_standstill_before_takeoff_keeps_it_down(monkeypatch):
+    stage = Stage(monkeypatch, "crazyflie")
+    act = stage.runtime._act
+
+    def late(actions):
+        stage.now += 0.8 if actions.commands is not None and len(actions.commands.takeoff) else 0.0
+        act(actions)
+
+    def visit(phase):
+        if phase == Phase.READY:
+            stage.runtime.agent.lifecycle.takeoff(0)
+        return phase == Phase.DONE
+
+    with Net().worn() as net:
+        stage.begin(net)
+        monkeypatch.setattr(stage.runtime, "_act", late)
+        stage.run(visit)
+    assert "takeoff" not in [order for _, order in stage.orders]

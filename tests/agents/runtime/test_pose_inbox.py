@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -464,3 +465,48 @@ def test_replay_on_the_key_is_a_hazard_with_its_number(robot):
     robot.t += 1.0
     assert hazards(robot) == []
     assert robot.x == 0.4
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_after_any_turmoil_the_process_that_stays_is_heard(robot, seed):
+    chance = random.Random(seed)
+    alive: set[str] = set()
+    names, seqs = ("one", "two", "three", "four"), dict.fromkeys(("one", "two", "three", "four"), 0)
+    clocks = {name: chance.choice([0.0, 0.0, 60.0, -4.0, -9.0, 3600.0]) for name in names}
+    plain = False
+
+    def speak(name: str, x: float) -> None:
+        seqs[name] += 1
+        robot.pose(seqs[name], x, session=name, age=clocks[name])
+
+    for _ in range(120):
+        name, what = chance.choice(names), chance.randrange(7)
+        if what == 0 or (what == 1 and name in alive):
+            alive ^= {name}
+            robot.tell(Keys.life(KEYS.alive("B"), name), gone=name not in alive)
+        elif what == 2:
+            plain = not plain
+            robot.tell(KEYS.alive("B"), gone=not plain)
+        elif what == 3:
+            robot.pose(chance.randrange(1, 9000), 0.9, session=None, age=chance.choice([0.0, 500.0]))
+        elif what == 4:
+            clocks[name] = chance.choice([0.0, 30.0, -3.0])  # its clock steps
+        else:
+            speak(name, 0.8)
+        robot.after(chance.choice([0.0, 0.02, 2.0]))
+    for name in sorted(alive - {"one"}):
+        robot.tell(Keys.life(KEYS.alive("B"), name), gone=True)
+    if "one" not in alive:
+        robot.tell(Keys.life(KEYS.alive("B"), "one"))
+    if not plain:
+        robot.tell(KEYS.alive("B"))
+    robot.after(0.02)
+    clocks["one"] = 0.0
+    for _ in range(2):
+        speak("one", 0.4)
+        robot.after(0.02)
+    robot.pose(9999, 0.9, session=None)
+    robot.pose(9999, 0.9, session="two")
+    robot.after()
+    assert (robot.live, robot.x) == (True, 0.4)
+    assert robot.agent.missing_neighbours(0) == []
