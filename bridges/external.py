@@ -62,15 +62,17 @@ class ExternalBody:
             if device:
                 raise BodyError(f"{name}: device: `{next(iter(device))}` is unknown; an external body has no settings")
         rows = len(request.names)
-        self._names, self._kinds, self._keys = request.names, request.kinds, request.keys
+        self._names, self._keys = request.names, request.keys
         self._endpoints, self._addresses = request.endpoints, request.addresses
         self._flies = np.array([kind.flies for kind in request.kinds])
+        self._steers = np.array([kind.takes == "twist" for kind in request.kinds])
         self._zero = uptime()
         self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
         self._clock_offset = np.inf  # from the caller's clock to this one [s]
         self._poses = External(rows)
-        self._yaw = np.array(request.yaw, dtype=float)
+        self._yaw = np.array(request.yaw, dtype=float)  # last measured
+        self._yaw_at = np.full(rows, -np.inf)
         self._flight = MeasuredFlight(rows)
         self._stopped = np.zeros(rows, dtype=bool)
         self._stopped_since = np.full(rows, np.inf)
@@ -115,7 +117,7 @@ class ExternalBody:
         nothing = np.full((rows, 3), np.nan)
         rays = self._ranges.read(self._utc, self._now())
         return BodyState(
-            time=self._poses.time - self._clock_offset,
+            time=self._measured() - self._clock_offset,
             position=self._poses.position.copy(),
             velocity=self._velocity(),
             yaw=self._yaw.copy(),
@@ -192,7 +194,12 @@ class ExternalBody:
     def _read_positions(self) -> None:
         for row, taken, position, yaw in self._positions.receive(self._utc, self._now()):
             if self._poses.update(row, taken, position, yaw) and isfinite(yaw):
-                self._yaw[row] = yaw
+                self._yaw[row], self._yaw_at[row] = yaw, taken
+
+    def _measured(self) -> Array:
+        """Time (n,) of the poses; a robot that steers by its yaw has no newer pose than that."""
+        late = self._steers & (self._yaw_at < self._poses.time - FRESH_S)
+        return np.where(late, self._yaw_at, self._poses.time)
 
     def _missing_positions(self) -> list[str]:
         """Diagnosis and remedy for each row without a usable position."""
@@ -212,7 +219,7 @@ class ExternalBody:
                     f"{name}: the position on {key} was measured {age:.1f} s ago by its stamp: stamps are UTC seconds, "
                     "not simulation time; if they are UTC, set the clocks of both computers"
                 )
-            elif self._kinds[row].takes == "twist" and not isfinite(self._poses.yaw[row]):
+            elif self._steers[row] and not isfinite(self._poses.yaw[row]):
                 found.append(f"{name}: the position on {key} has no yaw, without which a robot on wheels cannot steer")
         return found
 
@@ -239,14 +246,15 @@ class ExternalBody:
                     self._repeated.pop(row, None)
 
     def _notes(self) -> tuple[str, ...]:
-        age, positions = self._now() - self._poses.time, self._positions
+        age, positions = self._now() - self._measured(), self._positions
         unanswered = self._unconfirmed_stops() & (self._now() - self._stopped_since > ANSWER_S)
         if not ((age > FRESH_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
             return ()
         notes = []
         for row, seconds in enumerate(age.tolist()):
             parts = [UNANSWERED] if unanswered[row] else []
-            parts += [f"no position for {seconds:.0f} s"] if seconds > FRESH_S else []
+            what = "yaw" if self._measured()[row] < self._poses.time[row] else "position"
+            parts += [f"no {what} for {seconds:.0f} s"] if seconds > FRESH_S else []
             if positions.malformed[row]:
                 parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
             if self._ranges.malformed:

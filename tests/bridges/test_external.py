@@ -441,3 +441,23 @@ def test_no_take_off_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     body.land(np.array([0]))
     body.command(np.full((3, 4), np.nan))
     assert said == ["stop", "stop"]
+
+
+def test_pose_of_wheels_is_as_old_as_its_yaw(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that steers by a yaw that is not told any more has no position; one in the air does."""
+    body, samples, now = ExternalBody(request("tcp/127.0.0.1:1")), list[tuple[int, float, np.ndarray, float]](), [0.0]
+    body._positions = SimpleNamespace(  # type: ignore[assignment]
+        receive=lambda *_: samples, ahead=None, malformed=[0] * 3, trouble=[""] * 3
+    )
+    body._ranges = SimpleNamespace(read=lambda *_: None, malformed=0)  # type: ignore[assignment]
+    monkeypatch.setattr(body, "_now", lambda: now[0])
+    for k in range(300):
+        now[0] = 0.01 * k
+        yaw = 2.0 if k <= 100 else np.nan
+        samples[:] = [(row, now[0], np.zeros(3), yaw) for row in range(3)]
+        state = body.read(now[0])
+        if k == 140:
+            assert state.time[2] == pytest.approx(1.4)
+    assert state.yaw == pytest.approx(np.full(3, 2.0))
+    assert state.time == pytest.approx([2.99, 2.99, 1.0])
+    assert state.notes == ("", "", "no yaw for 2 s")

@@ -22,6 +22,8 @@ def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     [
         pytest.param(["conductor"], marks=pytest.mark.mechanism("chaos")),
         ["router", "clock", "double", "conductor"],
+        ["mocap-frozen"],
+        ["sleep"],
     ],
 )
 def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) -> None:

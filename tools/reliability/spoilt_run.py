@@ -127,7 +127,8 @@ class SpoiltRun:
         changes.append(f"network.routers={len(self.routers)}")
         if stage == "motion capture":
             changes += [f'robots.{name}.position="external"' for name in self.measured]
-            changes.append('positioning="vicon-twin"')
+            # robots land as they do without a world, in which they would wait for it
+            changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.blind_s}"]
         near = {
             role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
         }
