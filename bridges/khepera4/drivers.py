@@ -214,6 +214,8 @@ class GoalPark(Park):
         self._placed = -math.inf  # [s] when the server was told its position
         self._way = np.zeros(2)  # [m] since then, in its frame
         self._about = 0.0  # [rad/s] of a turn toward a goal behind
+        self._goal = (0.0, 0.0)  # [m] the last one, of a server that counts poses
+        self._ahead = 0.0  # [m] to the farthest goal since the last count, behind which it has not driven
 
     def begin(self) -> None:
         """See `Driver`. The heading must be known before a goal is sent."""
@@ -234,6 +236,8 @@ class GoalPark(Park):
                 self._about = 0.0
             self._send(b"i 0.0 0.0 1.570796")
             goal, stay = protocol.park_goal_2023_04(v, turn), (0.0, 0.0)
+            self._goal = goal
+            self._ahead = max(self._ahead, math.hypot(*goal))
         else:
             now = uptime()
             if not (v or turn) or now - self._placed > PLACED_S:
@@ -264,7 +268,10 @@ class GoalPark(Park):
             self._speed = way / reported, turn / reported
         self._counted = end
         if since > 0.0:
-            odometer.steps(self._speed[0] * since, self._speed[1] * since, uptime())
+            way, turned = self._speed[0] * since, self._speed[1] * since
+            share = min(1.0, self._ahead / abs(way)) if since > GAP_S and way else 1.0
+            odometer.steps(share * way, share * turned, uptime())
+        self._ahead = math.hypot(*self._goal)
 
 
 def identify(wire: Wire, chosen: protocol.Khepera4Settings, server: str | None) -> Park:

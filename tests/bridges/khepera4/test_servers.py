@@ -144,6 +144,20 @@ def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
     assert set(robot.heard) == {b"stop", b"p"}
 
 
+@pytest.mark.parametrize("server", SERVERS)
+def test_way_in_a_sleep_of_the_machine_is_counted(lab, server):
+    """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
+    robot = lab(server)
+    for _ in range(25):
+        robot.exchange(0.1, 0.0)
+    x, counted = robot.truth()[0], robot.odometer.x
+    robot.sleep(10.0)
+    robot.monotonic = lambda: robot.now - 10.0
+    for _ in range(25):
+        robot.exchange(0.0, 0.0)
+    assert robot.odometer.x - counted == pytest.approx(robot.truth()[0] - x, abs=0.1)
+
+
 def test_first_answer_may_take_seconds(lab):
     """A server of 2023 has one client in its life: one that does not wait for its answer is lost."""
     robot = lab("2025-05")
