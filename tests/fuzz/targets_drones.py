@@ -150,11 +150,9 @@ class Drone:
         self.state: dict[str, Any] = {}
         self.responses: list[bytes] = []
 
-    def send_rc_control(self, *sticks: int) -> None:
-        assert all(isinstance(stick, int) and -100 <= stick <= 100 for stick in sticks)
-
     def send_command_without_return(self, command: str) -> None:
-        assert command
+        word, *sticks = command.split()
+        assert word != "rc" or [-100 <= int(stick) <= 100 for stick in sticks] == [True] * 4
 
     def get_current_state(self) -> dict[str, Any]:
         return self.state
@@ -173,7 +171,7 @@ def tello_pilot() -> Iterator[Target]:
     from bridges.tello.pilot import TelloPilot  # noqa: PLC0415
 
     if "av" not in sys.modules and importlib.util.find_spec("av") is None:
-        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.body`
+        sys.modules["av"] = types.ModuleType("av")  # only its video would need it, see `bridges.tello.library`
     import djitellopy.tello  # noqa: PLC0415
 
     djitellopy.tello.Tello.LOGGER.setLevel("CRITICAL")  # it says every line that it cannot read
@@ -200,7 +198,7 @@ def tello_pilot() -> Iterator[Target]:
             try:
                 parsed = parse(state.decode("ascii"))
             except (UnicodeDecodeError, ValueError, IndexError, KeyError, TypeError):
-                parsed = drone.state  # its thread says so and goes on
+                parsed = drone.state  # dropped, see `bridges.tello.library`
             drone.state = parsed
             drone.responses.append(answer)
             if len(data) % 8 == 0:
