@@ -304,7 +304,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
         drive.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008 and not drive.state.notes[0])
         assert drive.slowest < 0.5
     assert notes[1].startswith("silent for")
-    assert "Connection refused" in notes[1] or "closed the connection" in notes[1]
+    assert any(text in notes[1] for text in ("Connection refused", "closed the connection", "reset by peer"))
     assert "no answer to" in notes[2]
     assert notes[3] == "battery at 3%: too low to drive"
     assert empty.truth()[0][0, 0] == 0.0
