@@ -41,6 +41,7 @@ class Preflight:
         )
         self._other_starts = _other_starts(assignment)
         self._since = np.full(len(self._flies), np.inf)
+        self._covered: Mask = np.zeros(len(self._flies), dtype=bool)  # (N,) drones with a robot above them
 
     def check(self, now: Situation, lacking: tuple[Mask, Callable[[int], Sequence[str]]]) -> dict[int, str]:
         """Rows that must not take off, each with the first reason.
@@ -60,7 +61,7 @@ class Preflight:
         """Failing rows (K,) that have failed for so long that they are not ready any more."""
         rows = np.array(list(failing), dtype=np.intp)
         since = np.full(len(self._flies), np.inf)
-        since[rows] = np.minimum(self._since[rows], t)
+        since[rows] = np.where(self._covered[rows], -np.inf, np.minimum(self._since[rows], t))  # these at once
         self._since = since
         return rows[t - since[rows] >= LOST_S]
 
@@ -119,15 +120,16 @@ class Preflight:
         links, place = self._assignment.links, now.neighbours.poses.position
         off = place - now.state.position[links.receiver]
         near = (off[:, 2] > ABOVE_M) & (np.vecdot(off[:, :2], off[:, :2]) < self._beside**2)
+        self._covered = np.zeros(len(self._flies), dtype=bool)
         if some(near):
 
             def reason(row: int) -> str:
                 link = int(np.flatnonzero(near & (links.receiver == row))[0])
                 return f"{self._assignment.robots[links.sender[link]]} is {off[link, 2]:.2f} m above it"
 
-            rows = np.zeros(len(self._flies), dtype=bool)
-            rows[links.receiver[near]] = True
-            yield rows & self._flies, reason
+            self._covered[links.receiver[near]] = True
+            self._covered &= self._flies
+            yield self._covered, reason
 
     def _too_close(self, now: Situation, limit: float) -> Iterator[Failing]:
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)

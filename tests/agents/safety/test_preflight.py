@@ -84,6 +84,13 @@ def test_nothing_takes_off_below_another(x, z, phase):
     swarm.groups[1].spoil = lambda t, state: replace(state, position=np.array([[x, 0.0, z]]))
     swarm.run(0.2)
     assert swarm.phase("F") == phase
+    spoil = swarm.groups[1].spoil
+    del swarm.groups[1].spoil
+    swarm.run(0.1)
+    assert swarm.phase("F") == READY
+    swarm.groups[1].spoil = spoil
+    swarm.run(0.05)
+    assert swarm.phase("F") == phase  # at once: the take-off would pass it
 
 
 def test_what_is_not_known_is_allowed():
