@@ -18,13 +18,14 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from experiments.view.heartbeat import CLOCK, SCRIPT
+from experiments.view.heartbeat import CLOCK, LAG_S, SCRIPT
 
 # with any port: that of a tunnel is another one. Every other name is of a page that had this machine's address put
 # behind the name of its own server.
 OWN_HOST: Final = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?", re.ASCII)
 TICKETS: Final = "open"  # first part of the path of an address that is good for one use
 REFUSED: Final = "zenpark: this address is of no page, or of one that is over; open the one that zenpark printed\n"
+GONE_S: Final = 60.0
 WEBSOCKET: Final = "websocket"
 PRIVATE: Final = {  # headers of every answer: the address goes nowhere, and no other page frames this one
     "Referrer-Policy": "no-referrer",
@@ -43,6 +44,7 @@ class Seen:
     drawn: float = -inf  # [s, UTC] time of the picture; -inf before the first report
     stage: int = -1  # number of the case
     hidden: bool = False  # behind another page or window, where browsers draw nothing
+    opened: float = -inf  # [s, UTC] of a page that has reported nothing yet
 
 
 @dataclass
@@ -89,13 +91,16 @@ class Gate:
             self.seen[page] = Seen(drawn, stage, hidden=given.get("hidden") == "1")
 
     def lag(self, utc: float) -> float:
-        """Time for which the slowest page that is in sight has had no newer picture, at `utc` [s, UTC]."""
-        drawn = [each.drawn for each in list(self.seen.values()) if not each.hidden and each.drawn > -inf]
-        return utc - min(drawn, default=utc)
+        """Time for which the slowest page that is in sight has had no newer picture, at `utc` [s, UTC].
+
+        A page that reports nothing for `GONE_S` counts no more.
+        """
+        latest = [max(each.drawn, each.opened) for each in list(self.seen.values()) if not each.hidden]
+        return utc - min((at for at in latest if utc - at < GONE_S), default=utc)
 
     def open(self, page: int) -> None:
         """Expects reports of a page."""
-        self.seen[page] = Seen()
+        self.seen[page] = Seen(opened=time.time() - LAG_S)  # few pictures, until it shows how fast it is
 
     def close(self, page: int) -> None:
         self.seen.pop(page, None)

@@ -12,6 +12,7 @@ SCRIPT: Final = b"<script>%s</script>" % Path(__file__).with_name("heartbeat.js"
 STALE_S: Final = 5.0  # a page with an older picture gives no order that sets robots in motion
 RECORDED_S: Final = 60.0  # messages that were never younger than this are of a recording that is played
 LAG_S: Final = 1.0  # from a picture to the report of a page that shows it, with nothing in the way
+STEEP: Final = 2.0  # [s/s] by which the time between two pictures grows with what is above that
 SLOWEST_S: Final = 2.0  # between two pictures
 
 
@@ -70,4 +71,4 @@ def frame_s(lag: float, usual: float) -> float:
 
     A page that is sent more than it can draw would fall behind for ever.
     """
-    return min(max(usual, 0.5 * (lag - LAG_S)), SLOWEST_S)
+    return min(max(usual, STEEP * (lag - LAG_S)), SLOWEST_S)

@@ -90,14 +90,23 @@ def test_page_reports_what_it_shows():
     gate.open(1)
     for query in ("page=1&drawn=x&stage=1", "page=9&drawn=1&stage=1", f"page=1&drawn={now + 3600}&stage=1", "&" * 99):
         assert answered(gate, f"/secret/clock?{query}", ("Host", HOST)) == 200
-        assert gate.seen == {1: Seen()}
+        assert gate.seen[1].drawn == -inf
     answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=0", ("Host", HOST))
     assert gate.seen[1].stage == 4
     assert gate.lag(now) == pytest.approx(7.0, abs=1e-3)
     answered(gate, f"/secret/clock?page=1&drawn={now - 7.0:.3f}&stage=4&hidden=1", ("Host", HOST))
     assert gate.lag(now) == 0.0, "a page that nobody sees slows nothing"
+    assert gate.lag(now + 3600.0) == 0.0
     gate.close(1)
     assert gate.seen == {}
+
+
+def test_page_without_reports_slows_for_a_while():
+    gate = Gate("secret")
+    gate.open(1)
+    opened = gate.seen[1].opened
+    assert gate.lag(opened + 3.0) == pytest.approx(3.0)
+    assert gate.lag(opened + 3600.0) == 0.0
 
 
 @pytest.fixture
