@@ -110,6 +110,11 @@ class Flight:
         """Whether the motors are on, as far as known."""
         return self.phase in AIRBORNE
 
+    @property
+    def at_rest(self) -> bool:
+        """Whether the motors are off and nothing that was armed for a take-off is still to be disarmed."""
+        return not self.airborne and self._disarm_at == math.inf
+
     def set_target(self, now: float, target: Target | None) -> None:
         """Store the setpoint of the robot's loop at `now` [s, monotonic]; None keeps the last one. From any thread."""
         self._commanded_at = now
@@ -183,6 +188,7 @@ class Flight:
         if answer is None or answer == Status.OK:
             return  # a lost answer is no refusal: `update_phase` sees whether it flies
         self._enter(Phase.GROUND)
+        self._disarm_at = -math.inf
         self.trouble = f"take-off refused: {ANSWERS.get(answer, f'error {answer}')}"
 
     def land(self) -> None:
@@ -272,7 +278,7 @@ class Flight:
             return
         self._confirm_starts()
         begun = self._since + (self._span if self.phase is Phase.CLIMBING else 0.0)
-        if now - max(self._sent_at, begun) > self._hold + UNSTARTED_S:
+        if now - max(self._sent_at, begun) > self._hold + UNSTARTED_S and not self.link.busy:
             self.trouble = "landed: its setpoints are not confirmed"
             self.land()
             return
@@ -352,6 +358,7 @@ class Flight:
             self._enter(Phase.GROUND)
         elif self.airborne and not flying and since > FLYING_FLAG_S:
             self._enter(Phase.GROUND)
+            self._disarm_at = -math.inf
             self.trouble = self.trouble or "its motors do not turn"
         elif telemetry.battery_low and self.phase in (Phase.CLIMBING, Phase.FLYING):
             self.trouble = "landed: battery low"

@@ -353,9 +353,9 @@ class CrazyfliePilot:
             if self._connection_note == IN_THE_AIR and not self._flight.airborne:
                 self._set_up(link)
             if self._ending.is_set() and self._order is None:
-                if not self._flight.airborne or now > self._end_by:
+                if self._flight.at_rest or now > self._end_by:
                     return
-                if not landing:
+                if not landing and self._flight.airborne:
                     landing = True
                     self.give_order("land")
 

@@ -237,6 +237,17 @@ def test_arming():
         process.cut()
 
 
+def test_end_during_arming():
+    """A process that ends while a take-off is prepared leaves nothing armed."""
+    with flown(device={"platform": "brushless"}) as (twin, process):
+        process.tick()
+        process.body.takeoff(np.array([0]), np.array([0.5]))
+        process.until(lambda: supervised(twin) == State.ARMING, "arming")
+        process.close()
+        assert supervised(twin) == State.DISARMED
+        assert truth(twin)[2] == 0.0
+
+
 @pytest.mark.parametrize(("order", "after_s"), [("stop", 0.3), ("land", 0.1)])
 def test_order_during_arming(order, after_s):
     """It replaces the take-off: the motors stay off, and nothing stays armed."""

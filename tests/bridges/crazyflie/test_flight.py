@@ -284,6 +284,21 @@ def test_setpoints_of_others_end_at_each_landing(air):
     assert air.now - air.flight._since < 0.2, "it was not landing any more"
 
 
+def test_nothing_is_ordered_into_a_silent_radio(air):
+    """Neither for setpoints that are not confirmed nor for a landing: packets would wait for the end of the gap."""
+    air.pass_(1.0)
+    air.flight.link.busy = True
+    air.sent.clear()
+    air.pass_(2.9)
+    assert air.sent == []
+    air.flight.link.busy = False
+    air.flight.land()
+    air.flight.link.busy = True
+    air.sent.clear()
+    air.pass_(1.5)
+    assert air.sent == []
+
+
 def test_landing_on_a_table_ends(air):
     """Where it stands is as high as it would fly if another client had ended the landing: a few more attempts."""
     air.flight.land()
