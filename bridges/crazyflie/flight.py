@@ -48,7 +48,7 @@ HOLD_AGE_S: Final = 0.3  # while the last pose is older, new setpoints are ignor
 AGAIN_S: Final = 3.0  # a landing that takes longer than planned by this is ordered again
 RELEASE_S: Final = 1.0  # period at which setpoints of another client are ended; after 2 s without new ones they lock it
 LAND_S: Final = 0.5  # period at which a landing is ordered again: setpoints of another client end it unnoticed,
-NEAR_S: Final = 1.0  # but not within this time of its end: after it the motors would start again;
+NEAR_S: Final = 0.3  # but not within this time of its end: after it the motors would start again;
 LOW: Final = 0.2  # [m] if the drone is higher then, it flies, or stands on a table:
 LATE_LANDINGS: Final = 3  # so many attempts
 UNSTARTED_S: Final = 1.0  # a drone that has descended by itself for longer, because no setpoint was started, is landed
@@ -222,13 +222,15 @@ class Flight:
 
     def _repeat_landing(self, now: float) -> None:
         """Order a landing again that a gap or another client has ended; a planner that lands refuses the order."""
+        telemetry = self._telemetry
         near = now - self._since > self._span - NEAR_S
         replies, answer = self.link.planner_reply(HighLevel.LAND)
         if replies > self._land_replies and answer == Status.OK:
             self._late_landings += near
             self._begin_landing()
-        high = self._telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
-        if now - self._since > self._span + AGAIN_S:
+        ended = telemetry.pose_time - self._since > self._span  # what waits in queues tells of before
+        high = ended and telemetry.pose[2] > LOW and self._late_landings < LATE_LANDINGS
+        if telemetry.status_time - self._since > self._span + AGAIN_S:
             self._land()
         elif (high or not near) and not self.link.busy and now - self._released_at > LAND_S:
             self._order_landing()

@@ -65,7 +65,7 @@ def test_flight_by_another_client_is_landed(fleet, stays_s):
         fleet.run(0.02)
     fleet.run(stays_s)
     client.leave()
-    fleet.run(0.8 / DESCENT + 3.0)
+    fleet.run(0.8 / DESCENT + 5.0)
     assert fleet.phases == {Phase.GROUND}
     assert fleet.fastest < TOUCHES
     assert fleet.troubles == {"landed: it flew without an order"}

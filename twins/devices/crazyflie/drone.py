@@ -420,12 +420,12 @@ class Drone:
     def _location(self, channel: int, data: bytes) -> bytes | None:
         flock, row = self.flock, self.row
         if channel == 0:
-            flock.estimator.add_external(row, flock.t, _numbers(crtp.VECTOR, data))
+            flock.estimator.add_external(row, flock.t, _numbers(crtp.VECTOR, data), flock.place[row])
             return None
         kind, rest = data[0], data[1:]
         if kind == Location.POSE:
             x, y, z, qx, qy, qz, qw = _numbers(crtp.POSE, rest)
-            flock.estimator.add_external(row, flock.t, (x, y, z))
+            flock.estimator.add_external(row, flock.t, (x, y, z), flock.place[row])
             yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
             flock.estimator.turn[row] = math.remainder(yaw - flock.quadrotor.yaw[row], math.tau)
         elif kind == Location.LPP and flock.loco[row]:

@@ -39,6 +39,7 @@ class Estimator:
         self.variance = np.full(rows, LOST)  # per axis [m²]
         self.external = np.zeros((rows, 3))  # last external position [m]
         self.received = np.zeros(rows, dtype=np.intp)  # number of external positions
+        self._external_error = np.zeros((rows, 3))  # of the last external position [m]
         self._external_time = np.full(rows, -np.inf)
         self._drift = np.zeros((rows, 3))  # rate of the error without measurements [m/s]
         self.rate = np.zeros((rows, 3))  # of the error [m/s]: the estimate of the velocity is wrong by as much
@@ -48,25 +49,25 @@ class Estimator:
         """Restart the estimator of a row with an error (3,) [m] and one of its yaw [rad]."""
         self.error[row], self.variance[row], self.turn[row] = error, LOST, turn
 
-    def add_external(self, row: int, t: float, position: tuple[float, float, float]) -> None:
-        """Add an external position (3) [m]."""
+    def add_external(self, row: int, t: float, position: tuple[float, float, float], truth: Array) -> None:
+        """Add an external position (3) [m] of a row at `truth` (3,) [m]; accelerometers measure how it moves on."""
         self.external[row], self._external_time[row] = position, t
+        self._external_error[row] = self.external[row] - truth
         self.received[row] += 1
 
-    def advance(self, t: float, dt: float, truth: Array, ready: Mask, flow: Mask, *, flying: Mask) -> None:
+    def advance(self, t: float, dt: float, ready: Mask, flow: Mask, *, flying: Mask) -> None:
         """Advance one step of dt [s].
 
         Args:
             t: Current time [s].
             dt: [s].
-            truth: (N, 3) true positions [m].
             ready: (N,) rows with a working positioning system on board.
             flow: (N,) rows with a Flow deck: velocity and height are measured, so an error of the place stays.
             flying: (N,) rows in the air: without measurements they integrate the error of their attitude.
         """
         outside = t - self._external_time <= FRESH_S
         share = -np.expm1(-dt / SETTLING_S)
-        wanted = np.where((ready | flow)[:, None], 0.0, self.external - truth)
+        wanted = np.where((ready | flow)[:, None], 0.0, self._external_error)
         measured = ready | outside
         axes = measured[:, None] | (flow[:, None] & UPWARDS)
         before = self.error.copy()
@@ -267,7 +268,7 @@ class Flock:
             self.place[:, :2] += self._jitter.advance(quadrotor.position[:, 2])
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
-        self.estimator.advance(t, self.dt, self.place, self.ready(), self._flow, flying=quadrotor.flying)
+        self.estimator.advance(t, self.dt, self.ready(), self._flow, flying=quadrotor.flying)
         measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
         self.estimate = measured + self.estimator.error
         self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
