@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Final
 from agents.clock import Clock
 from agents.network import messages
 from agents.network.keys import Keys
+from agents.runtime.orders import LAND, STOP
 from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
@@ -103,6 +104,7 @@ class Conductor(CaseRun):
         clocks = self._context.hosts.join(self._experiment)
         start = ready = None
         self._failures: list[str] = []
+        self._landed: set[str] = set()  # robots whose early landing was seen
         try:
             self._processes.prepare()
             with ExitStack() as stack:
@@ -241,12 +243,25 @@ class Conductor(CaseRun):
                 self._view.report("phase", "conductor", self._progress.phase, stamp=start + at)
             busy = self._changes.under_way
             left = [view for name, view in self._robots.items() if not view.gone and name not in busy]
-            if all(view.reached("landing") for view in left) and (left or not busy):
+            ended = all(view.reached("landing") for view in left) and (left or not busy)
+            if now < end - EARLY_S and not ended:
+                self._note_landings(now - start, busy)
+            if ended:
                 if now < end - EARLY_S:
                     what = "all robots had landed" if left else "no robot was left"
                     self._failures.append(f"{what} after {now - start:.1f} of {self._experiment.duration_s:g} s")
                 return
             time.sleep(POLL_S)
+
+    def _note_landings(self, elapsed: float, busy: Container[str]) -> None:
+        """Note robots that others have ordered to land or to stop before the end: the run is spoilt without a fault."""
+        for name, view in self._robots.items():
+            if view.gone or name in busy or name in self._landed or not view.reached("landing"):
+                continue
+            self._landed.add(name)
+            if (reason := self._reason(name)).startswith((LAND, STOP)):
+                text = f"{name} landed after {elapsed:.1f} of {self._experiment.duration_s:g} s: {reason}"
+                self._failures.append(text)
 
     def _start_late(self, start: float) -> None:
         """Repeat the start to robots that still wait: a busy machine may have lost the order, or its answer."""

@@ -39,6 +39,8 @@ class Course(Conductor):
         self._phases, self._deaths = phases, deaths or {}
         self._failures: list[str] = []
         self._starting: set[str] = set()
+        self._landed: set[str] = set()
+        self.reasons: dict[str, str] = {}  # of robots that have landed at 3 s, before all others
         self.killed = 0
         nothing: Any = SimpleNamespace(
             under_way=set(), begin=lambda _: None, advance=lambda: None, news=lambda: ((), ())
@@ -59,7 +61,10 @@ class Course(Conductor):
         now = self._clock.now - START
         phase = next(said for at, said in sorted(self._phases.items(), reverse=True) if now >= at)
         for name, view in self._robots.items():
-            view.status = msgspec.structs.replace(status(name, at=now), phase=phase)
+            reason = self.reasons.get(name, "") if now >= 3.0 else ""
+            view.status = msgspec.structs.replace(
+                status(name, at=now), phase="landing" if reason else phase, reason=reason
+            )
         return []
 
     def _died(self) -> list[Death]:
@@ -79,6 +84,18 @@ def test_a_run_that_ended_early_has_failed(landing: float, failures: list[str]) 
     course = Course({0.0: "running", landing: "landing"})
     course._walk(START)
     assert [text.replace("3.5", "3.0") for text in course._failures] == failures
+
+
+@pytest.mark.parametrize(
+    ("reason", "spoilt"), [("ordered to land", True), ("ordered to stop", True), ("its battery is low", False)]
+)
+def test_a_robot_that_was_ordered_down_spoils_the_run(reason: str, spoilt: bool) -> None:
+    """What lands a robot else is a hazard of the recording."""
+    course = Course({0.0: "running", 10.0: "landing"})
+    name = next(iter(course._robots))
+    course.reasons = {name: reason}
+    course._walk(START)
+    assert [text.split(" of ")[0].rpartition(" ")[0] for text in course._failures] == [f"{name} landed after"] * spoilt
 
 
 def test_a_run_without_any_robot_left_has_failed() -> None:
