@@ -57,7 +57,7 @@ SHADOWS: Final = (
 ARCHITECTURE: Final = (
     "In the centralised architecture one process decides for all robots, from the poses that they send; in a hybrid "
     "one for some. Messages are poses and goals of the whole network, leaders too; deliveries count each once for "
-    "every receiver. A delay is from the measurement of a robot's pose to its acting on the first goal that "
+    "every receiver that it reached. A delay is from the measurement of a robot's pose to its acting on the first goal that "
     "rests on it: both ways through the network, and the wait for the next decision."
 )
 NETWORK: Final = (

@@ -72,7 +72,10 @@ DEFINITIONS: Final = (
      " to so far ahead. Along and across are in the robot's heading, to the left positive."),
     ("Correlation", "Pearson's, between robot and twin, of positions and of speeds over 0.2 s; a dash where one of them"
      " hardly moved."),
-    ("Missed deadline", "A tick that began more than one period late."),
+    ("Missed deadline", "A tick that was skipped because its time had passed; shares are of the ticks that were due."),
+    ("Spoiled", "A run in which a robot failed or began late, 1 % of the deadlines or of the poses were missed or lost,"
+     " messages could not be read, or the world was slow. Its figures are compared with none."),
+    ("×", "Over the reference with the same seed, of runs of equal length that nothing spoiled."),
     ("Known", "Share of a robot's link errors that is known. Robots whose position is known for less than 95 % of the"
      " run are left out of the means; their neighbours' errors leave out the links to them."),
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
@@ -210,7 +213,7 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
             ("Messages of the network", _value("network_messages"), 1.0),
             ("of them poses of robots", lambda case: sum(robot.messages for robot in case.robots), 1.0),
             ("of them goals of the centre", _value("guidance.goals"), 1.0),
-            ("Deliveries", _value("deliveries"), 1.0),
+            ("Deliveries that arrived", _value("deliveries"), 1.0),
             ("Payload [kB]", _value("network_bytes"), 0.001),
             ("Goals per second", _value("guidance.goals_hz"), 1.0),
             ("Goals that were lost", _value("guidance.goals_lost"), 1.0),
