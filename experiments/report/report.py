@@ -57,8 +57,8 @@ SHADOWS: Final = (
 ARCHITECTURE: Final = (
     "In the centralised architecture one process decides for all robots, from the poses that they send; in a hybrid "
     "one for some. Messages are poses and goals of the whole network, leaders too; deliveries count each once for "
-    "every receiver that it reached. A delay is from the measurement of a robot's pose to its acting on the first goal that "
-    "rests on it: both ways through the network, and the wait for the next decision."
+    "every receiver that it reached. A delay is from the measurement of a robot's pose to its acting on the first goal "
+    "that rests on it: both ways through the network, and the wait for the next decision."
 )
 NETWORK: Final = (
     "The effects that the file asks of the network, on top of the real network's own: dropped poses did arrive, and "
