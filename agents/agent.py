@@ -306,13 +306,15 @@ class Agent:
         life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
             active = cruising = running = self._every_row
-            landing = self._no_row
+            climbing = landing = self._no_row
         else:
             running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
+            climbing = life.climbing
             cruising = running | (life.phase == AIRBORNE)
         rows = RowStatus(
             self._ordered,
             cruising,
+            climbing,
             landing,
             self.goal_computer.without_neighbours() if neighbours.incomplete else None,
             None if guidance is None else running & guidance.unguided(now.t),

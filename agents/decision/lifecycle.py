@@ -115,6 +115,11 @@ class Lifecycle:
         """Rows (N,) that climb, wait in the air, or run."""
         return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
 
+    @property
+    def climbing(self) -> Mask:
+        """Rows (N,) on their way up to their height."""
+        return self._climbing
+
     def in_motion(self, row: int) -> bool:
         """Whether a row climbs, waits in the air, runs, or lands."""
         return bool(self._climbing[row] or AIRBORNE <= self.phase[row] <= LANDING)

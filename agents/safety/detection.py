@@ -13,11 +13,12 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, clamp, every, norm, some
 from agents.body.interface import BodyState
+from agents.body.kinds import Kind
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
 from agents.safety.hazards import Cause, Observation
 from agents.safety.landing import LOW, SLOW, Landing
-from agents.safety.obedience import Obedience
+from agents.safety.obedience import RUSH_S, Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.safety.situation import ProcessHealth, Situation
 
@@ -69,6 +70,7 @@ class RowStatus(msgspec.Struct, frozen=True):
 
     ordered: Mask  # hold by order
     cruising: Mask  # at their height or running: their setpoints are followed
+    climbing: Mask  # on their way up
     landing: Mask  # descending
     without_neighbours: Mask | None  # the law has no input; None: nowhere
     unguided: Mask | None  # running without guidance; None: no row is guided
@@ -77,6 +79,24 @@ class RowStatus(msgspec.Struct, frozen=True):
     setpoint: Array  # (N, 4) of the tick before, NaN for rows that their bodies drive by themselves
     not_finite: Mask  # the last setpoint was not finite
     landing_places: Landing  # of rows that land
+
+
+class Ascent:
+    """Progress of N rows of these kinds that climb: straight up, as their bodies do by themselves."""
+
+    def __init__(self, kinds: Sequence[Kind]) -> None:
+        self._climbing: Mask = np.zeros(len(kinds), dtype=bool)
+        self._begin = np.full((len(kinds), 2), np.nan)
+        self._free = RUSH_S * np.array([kind.speed for kind in kinds]) + np.array([kind.radius for kind in kinds])
+        self.aside = np.zeros(len(kinds))  # (N,) distance from there, seen from above [m]
+        self.carried: Mask = self._climbing  # (N,) rows that are carried aside
+
+    def update(self, climbing: Mask, position: Array) -> None:
+        """Look at rows that are `climbing` (N,), at `position` (N, 3) [m]."""
+        begins, self._climbing = climbing & ~self._climbing, climbing.copy()
+        self._begin = np.where(begins[:, None], position[:, :2], self._begin)
+        self.aside = norm(position[:, :2] - self._begin)
+        self.carried = climbing & (self.aside > self._free)
 
 
 class Descent:
@@ -122,6 +142,7 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
+        self._ascent, self._climbed = Ascent(assignment.kinds), False
         self._descent = Descent(len(self._flies), float(self._limits.high[2]))
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
@@ -141,8 +162,11 @@ class Detector:
             found.append(self._silent_devices(now.t, state.heard))
         watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
         self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
-        if some(self._obedience.still) or some(self._obedience.strays):
-            found.append(self._disobedient(self._obedience))
+        if (climbs := some(rows.climbing)) or self._climbed:
+            self._climbed = climbs
+            self._ascent.update(rows.climbing & self._flies, state.position)
+        if some(self._obedience.still) or some(self._obedience.strays) or some(self._ascent.carried):
+            found.append(self._disobedient(self._obedience, self._ascent))
         if not now.where.all_valid:
             found.append(self._position_and_arena(now))
         if not found:  # as on most ticks
@@ -250,10 +274,16 @@ class Detector:
         silent = t - heard > self._limits.own_silence_s
         yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
 
-    def _disobedient(self, obedience: Obedience) -> Iterator[Observation]:
+    def _disobedient(self, obedience: Obedience, ascent: Ascent) -> Iterator[Observation]:
         """Rows that do not move as they are told, or move otherwise."""
+
+        def astray(row: int) -> str:
+            if ascent.carried[row]:
+                return f"{ascent.aside[row]:.2f} m aside while it climbs"
+            return f"{obedience.strayed[row]:.2f} m lately"
+
         yield Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
-        yield Observation(Cause.STRAYING, obedience.strays, lambda row: f"{obedience.strayed[row]:.2f} m lately")
+        yield Observation(Cause.STRAYING, obedience.strays | ascent.carried, astray)
 
     def _separation_of_robots(self, now: Situation, limit: float) -> Iterator[Observation]:
         apart = self._separation.distances(now.t, now.state.position, now.neighbours)

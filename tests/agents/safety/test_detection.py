@@ -105,6 +105,22 @@ def test_wheels_whose_position_is_old_know_no_error():
     assert np.isfinite(swarm.agent("B").error).all()
 
 
+def test_a_drone_that_is_carried_aside_while_it_climbs_lands():
+    swarm = drone().run(0.1)
+    assert swarm.agent("F").lifecycle.takeoff(0) == ""
+    group, begin = swarm.groups[0], swarm.t
+
+    def carried(t, state):
+        state.position[:, 0] += 1.0 * (t - begin)
+        return state
+
+    group.spoil = carried
+    swarm.run(0.5)
+    assert not happened(swarm)["F"]
+    swarm.run(0.1)
+    assert happened(swarm)["F"] == ["land: it moves and is not told to: 0.57 m aside while it climbs"]
+
+
 @pytest.mark.parametrize("ahead_s", [0.3, 100.0, np.inf])
 def test_a_silent_body_whose_clock_is_ahead_lands(ahead_s):
     swarm = drone().running().run(0.3)
