@@ -306,7 +306,7 @@ class Agent:
         life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
             active = cruising = running = self._every_row
-            climbing = landing = self._no_row
+            landing, climbing = self._no_row, None
         else:
             running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
             climbing = life.climbing

@@ -116,9 +116,9 @@ class Lifecycle:
         return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
 
     @property
-    def climbing(self) -> Mask:
-        """Rows (N,) on their way up to their height."""
-        return self._climbing
+    def climbing(self) -> Mask | None:
+        """Rows (N,) on their way up to their height; None if no row is."""
+        return self._climbing.copy() if self._climbing.any() else None
 
     def in_motion(self, row: int) -> bool:
         """Whether a row climbs, waits in the air, runs, or lands."""

@@ -70,7 +70,7 @@ class RowStatus(msgspec.Struct, frozen=True):
 
     ordered: Mask  # hold by order
     cruising: Mask  # at their height or running: their setpoints are followed
-    climbing: Mask  # on their way up
+    climbing: Mask | None  # on their way up; None: no row is
     landing: Mask  # descending
     without_neighbours: Mask | None  # the law has no input; None: nowhere
     unguided: Mask | None  # running without guidance; None: no row is guided
@@ -90,6 +90,7 @@ class Ascent:
         self._free = RUSH_S * np.array([kind.speed for kind in kinds]) + np.array([kind.radius for kind in kinds])
         self.aside = np.zeros(len(kinds))  # (N,) distance from there, seen from above [m]
         self.carried: Mask = self._climbing  # (N,) rows that are carried aside
+        self.any_carried = False
 
     def update(self, climbing: Mask, position: Array) -> None:
         """Look at rows that are `climbing` (N,), at `position` (N, 3) [m]."""
@@ -97,6 +98,7 @@ class Ascent:
         self._begin = np.where(begins[:, None], position[:, :2], self._begin)
         self.aside = norm(position[:, :2] - self._begin)
         self.carried = climbing & (self.aside > self._free)
+        self.any_carried = some(self.carried)
 
 
 class Descent:
@@ -142,7 +144,9 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
-        self._ascent, self._climbed = Ascent(assignment.kinds), False
+        self._ascent = Ascent(assignment.kinds)
+        self._climbed: Mask | None = None
+        self._none: Mask = ~self._every_row
         self._descent = Descent(len(self._flies), float(self._limits.high[2]))
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
@@ -162,10 +166,10 @@ class Detector:
             found.append(self._silent_devices(now.t, state.heard))
         watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
         self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
-        if (climbs := some(rows.climbing)) or self._climbed:
-            self._climbed = climbs
-            self._ascent.update(rows.climbing & self._flies, state.position)
-        if some(self._obedience.still) or some(self._obedience.strays) or some(self._ascent.carried):
+        if rows.climbing is not self._climbed:  # while no row climbs it is None
+            self._climbed = rows.climbing
+            self._ascent.update(self._none if rows.climbing is None else rows.climbing & self._flies, state.position)
+        if some(self._obedience.still) or some(self._obedience.strays) or self._ascent.any_carried:
             found.append(self._disobedient(self._obedience, self._ascent))
         if not now.where.all_valid:
             found.append(self._position_and_arena(now))
