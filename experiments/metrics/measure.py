@@ -225,6 +225,7 @@ def _robots(
     unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
     settled = after_last(unsettled & (errors.there | np.isfinite(total)), time)
     sent, recorded = transmissions(trace)
+    early = [int((trace.sent_by(i).stamp < joined[i]).sum()) for i in range(rows)]  # poses before a robot took part
     size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
     guided = centralised.guided_rows(trace)[errors.net.receiver]  # the centre receives their neighbours' poses
@@ -262,7 +263,7 @@ def _robots(
         RobotMetrics(
             robot=name,
             kind=trace.experiment.robots[name].kind,
-            f_hz=float(sent[i]) / float(present[i]),
+            f_hz=float(sent[i] - early[i]) / float(present[i]),
             acquired_s=phases[0][i].acquired_s,
             dropped=dropped[name],
             residual=phases[0][i].residual,

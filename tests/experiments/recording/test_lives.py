@@ -91,7 +91,7 @@ def test_reserve_that_never_came_is_left_out(path):
 
 def test_reserve_is_judged_since_it_came(path):
     came = [state("KH01", k, k / 10, 1.0, phase="running" if k >= 15 else "ready") for k in range(10, 41)]
-    came += [pose("KH01", k, k / 10) for k in range(15, 40)]
+    came += [pose("KH01", k, k / 10) for k in range(13, 40)]  # two before it took part
     write(path, begun(), *seconds(41), *came, landed(4.0), experiment=LINKED)
     trace = read(path).trace
     np.testing.assert_allclose(trace.joined, [0.0, 0.0, 1.5], atol=1e-6)
