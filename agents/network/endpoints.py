@@ -170,6 +170,11 @@ def bare(endpoints: Sequence[str]) -> list[str]:
     return [endpoint.partition(OWNER)[0] for endpoint in lab.bare(endpoints)]
 
 
+def describe(endpoints: Sequence[str]) -> str:
+    """Routers, or that they are a mesh, for people."""
+    return "a mesh" if is_mesh(endpoints) else ", ".join(bare(endpoints))
+
+
 def near(endpoints: Sequence[str], senders: Mapping[str, set[str]], names: Sequence[str]) -> list[str]:
     """Endpoints of a mesh for robots that share a process: their own, their neighbours', and those of services.
 

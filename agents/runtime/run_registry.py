@@ -49,7 +49,7 @@ class Run(msgspec.Struct, frozen=True):
     @property
     def where(self) -> str:
         """Routers, for people."""
-        return "a mesh" if topology.is_mesh(self.endpoints) else ", ".join(topology.bare(self.endpoints))
+        return topology.describe(self.endpoints)
 
     @property
     def words(self) -> str:

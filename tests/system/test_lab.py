@@ -47,7 +47,7 @@ def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None
     assert denied.returncode == 1
     assert "NOT known to have stopped: CF01, KH01, KH02" in denied.stderr
     stopped = zenpark("estop", *reach)
-    assert (stopped.returncode, stopped.stdout) == (0, "stopped: CF01, KH01, KH02\n")
+    assert (stopped.returncode, stopped.stdout) == (0, f"stopped: CF01, KH01, KH02 (at {endpoint})\n")
     assert flight.finish()[0] == 1
     assert flight.logs().count("done (emergency stop by operator: zenpark estop)") == 3
 

@@ -75,7 +75,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     finally:
         watcher.close()
     assert orders.estop(connect=endpoints, realm="park", identity="operator") == 0
-    assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))}\n"
+    assert capsys.readouterr().out == f"stopped: {', '.join(sorted(begun))} (at a mesh)\n"
     flight.finish()
     run = reopen(flight.folder)
     assert run.notes == ("event: lost CF02",) or "event" in run.traces

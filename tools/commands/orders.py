@@ -27,7 +27,7 @@ from tools.commands.options import (
     session,
     with_options,
 )
-from tools.terminal import printable, say
+from tools.terminal import listed, printable, say
 
 if TYPE_CHECKING:
     import zenoh
@@ -48,6 +48,7 @@ NamesOrAll = Annotated[
 
 IDENTITY: Final = "operator"
 WAIT_S: Final = 2.0  # for a router
+MOST_NAMES: Final = 20  # robots that a line of the emergency stop names; --json names all
 # orders to the robots themselves, in a run or by hand; without names to all of them
 ORDERS: Final[Mapping[messages.OrderKind, str]] = {
     "takeoff": "Let robots take off that were started by hand.",
@@ -111,20 +112,13 @@ class Operator:
         return 2
 
 
-def _alive(opened: zenoh.Session, keys: Keys) -> list[str]:
-    """Robots of the realm that are on the network, by name."""
-    replies = opened.liveliness().get(keys.alive("*"), timeout=2.0)
-    found = [keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None]
-    return sorted(name for name in found if name is not None)
-
-
 def _order_robots(what: messages.OrderKind, robots: Sequence[str], by: Operator) -> int:
     """Give an order to the robots themselves, to all if none is named, and tell the recorder; the exit code."""
     from agents.network import messages
     from experiments.real_time.conductor import orders
 
     with by.joined() as (opened, keys):
-        receivers = robots or _alive(opened, keys)
+        receivers = robots or sorted(orders.alive(opened, keys))
         if not receivers:
             return by.refuse(f"no robot in the realm '{by.realm}'; `./zenpark keys` shows the members")
         at = time.time() + orders.start_lead_s(len(receivers)) if what == "start" else None
@@ -251,16 +245,20 @@ def reset(
     return _tell_world(WorldOrder("reset", name=name), done, by)
 
 
-@app.command(epilog=example("estop", "estop --connect @runs/first/network.txt"))
+@app.command(epilog=example("estop", "estop --dry-run", "estop --connect @runs/first/network.txt"))
 def estop(
     *,
     connect: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ENDPOINT",
-            help=f"Only at this router; may be repeated. [all runs of this machine, and the routers of ${CONNECT}]",
+            help="Only at this router, or at those of one run (@RUN/network.txt); may be repeated. "
+            f"[all runs of this machine, the routers of ${CONNECT}, and tcp/127.0.0.1:7447]",
         ),
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only print which robots would be stopped; nothing is sent to them.")
+    ] = False,
     realm: Annotated[str | None, typer.Option(metavar="NAME", help="First chunk of the keys. [the run's]")] = None,
     lab: Lab = None,
     identity: Annotated[
@@ -274,7 +272,8 @@ def estop(
     from experiments.real_time.conductor.orders import EmergencyStop
 
     if given := routers(connect, lab):
-        return _stop_all([EmergencyStop(given, realm or "park", identity or IDENTITY)], as_json=as_json)
+        stops = [EmergencyStop(given, realm or "park", identity or IDENTITY)]
+        return _stop_all(stops, dry_run=dry_run, as_json=as_json)
     up = run_registry.runs()
     stops = [EmergencyStop(run.endpoints, realm or run.realm, identity or run.identity, run) for run in up]
     known = {endpoint for stop in stops for endpoint in topology.bare(stop.endpoints)}
@@ -282,7 +281,7 @@ def estop(
         if others and known.isdisjoint(topology.bare(others)):
             stops.append(EmergencyStop(others, realm or "park", identity or IDENTITY))
             known |= {*topology.bare(others)}
-    return _stop_all(stops, as_json=as_json)
+    return _stop_all(stops, dry_run=dry_run, as_json=as_json)
 
 
 def _of_environment(lab: str | None) -> list[str]:
@@ -298,13 +297,14 @@ def _of_environment(lab: str | None) -> list[str]:
         return []
 
 
-def _stop_all(stops: Sequence[EmergencyStop], *, as_json: bool) -> int:
-    """Send all stops at the same time and print their results.
+def _stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) -> int:
+    """Send all stops at the same time, or only look whom they would reach, and print the results.
 
     Returns:
         The exit code: 0, or 1 if a robot has not stopped in time, or if no robot was seen.
     """
-    threads = [threading.Thread(target=stop.send, args=("zenpark estop",), daemon=True) for stop in stops]
+    todo = [(stop.look, ()) if dry_run else (stop.send, ("zenpark estop",)) for stop in stops]
+    threads = [threading.Thread(target=act, args=given, daemon=True) for act, given in todo]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -312,35 +312,46 @@ def _stop_all(stops: Sequence[EmergencyStop], *, as_json: bool) -> int:
     missed = any(stop.moving or (stop.expected and not stop.seen) for stop in stops)
     seen = any(stop.seen for stop in stops)
     if as_json:
-        routers_asked = [
-            {
-                "where": stop.where,
-                "stopped": sorted(stop.seen - stop.moving),
-                "not_known_to_have_stopped": sorted(stop.moving),
-                "failure": None if stop.failure is None else str(stop.failure),
-            }
-            for stop in stops
-        ]
-        print_json({"ok": seen and not missed, "routers": routers_asked})
+        print_json({"ok": seen and not missed, "routers": [_as_json(stop, dry_run=dry_run) for stop in stops]})
         return int(missed or not seen)
-    for stop in stops:
-        known = "" if stop.run is None else f" ({stop.where})"
-        if stop.moving:
-            print(f"NOT known to have stopped: {', '.join(sorted(stop.moving))}{known}", file=sys.stderr)
-        elif stop.seen:
-            print(f"stopped: {', '.join(sorted(stop.seen))}{known}", flush=True)
-        elif stop.expected:
-            why = "no robot is there" if stop.failure is None else str(stop.failure)
-            print(f"NOT known to have stopped: {stop.where}: {why}", file=sys.stderr)
     if seen or missed:
+        for stop in stops:
+            _print_stop(stop, dry_run=dry_run)
         return int(missed)
     failures = [stop.failure for stop in stops if stop.failure is not None]
     if len(failures) == len(stops):
         raise failures[-1]
     where = "; ".join(f"in the realm '{stop.realm}' {stop.where}" for stop in stops if stop.failure is None)
     print(
-        f"NOTHING WAS STOPPED: no robot is seen {where}. Name the router of the run: "
+        f"{'no robot' if dry_run else 'NOTHING WAS STOPPED: no robot'} is seen {where}. Name the router of the run: "
         "--connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
         file=sys.stderr,
     )
     return 1
+
+
+def _as_json(stop: EmergencyStop, *, dry_run: bool) -> Mapping[str, object]:
+    failure = None if stop.failure is None else str(stop.failure)
+    if dry_run:
+        return {"where": stop.where, "would_be_stopped": sorted(stop.seen), "failure": failure}
+    return {
+        "where": stop.where,
+        "stopped": sorted(stop.seen - stop.moving),
+        "not_known_to_have_stopped": sorted(stop.moving),
+        "failure": failure,
+    }
+
+
+def _print_stop(stop: EmergencyStop, *, dry_run: bool) -> None:
+    """Print the result of one stop, with title, folder and routers of its run where they are known."""
+    why = "no robot is there" if stop.failure is None else str(stop.failure)
+    if stop.moving:
+        of_all = f"{len(stop.moving)} of {len(stop.seen)} robots; {stop.where}"
+        say(f"NOT known to have stopped: {listed(stop.moving, MOST_NAMES)} ({of_all})", to=sys.stderr)
+    if stopped := stop.seen - stop.moving:
+        say(f"{'would be stopped' if dry_run else 'stopped'}: {listed(stopped, MOST_NAMES)} ({stop.where})")
+    elif stop.expected and not stop.seen:
+        done = "no robot would be stopped" if dry_run else "NOT known to have stopped"
+        say(f"{done}: {stop.where}: {why}", to=sys.stderr)
+    elif not stop.seen and stop.run is None:
+        say(f"also tried, {stop.where}: {why}", to=sys.stderr)

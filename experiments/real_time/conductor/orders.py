@@ -123,6 +123,13 @@ def stop_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
     )
 
 
+def alive(session: zenoh.Session, keys: Keys) -> set[str]:
+    """Robots that are on the network."""
+    replies = session.liveliness().get(keys.alive("*"), timeout=STOP_ANSWER_S)
+    found = {keys.whose(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+    return {robot for robot in found if robot is not None}
+
+
 @dataclass
 class EmergencyStop:
     """An emergency stop at the routers of one run."""
@@ -137,7 +144,7 @@ class EmergencyStop:
 
     @property
     def where(self) -> str:
-        return f"at {', '.join(topology.bare(self.endpoints))}" if self.run is None else self.run.words
+        return f"at {topology.describe(self.endpoints)}" if self.run is None else self.run.words
 
     @property
     def expected(self) -> bool:
@@ -149,6 +156,15 @@ class EmergencyStop:
         try:
             self._send(reason)
         except Exception as error:  # noqa: BLE001 - the others are stopped whatever happens to this one
+            self.failure = error
+
+    def look(self) -> None:
+        """Find the robots that the stop would reach; nothing is sent to them."""
+        try:
+            opened = network.open_session(self.endpoints, name="estop", wait_s=2.0, identity=self.identity)
+            with held(opened) as (session, _):
+                self.seen = alive(session, Keys(self.realm))
+        except Exception as error:  # noqa: BLE001 - as for the stop itself
             self.failure = error
 
     def _send(self, reason: str) -> None:
@@ -163,11 +179,7 @@ class EmergencyStop:
             statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
             inbox = pubsub.Inbox(statuses, messages.Status, keys=keys)
             declared += [urgent, statuses]
-            self.seen = {
-                robot
-                for reply in session.liveliness().get(keys.alive("*"), timeout=STOP_ANSWER_S)
-                if reply.ok is not None and (robot := keys.whose(str(reply.ok.key_expr))) is not None
-            }
+            self.seen = alive(session, keys)
             self.moving = set(self.seen)
             watch = pubsub.AliveWatch(session, keys.alive("*"))
             while (self.moving or self._awaited(session, begun)) and time.monotonic() < begun + STOP_ANSWER_S:
