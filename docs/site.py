@@ -1,4 +1,4 @@
-"""Pages of the documentation site that are generated: the reference, from the code's own texts.
+"""Pages of the documentation site that are generated, the reference from the code's own texts; and its formulas.
 
 A hook of mkdocs (`mkdocs.yml`): the pages exist only in the site.
 """
@@ -9,6 +9,7 @@ import ast
 import inspect
 import re
 from collections.abc import Callable, Iterator, Sequence
+from html import unescape
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 NOTEBOOKS: Final = ("experiments.run",)
+FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
     "agents.arrays",
     "agents.formation.graph",
@@ -39,6 +41,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, make in PAGES.items():
         files.append(File.generated(config, f"reference/{name}.md", content="\n".join(make())))
     return files
+
+
+def on_page_content(html: str, **_: object) -> str:
+    """Formulas as MathML, which browsers draw without a script."""
+    from latex2mathml.converter import convert  # noqa: PLC0415
+
+    displays = {"span": "inline", "div": "block"}
+    return FORMULA.sub(lambda found: convert(unescape(found[2]).strip(), display=displays[found[1]]), html)
 
 
 def experiment_file() -> Iterator[str]:

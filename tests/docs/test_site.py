@@ -15,6 +15,7 @@ from agents.formation.graph import Links
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
+from tests.system.browser import CHROMIUM, needs_chromium
 from tools.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -56,6 +57,26 @@ def test_the_site_has_every_page_and_fetches_nothing(site):
         for url in re.findall(r"<(?:script|img|link)[^>]* (?:src|href)=\"?(https?://[^\"> ]+)", page.read_text("utf-8"))
     }
     assert loaded == set()
+
+
+@pytest.mark.slow
+@needs_chromium
+@pytest.mark.timeout(600)
+def test_search_and_formulas_work_from_disk(site):
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page()
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto((site / "triggers.html").as_uri())
+        page.locator("input.md-search__input").press_sequentially("self-triggered")
+        page.locator(".md-search-result__item a[href*='triggers.html']").first.wait_for(timeout=60_000)
+        assert page.locator("td math").count() > 0
+        assert page.get_by_text("\\(").count() == 0
+        browser.close()
+    assert [url for url in asked if not url.startswith("file:")] == []
 
 
 @pytest.mark.slow
