@@ -1,7 +1,7 @@
 """ROS 2 bridge over rmw_zenoh: the robots of a realm as ROS 2 topics, without ROS here: `python -m bridges.ros2`.
 
-Published: /<robot>/pose, /<robot>/velocity and /diagnostics. Subscribed: /<robot>/goal. A robot's topics exist while
-its liveliness token does.
+Published: /<robot>/pose, /<robot>/velocity, /<robot>/scan, /tf and /diagnostics. Subscribed: /<robot>/goal. A robot's
+topics exist while its liveliness token does; its scan from its first range readings on.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from math import isfinite, isnan, nan
+from math import inf, isfinite, isnan, nan, radians, remainder, tau
 from typing import Annotated, Final
 
 import msgspec
+import numpy as np
 import zenoh
 from msgspec import Meta
 
+from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -34,6 +36,8 @@ NODE: Final = "zenpark"
 FRAME: Final = "map"  # the arena, as rviz and nav2 name the fixed frame; goals must be in it
 POLL_S: Final = 0.01
 REACH: Final = (1e3, 1e3, 1e3)  # [m] bounds of valid positions: any room
+DEGREE: Final = radians(1.0)
+SAME: Final = 1e-3  # [rad] bearings that differ less are one
 OK, WARN, ERROR = 0, 1, 2  # levels of a DiagnosticStatus
 
 
@@ -68,12 +72,16 @@ class _Robot:
     velocity: Publisher
     goal: Subscriber
     goal_publisher: zenoh.Publisher
+    frame: str
+    scan: Publisher | None = None  # None until the first range readings
     stamp: float = 0.0  # of the last pose published to ROS, UTC [s]
     height: GoalHeight = field(default_factory=GoalHeight)
 
     def close(self) -> None:
         self.pose.close()
         self.velocity.close()
+        if self.scan is not None:
+            self.scan.close()
         self.goal.close()
         self.goal_publisher.undeclare()  # type: ignore[no-untyped-call]
 
@@ -89,8 +97,10 @@ class Graph:
         self._types = participant.types
         self._node = participant.node(NODE)
         self._diagnostics = self._node.publisher("/diagnostics", ros2.DIAGNOSTIC_ARRAY)
+        self._transforms = self._node.publisher("/tf", ros2.TF_MESSAGE, ros2.TRANSFORMS)
         self._robots: dict[str, _Robot] = {}
         self._states = pubsub.Inbox(pubsub.subscriber(session, keys.state("*"), 1024), messages.State, keys=keys)
+        self._ranges = pubsub.Inbox(pubsub.subscriber(session, keys.ranges("*"), 256), messages.Ranges, keys=keys)
         self._statuses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.status("*"), 256), messages.Status)
         self._alive = pubsub.AliveWatch(session, keys.alive("*"))
         self._centres = pubsub.AliveWatch(session, keys.centre_alive)
@@ -101,7 +111,7 @@ class Graph:
     @property
     def malformed(self) -> int:
         """Samples of the realm that were refused."""
-        return self._states.malformed + self._statuses.malformed
+        return self._states.malformed + self._ranges.malformed + self._statuses.malformed
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -115,6 +125,7 @@ class Graph:
             header = self._types.header(self._clock.utc(), "")
             self._diagnostics.put(self._types.make(ros2.DIAGNOSTIC_ARRAY, header=header, status=statuses))
         self._publish_states()
+        self._publish_scans()
         for _, alive in self._centres.changes():
             self._centralised = alive
         for name, robot in self._robots.items():
@@ -143,11 +154,12 @@ class Graph:
             self._node.publisher(f"/{chunk}/velocity", ros2.TWIST_STAMPED),
             self._node.subscriber(f"/{chunk}/goal", ros2.POSE_STAMPED, depth=8),
             pubsub.publisher(self._session, self._keys.goal(name), messages.JSON),
+            chunk,
         )
 
     def _publish_states(self) -> None:
-        """Publish received states as pose and velocity."""
-        now = self._clock.utc()
+        """Publish received states as pose, transform and velocity."""
+        now, transforms = self._clock.utc(), []
         for state in self._states.read(lambda state: validation.check_state(state, now=now, reach=REACH)):
             if (robot := self._robots.get(state.robot)) is None:
                 continue
@@ -155,8 +167,23 @@ class Graph:
             if state.position is not None:
                 robot.height.follow(state.phase, state.position[2])
                 robot.pose.put(pose(self._types, state, state.position))
+                transforms.append(transform(self._types, state, state.position, robot.frame))
             if state.velocity is not None:
                 robot.velocity.put(velocity(self._types, state, state.velocity))
+        if transforms:
+            self._transforms.put(self._types.make(ros2.TF_MESSAGE, transforms=transforms))
+
+    def _publish_scans(self) -> None:
+        """Publish received range readings; a robot's topic is declared with its first ones."""
+        now = self._clock.utc()
+        for ranges in self._ranges.read(lambda ranges: validation.check_ranges(ranges, now=now)):
+            robot = self._robots.get(ranges.robot)
+            made = None if robot is None else scan(self._types, ranges, robot.frame)
+            if robot is None or made is None:
+                continue
+            if robot.scan is None:
+                robot.scan = self._node.publisher(f"/{robot.frame}/scan", ros2.LASER_SCAN)
+            robot.scan.put(made)
 
     def _diagnostics_of_statuses(self) -> list[Message]:
         return [diagnosis(self._types, status) for status in self._statuses.read() if status.robot in self._robots]
@@ -187,6 +214,62 @@ def pose(types: Types, state: messages.State, position: messages.Vector) -> Mess
     """A PoseStamped in the arena; only the robot's yaw is known, and an unknown yaw is sent as 0."""
     header = types.header(state.stamp, FRAME)
     return types.make(ros2.POSE_STAMPED, header=header, pose=types.pose(*position, state.yaw or 0.0))
+
+
+def transform(types: Types, state: messages.State, position: messages.Vector, frame: str) -> Message:
+    """A TransformStamped from the arena to the robot's frame: its place and yaw, as in its pose."""
+    return types.make(
+        ros2.TRANSFORM_STAMPED,
+        header=types.header(state.stamp, FRAME),
+        child_frame_id=frame,
+        transform=types.transform(*position, state.yaw or 0.0),
+    )
+
+
+def scan(types: Types, ranges: messages.Ranges, frame: str) -> Message | None:
+    """A LaserScan of the horizontal rays; None without any.
+
+    A LaserScan has equal steps: a place without a ray is NaN, a ray with nothing in reach is infinite (REP 117). The
+    reach of the sensor is not known here: `range_max` is that of any.
+    """
+    found = zip(ranges.bearing, ranges.elevation, ranges.distance, strict=True)
+    flat = [(remainder(bearing, tau), distance) for bearing, up, distance in found if abs(up) < DEGREE]
+    if not flat:
+        return None
+    start, step, place = steps(np.array([bearing for bearing, _ in flat]))
+    values = np.full(int(place.max()) + 1, nan, np.float32)
+    # of two rays at one place the nearer hit counts
+    np.fmin.at(values, place, np.array([inf if distance is None else distance for _, distance in flat], np.float32))
+    return types.make(
+        ros2.LASER_SCAN,
+        header=types.header(ranges.stamp, frame),
+        angle_min=start,
+        angle_max=start + step * (len(values) - 1),
+        angle_increment=step,
+        time_increment=0.0,
+        scan_time=0.0,
+        range_min=0.0,
+        range_max=validation.MAX_RANGE,
+        ranges=values,
+        intensities=np.zeros(0, np.float32),
+    )
+
+
+def steps(bearing: Array) -> tuple[float, float, Index]:
+    """The first angle [rad] and the step [rad] of a scan with these bearings [rad], and the place of each in it.
+
+    Where the bearings are no multiples of the smallest gap between two, the step is one degree.
+    """
+    start = float(bearing.min())
+    along = bearing - start
+    span, step = float(along.max()), DEGREE
+    gaps = np.diff(np.sort(along))
+    gap = float(gaps.min(where=gaps > SAME, initial=inf))
+    if tau / validation.MAX_RAYS - SAME < gap < inf:
+        equal = span / round(span / gap)
+        if np.abs(along - equal * np.rint(along / equal)).max() < SAME:
+            step = equal
+    return start, step, np.rint(along / step).astype(np.intp)
 
 
 def velocity(types: Types, state: messages.State, linear: messages.Vector) -> Message:

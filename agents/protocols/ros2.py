@@ -29,6 +29,8 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 LASER_SCAN: Final = "sensor_msgs/msg/LaserScan"
 BATTERY_STATE: Final = "sensor_msgs/msg/BatteryState"
 DIAGNOSTIC_ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
+TRANSFORM_STAMPED: Final = "geometry_msgs/msg/TransformStamped"
+TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
 
 STORES: Final[dict[Distro, str]] = {
     "humble": "ROS2_HUMBLE",
@@ -101,10 +103,16 @@ class Types:
 
     def pose(self, x: float, y: float, z: float, yaw: float) -> Message:
         """An upright geometry_msgs/Pose [m, rad]."""
-        turned = self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(0.5 * yaw), w=cos(0.5 * yaw))
-        return self.make(
-            "geometry_msgs/msg/Pose", position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turned
-        )
+        point = self.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+        return self.make("geometry_msgs/msg/Pose", position=point, orientation=self.turn(yaw))
+
+    def transform(self, x: float, y: float, z: float, yaw: float) -> Message:
+        """An upright geometry_msgs/Transform [m, rad]."""
+        return self.make("geometry_msgs/msg/Transform", translation=self.vector(x, y, z), rotation=self.turn(yaw))
+
+    def turn(self, yaw: float) -> Message:
+        """A geometry_msgs/Quaternion about the z axis [rad]."""
+        return self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=sin(0.5 * yaw), w=cos(0.5 * yaw))
 
 
 def yaw_of(q: Message) -> float:
@@ -164,6 +172,7 @@ def qos(*, best_effort: bool = False, depth: int = 10) -> str:
 
 RELIABLE: Final = qos()
 SENSOR_DATA: Final = qos(best_effort=True, depth=5)
+TRANSFORMS: Final = qos(depth=100)  # of tf2_ros
 
 
 # ---------------------------------------------------------------------- tokens and attachments

@@ -135,7 +135,7 @@ def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
         ),
         "ros2": Grant(
             publish=[*goals, *foreign],
-            subscribe=[keys.state("*"), keys.status("*"), *foreign],
+            subscribe=[keys.state("*"), keys.ranges("*"), keys.status("*"), *foreign],
             tokens=tokens,
             watch=[keys.alive("*"), keys.centre_alive, *tokens],
         ),

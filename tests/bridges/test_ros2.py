@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import xxhash
 import zenoh
@@ -24,7 +25,8 @@ from agents.network.keys import Keys
 from agents.network.pubsub import alive_token, pose_publisher, publisher
 from agents.network.session import open_session, received
 from agents.protocols import ros2
-from bridges.ros2 import GoalHeight, main, ros_name
+from bridges.ros2 import GoalHeight, main, ros_name, scan, transform
+from twins.sensing.range_sensors import SENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
 JSON = "application/json"
@@ -35,6 +37,9 @@ HASHES = {
     "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
     "geometry_msgs/msg/TwistStamped": "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
     "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "geometry_msgs/msg/TransformStamped": "0a241f87d04668d94099cbb5ba11691d5ad32c2f29682e4eb5653424bd275206",
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "sensor_msgs/msg/LaserScan": "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
     "sensor_msgs/msg/Imu": "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
     "sensor_msgs/msg/BatteryState": "4bee5dfce981c98faa6828b868307a0a73f992ed0789f374ee96c8f840e69741",
@@ -80,6 +85,65 @@ def test_cdr_is_identical_to_rosbags(distro, kind):
     raw = types.encode(message, kind)
     assert raw == bytes(store.serialize_cdr(store.deserialize_cdr(raw, kind), kind))
     assert len(raw) == {ros2.TWIST: 52, ros2.TWIST_STAMPED: 68, ros2.POSE_STAMPED: 84}[kind]
+
+
+def test_transforms_are_tf_byte_by_byte_and_read_back():
+    types = ros2.types("jazzy")
+    state = messages.State("tb3-0", 1, 12.5, "running", (1.0, -2.0, 0.5), None, math.pi, None, None, 0.0)
+    made = transform(types, state, (1.0, -2.0, 0.5), "tb3_0")
+    raw = types.encode(types.make(ros2.TF_MESSAGE, transforms=[made]), ros2.TF_MESSAGE)
+    head = struct.pack("<IiI", 1, 12, 500000000) + struct.pack("<I", 4) + b"map\0" + struct.pack("<I", 6) + b"tb3_0\0"
+    numbers = struct.pack("<7d", 1.0, -2.0, 0.5, 0.0, 0.0, 1.0, math.cos(math.pi / 2))
+    assert raw == b"\0\1\0\0" + head + b"\0\0" + numbers
+    (back,) = types.decode(raw, ros2.TF_MESSAGE).transforms
+    assert (back.header.frame_id, back.child_frame_id, back.transform) == ("map", "tb3_0", made.transform)
+    assert (ros2.TRANSFORMS, ros2.yaw_of(back.transform.rotation)) == ("::,100:,:,:,,", pytest.approx(math.pi))
+
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("bearing", "up", "distance", "grid", "places"),
+    [
+        pytest.param(  # Multi-ranger: back at +180°, and a ray to the ceiling
+            [0.0, 180.0, 90.0, -90.0, 0.0], 90.0, [1.0, 2.0, None, 4.0, 5.0], (-180.0, 90.0), [2.0, 4.0, 1.0, INF],
+        ),
+        pytest.param([-50.0, 0.0, 50.0], 0.0, [1.0, 2.0, None], (-50.0, 50.0), [1.0, 2.0, INF], id="a fan"),
+        pytest.param([350.0, 0.0, 20.0], 0.0, [1.0, 2.0, 3.0], (-10.0, 10.0), [1.0, 2.0, NAN, 3.0], id="a gap"),
+        pytest.param([0.0, 2.0, 5.0], 0.0, [1.0, 2.0, 3.0], (0.0, 1.0), [1.0, NAN, 2.0, NAN, NAN, 3.0], id="no steps"),
+        pytest.param([7.0], 0.0, [None], (7.0, 1.0), [INF], id="one ray"),
+        pytest.param([0.0, 0.0, 10.0], 0.0, [3.0, 2.0, None], (0.0, 10.0), [2.0, INF], id="the nearer hit"),
+    ],
+)  # fmt: skip
+def test_range_readings_are_a_scan_of_equal_steps(bearing, up, distance, grid, places):
+    types, up = ros2.types("jazzy"), [*[0.0] * (len(bearing) - 1), up]
+    angles = np.radians([bearing, up]).round(6).tolist()  # as they are sent
+    made = scan(types, messages.Ranges("CF01", 12.5, *angles, distance), "CF01")
+    back = types.decode(types.encode(made, ros2.LASER_SCAN), ros2.LASER_SCAN)
+    assert (back.header.frame_id, back.header.stamp.sec) == ("CF01", 12)
+    assert np.degrees([back.angle_min, back.angle_increment]) == pytest.approx(grid, abs=1e-3)
+    assert back.angle_max == pytest.approx(back.angle_min + back.angle_increment * (len(places) - 1), abs=1e-5)
+    np.testing.assert_array_equal(back.ranges, np.array(places, np.float32))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_each_sensor_becomes_a_scan_that_loses_nothing(name):
+    sensor = SENSORS[name]
+    flat = np.abs(sensor.elevation) < 0.01
+    distance = (0.5 + 0.01 * np.arange(len(flat))).tolist()
+    ranges = messages.Ranges("R", 12.5, sensor.bearing.round(6).tolist(), sensor.elevation.round(6).tolist(), distance)
+    made = scan(ros2.types("jazzy"), ranges, "R")
+    there = np.isfinite(made.ranges)
+    assert sorted(made.ranges[there].tolist()) == pytest.approx(np.array(distance)[flat].tolist(), abs=1e-6)
+    angles = made.angle_min + made.angle_increment * np.flatnonzero(there)
+    wanted = dict(zip(np.array(distance)[flat].round(6).tolist(), sensor.bearing[flat], strict=True))
+    for angle, value in zip(angles, made.ranges[there].astype(float).round(6).tolist(), strict=True):
+        assert abs(math.remainder(angle - wanted[value], math.tau)) <= math.radians(0.5)
+
+
+def test_rays_to_the_ceiling_are_no_scan():
+    assert scan(ros2.types("jazzy"), messages.Ranges("R", 1.0, [0.0], [1.570796], [2.0]), "R") is None
 
 
 @given(st.binary(max_size=120), st.sampled_from([ros2.TWIST, ros2.TWIST_STAMPED, ros2.ODOMETRY, ros2.LASER_SCAN]))
@@ -220,6 +284,7 @@ class Realm:
         self.out[name] = (
             publisher(self.session, self.keys.state(name), JSON),
             pose_publisher(self.session, self.keys.status(name), JSON),
+            publisher(self.session, self.keys.ranges(name), JSON),
         )
         self.tokens[name] = alive_token(self.session, self.keys.alive(name))
 
@@ -229,6 +294,11 @@ class Realm:
     def state(self, name, position, velocity, yaw):
         state = messages.State(name, 1, 1700000000.5, "running", position, velocity, yaw, None, None, 0.0)
         self.out[name][0].put(messages.encode(state))
+
+    def ranges(self, name):
+        quarter = round(math.pi / 2, 6)
+        sweep = messages.Ranges(name, 1700000000.5, [0.0, quarter], [0.0, 0.0], [1.5, None])
+        self.out[name][2].put(messages.encode(sweep))
 
     def status(self, name, body=""):
         status = messages.Status(
@@ -286,6 +356,8 @@ def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
         eventually(lambda: any("/NN/%/%/zenpark" in token for token in node.graph()))
         diagnostics = node.subscribe("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         poses = node.subscribe("CF01/pose", "geometry_msgs/msg/PoseStamped")
+        frames = node.subscribe("tf", "tf2_msgs/msg/TFMessage")
+        scans = node.subscribe("CF01/scan", "sensor_msgs/msg/LaserScan")
         speeds = node.subscribe("CF01/velocity", "geometry_msgs/msg/TwistStamped")
         realm.enter("CF01")
         realm.enter("tb3-0")
@@ -298,7 +370,10 @@ def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
                 ("MS", "goal", "PoseStamped"),
             )
         }
-        wanted |= {("MP", "/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_")}
+        wanted |= {
+            ("MP", "/diagnostics", "diagnostic_msgs::msg::dds_::DiagnosticArray_"),
+            ("MP", "/tf", "tf2_msgs::msg::dds_::TFMessage_"),
+        }
         eventually(lambda: node.topics() == wanted)
         assert all(
             re.fullmatch(r"RIHS01_[0-9a-f]{64}", token.split("/")[11]) for token in node.graph() if "/NN/" not in token
@@ -323,6 +398,21 @@ def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
         assert gid == xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
         speed = node.take(speeds)[0][0].twist.linear
         assert (speed.x, speed.y, speed.z) == (0.1, 0.2, -0.3)
+        frame = node.take(frames)[0][0].transforms[0]
+        assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "CF01", 1700000000)
+        assert (frame.transform.translation.x, frame.transform.rotation) == (1.0, turn)
+
+        swept = []
+
+        def scan_came():
+            realm.ranges("CF01")
+            swept.extend(node.take(scans))
+            return swept
+
+        eventually(scan_came)
+        assert (swept[0][0].header.frame_id, swept[0][0].ranges.tolist()) == ("CF01", [1.5, INF])
+        scanner = {("MP", "/CF01/scan", "sensor_msgs::msg::dds_::LaserScan_")}
+        assert node.topics() == wanted | scanner, "the other robot has no range readings"
 
         found = []
 
@@ -342,7 +432,7 @@ def test_robots_are_in_the_graph_of_ros(router, bridge, eventually):
         eventually(
             lambda: (
                 {topic for _, topic, _ in node.topics()}
-                == {"/diagnostics", "/tb3_0/pose", "/tb3_0/velocity", "/tb3_0/goal"}
+                == {"/diagnostics", "/tf", "/tb3_0/pose", "/tb3_0/velocity", "/tb3_0/goal"}
             )
         )
         found.clear()
@@ -432,8 +522,8 @@ def test_the_graph_survives_its_router(router, bridge, eventually):
         node = RosNode(outside, 7)
         realm = Realm(outside)
         realm.enter("CF01")
-        eventually(lambda: len(node.topics()) == 4)
+        eventually(lambda: len(node.topics()) == 5)
         router.kill()
         eventually(lambda: not [token for token in node.graph() if "zenpark" in token])
         router.start()
-        eventually(lambda: len(node.topics()) == 4)
+        eventually(lambda: len(node.topics()) == 5)

@@ -142,7 +142,7 @@ def ros_graph() -> Iterator[Target]:
     from tests.fuzz.messages import everything  # noqa: PLC0415
 
     good = ros_messages()
-    examples = everything("KH01", "KH02", only=("state", "status"))
+    examples = everything("KH01", "KH02", only=("state", "ranges", "status"))
 
     def make():
         net.forget()

@@ -63,7 +63,7 @@ def wanted(who, action, robot, what, *, hears, mates, guided):
     if who == "ros2":
         return (
             (what == "goal" and robot in guided and action in ("put", "keep"))
-            or (what in ("state", "status") and action in ("hear", "last"))
+            or (what in ("state", "ranges", "status") and action in ("hear", "last"))
             or (what == "alive" and action == "watch")
         )
     if who.startswith("R"):
