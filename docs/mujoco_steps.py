@@ -12,7 +12,7 @@ from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
 from experiments.report.style import CASES, STYLE
 from twins.engines.mujoco_engine import Drones
-from twins.models.quadrotor import LEANING, RESPONSES, Quadrotor
+from twins.models.quadrotor import RESPONSES, Quadrotor
 from twins.scene import Scene
 
 DT, SECONDS, HEIGHT = 0.01, 4.0, 1.0
@@ -45,8 +45,7 @@ def figures(path: Array, step: float) -> tuple[float, float]:
 def main() -> None:
     """Both."""
     one = ((CRAZYFLIE,), np.zeros((1, 3)), np.zeros(1), DT)
-    for response in (RESPONSES["crazyflie"], LEANING["crazyflie"]):
-        print(f"law: {response}")
+    print(f"law: {RESPONSES['crazyflie']}")
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 1.9), layout="constrained")
         panels = iter(figure.subplots(1, 4))
@@ -54,7 +53,6 @@ def main() -> None:
             curves = {
                 "rigid body, firmware's cascade": flown(Drones(*one, scene=Scene.empty(), motor_lag=0.03), axis, step),
                 "fitted law": flown(Quadrotor(*one), axis, step),
-                "fitted law that leans": flown(Quadrotor(*one, leaning=True), axis, step),
             }
             for label, path in curves.items():
                 rise, overshoot = figures(path, step)
@@ -62,14 +60,14 @@ def main() -> None:
             if (name, step) == ("z", 0.3):
                 continue
             axes = next(panels)
-            for (label, path), style, colour in zip(curves.items(), ("-", "--", ":"), CASES, strict=False):
+            for (label, path), style, colour in zip(curves.items(), ("-", "--"), CASES, strict=False):
                 axes.plot(*path.T, style, color=colour, label=label)
             axes.axhline(step, color="#9a9a9a", linewidth=0.5, zorder=0.5)
             axes.set(
                 xlabel="Time (s)", ylabel=f"{name} ({'rad' if axis == 3 else 'm'})", xlim=(0.0, SECONDS), ylim=(0, None)
             )
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, ncols=3, loc="outside upper center")
+        figure.legend(handles, labels, ncols=2, loc="outside upper center")
         figure.savefig(Path(__file__).with_name("mujoco-steps.svg"), metadata={"Date": None}, transparent=False)
 
 

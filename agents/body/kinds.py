@@ -37,10 +37,10 @@ CRAZYFLIE: Final = Kind(
     mass=0.027,
     endurance_s=420.0,
     speed=1.0,
-    turn_rate=math.radians(200.0),
+    turn_rate=10.0,  # that of a step of 3 rad under the firmware's yaw controller
     response=2.0,  # position P of the firmware
-    turn_response=3.0,
-    lag=1.0 / 3.5,
+    turn_response=7.6,  # step response of the firmware's yaw controller
+    lag=0.4,  # velocity loop and tilt, 0.2 s each
 )
 TELLO: Final = Kind(
     "tello",

@@ -55,6 +55,17 @@ class Nearby(Columns, frozen=True):
             away[~some_way], distance = (COINCIDENT, 0.0), np.maximum(distance, COINCIDENT)
         return away / distance[:, None], distance
 
+    def gaps(self, own: OwnState) -> tuple[Array, Array]:
+        """Unit vectors (K, 2) as `bearing`, and gaps (K,) between surfaces once both have stopped closing in [m].
+
+        A velocity fades with its time constant, so that a robot moves on by the product of both.
+        """
+        away, distance = self.bearing(own)
+        coming = np.maximum(np.vecdot(away, self.velocity), 0.0)
+        going = np.maximum(-np.vecdot(away, own.velocity[self.row, :2]), 0.0)
+        way = own.lag[self.row] * going + self.lag * coming
+        return away, distance - own.radius[self.row] - self.radius - way
+
 
 @dataclass(frozen=True)
 class OwnState:
@@ -103,7 +114,7 @@ class Potential(Avoidance, frozen=True):
     """The repulsive potential of the paper, eqs. (2) to (4): a shift of the goal away from near things.
 
     Each thing k within d0 pushes with F_k = η (1/d_k − 1/d0) / d_k² along the horizontal unit vector from it to the
-    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k; d is measured from surface to surface. In a layer of
+    robot, and the goal is shifted by u = h v F/‖F‖, F = Σ F_k; d is between surfaces once both stopped. In a layer of
     `LAYER` below d0 the shift grows in proportion to ‖F‖ (Slotine and Sastry, "Tracking control of non-linear systems
     using sliding surfaces", Int. J. Control 38(2), 1983), and the part of the pull against F also pulls aside, by
     `ASIDE` (a vortex field: De Luca and Oriolo, "Local incremental planning for nonholonomic mobile robots", ICRA
@@ -117,8 +128,8 @@ class Potential(Avoidance, frozen=True):
 
     def force(self, own: OwnState, near: Nearby) -> Array:
         """F (N, 2) of eq. (3), summed over near things; zero where there are none."""
-        away, distance = near.bearing(own)
-        gap = np.maximum(distance - own.radius[near.row] - near.radius, TOUCHING)
+        away, gap = near.gaps(own)
+        gap = np.maximum(gap, TOUCHING)
         push = self.strength * np.maximum(1.0 / gap - 1.0 / self.reach, 0.0) / gap**2
         total = np.zeros((len(own.yaw), 2))
         np.add.at(total, near.row, push[:, None] * away)

@@ -61,11 +61,9 @@ class Barrier(Avoidance, frozen=True):
 
         `share` (K,) of α is used.
         """
-        row = near.row
-        away, distance = near.bearing(own)
+        away, gap = near.gaps(own)
+        left = gap - self.margin
         coming = np.maximum(np.vecdot(away, near.velocity), 0.0)
-        going = np.maximum(-np.vecdot(away, own.velocity[row, :2]), 0.0)
-        left = distance - own.radius[row] - near.radius - self.margin - own.lag[row] * going - near.lag * coming
         used = self.alpha * share * left
         return -away, np.minimum(np.where(left > 0.0, 0.5 * used, used), used - coming)
 

@@ -17,6 +17,7 @@ from agents.plugins.calls import call
 FLOOR_M = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
 OUTSIDE_M = 0.25  # [m] outside the arena: no longer under control
 ABSURD = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
+BEFORE_WALL = 0.6  # share of the way to a wall that a goal may be ahead: a drone overshoots a step by a tenth
 ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
 
 
@@ -143,8 +144,9 @@ class SetpointFilter:
             setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
 
     def _clamp_target(self, target: Array, here: Array, rows: Rows) -> Array:
-        """Goals inside the arena and not too far ahead of the robot."""
-        target = clamp(target, self._low[rows], self._high[rows])
+        """Goals inside the arena, not too far ahead of the robot, and before a wall that it would overshoot to."""
+        low, high = self._low[rows], self._high[rows]
+        target = clamp(target, here + BEFORE_WALL * (low - here), here + BEFORE_WALL * (high - here))
         step = target - here
         length, longest = norm(step), self._step[rows]
         far = length > longest

@@ -14,10 +14,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from agents.arrays import Array
-from agents.body.kinds import CRAZYFLIE
+from agents.body.kinds import TELLO
 from agents.formation.graph import components, laplacian, links
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import closed_shares
+from experiments.check.ideal_run import bearable_factors, closed_shares
 from experiments.check.realisation import algebraic_connectivity
 from experiments.file.document import Document, loads
 from experiments.recording.trace import Trace
@@ -124,7 +124,7 @@ START = [(-1.0, 0.6), (-0.4, -0.9), (0.9, -0.5), (0.2, 1.0), (1.1, 0.7), (-0.8, 
 def rendezvous(pairs: Pairs, stiffness: float, duration_s: float) -> Document:
     """An experiment: consensus of six drones on where to meet."""
     robots = [
-        f'D{i} = {{ kind = "crazyflie", start = [{x}, {y}], hover = {0.5 + 0.4 * i:.1f} }}'
+        f'D{i} = {{ kind = "tello", start = [{x}, {y}], hover = {0.5 + 0.4 * i:.1f} }}'
         for i, (x, y) in enumerate(START)
     ]
     wanted = [f'"D{i} - D{j}" = {{ offset = [0.0, 0.0] }}' for i, j in pairs]
@@ -144,7 +144,7 @@ def rendezvous(pairs: Pairs, stiffness: float, duration_s: float) -> Document:
     )
 
 
-GAIN, DURATION_S = 0.03, 40.0
+GAIN, DURATION_S = 0.06, 40.0
 experiments = {name: rendezvous(pairs, GAIN, DURATION_S) for name, pairs in GRAPHS.items()}
 print("\n".join(str(finding) for finding in check(experiments["ring"])))
 
@@ -197,7 +197,7 @@ for name, trace in runs.items():
 # ## 3. How fast: the rate predicted
 #
 # Write x in the eigenvectors of L: x = Σ zᵢ vᵢ. The modes do not act on each other. *First prediction*, with
-# robots that close a distance to their goal at the rate c (`response`, 2 per second for a Crazyflie): żᵢ = −c k λᵢ
+# robots that close a distance to their goal at the rate c (`response`, 1 per second for a Tello): żᵢ = −c k λᵢ
 # zᵢ. Every mode decays at its own rate c k λᵢ; the slowest is that of λ₂, so **the algebraic connectivity is the
 # rate of convergence**.
 #
@@ -223,13 +223,13 @@ def decay_rates(trace: Trace, modes: Array) -> Array:
 spectrum = {name: np.linalg.eigh(laplacian_of(pairs)) for name, pairs in GRAPHS.items()}
 eigenvalue = np.concatenate([values[1:] for values, _ in spectrum.values()])
 measured = np.concatenate([decay_rates(runs[name], modes) for name, (_, modes) in spectrum.items()])
-by_hand = CRAZYFLIE.response * GAIN * eigenvalue
+by_hand = TELLO.response * GAIN * eigenvalue
 off = measured / by_hand - 1.0
 print(f"{len(measured)} modes, measured over predicted: {off.min():+.1%} to {off.max():+.1%}")
-assert np.all(np.abs(off) < 0.10)
+assert np.all(np.abs(off) < 0.125)
 
 # %% [markdown]
-# A prediction by hand, over a range of rates of more than 20, and no mode is off by more than a tenth. But the
+# A prediction by hand, over a range of rates of more than 20, and no mode is off by more than an eighth. But the
 # errors are no accident: slow modes are slower than predicted, and fast ones faster. Both have a reason.
 #
 # *Sampling.* The goal is decided anew ten times in a second, and stands in between. Of a distance to its goal a
@@ -237,13 +237,13 @@ assert np.all(np.abs(off) < 0.10)
 # its `slowest_mode_s` is the time constant of λ₂.
 #
 # *Lag.* A quadrotor must get up to speed first: its velocity follows what its position controller wants at the rate
-# k_v = 3.5 per second. So it has two states, and a decision is a 2 × 2 matrix; its larger eigenvalue is what is
+# k_v = 3 per second. So it has two states, and a decision is a 2 × 2 matrix; its larger eigenvalue is what is
 # left.
 
 # %%
 HZ = 10.0  # decisions in a second
 BODY_HZ = 100.0  # steps of the position controller
-h = float(closed_shares([CRAZYFLIE], HZ)[0])
+h = float(closed_shares([TELLO], HZ)[0])
 
 
 def sampled_rate(taken: float) -> float:
@@ -253,7 +253,7 @@ def sampled_rate(taken: float) -> float:
 
 def lagging_rate(taken: float) -> float:
     """The same for robots of two states, distance to the meeting place and velocity [1/s]."""
-    k_p, k_v, dt = CRAZYFLIE.response, 1.0 / CRAZYFLIE.lag, 1.0 / BODY_HZ
+    k_p, k_v, dt = TELLO.response, 1.0 / TELLO.lag, 1.0 / BODY_HZ
     after = np.eye(2)  # columns: what becomes of a unit of either state
     goal = (1.0 - taken) * after[0]
     for _ in range(round(BODY_HZ / HZ)):
@@ -272,7 +272,7 @@ sampled = np.array([sampled_rate(GAIN * value) for value in eigenvalue])
 lagging = np.array([lagging_rate(GAIN * value) for value in eigenvalue])
 print(f"sampled:        {(measured / sampled - 1.0).min():+.1%} to {(measured / sampled - 1.0).max():+.1%}")
 print(f"sampled, a lag: {(measured / lagging - 1.0).min():+.1%} to {(measured / lagging - 1.0).max():+.1%}")
-assert np.all(np.abs(measured / sampled - 1.0) < 0.13)
+assert np.all(np.abs(measured / sampled - 1.0) < 0.16)
 assert np.all(np.abs(measured / lagging - 1.0) < 0.005)
 
 # %% [markdown]
@@ -288,7 +288,7 @@ def rates() -> Figure:
     figure = Drawing(figsize=(2.0 * WIDTH, 2.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     line = np.linspace(0.0, 6.2, 100)
-    left.plot(line, CRAZYFLIE.response * GAIN * line, color=MAGENTA, label=r"$c\,k\,\lambda$", zorder=1)
+    left.plot(line, TELLO.response * GAIN * line, color=MAGENTA, label=r"$c\,k\,\lambda$", zorder=1)
     for k, name in enumerate(GRAPHS):
         mine = slice(k * (N - 1), (k + 1) * (N - 1))
         left.plot(eigenvalue[mine], measured[mine], "o^sD"[k], color=CASES[k], fillstyle="none", label=name)
@@ -314,10 +314,12 @@ show(rates(), OUT / "consensus-rates")
 # A larger k makes all modes faster, until a decision overshoots: 1 − h k λ is negative from h k λ = 1 on, and below
 # −1 from **h k λ_max = 2** on. So the largest eigenvalue of L limits the step, and the smallest but one the rate;
 # the best that any k can do depends on λ_max/λ₂ alone. `check` refuses what lies beyond 2. It warns from 1.2 on,
-# because it leaves room for what its model does not have. Is that room needed?
+# because it leaves room for what its model does not have. Is that room needed? With the lag of section 3 a drone
+# bears a factor of its own, and h is 2 over that factor here, which `check` computes likewise.
 
 # %%
 largest = float(spectrum["ring"][0][-1])
+h = 2.0 / float(bearable_factors([TELLO], HZ)[0])
 print(f"the limit of the ring: k = 2/(h λ_max) = {2.0 / (h * largest):.2f} per decision")
 LOOP = (0.4, 0.8, 1.1, 1.5, 1.8, 2.1, 2.5)  # h k λ_max
 left_over, said, steps = [], [], {}
@@ -338,7 +340,7 @@ assert said == [{"stable"}] * 3 + [{"rings"}] * 2 + [{"hunts"}] * 2
 assert max(left_over[:3]) < 1e-4  # they meet
 assert left_over[3] < 0.01  # they still do, but take long
 assert min(left_over[5:]) > 0.03  # they never do
-assert left_over[:6] == sorted(left_over[:6])
+assert left_over[:5] == sorted(left_over[:5])
 
 # %% [markdown]
 # Beyond the limit they do not fly away, as the linear model says they would: speed limits turn the growth into a

@@ -15,7 +15,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.authoring import layouts
 from experiments.authoring.layouts import Layout, LayoutError
 from experiments.catalogue import index
-from experiments.check.ideal_run import closed_shares
+from experiments.check.ideal_run import bearable_factors
 from experiments.file import catalogue as entries
 from experiments.file.problems import refusal
 
@@ -205,6 +205,6 @@ def _taken(position: Array, made: Layout, kind: Kind, highest: float, *, by_offs
         )
         stiffest = float(np.sqrt(np.vdot(way, way)))
         way = way / stiffest
-    gain = min(highest, TAKEN / (float(closed_shares([kind], 10.0)[0]) * stiffest))
+    gain = min(highest, 0.5 * TAKEN * float(bearable_factors([kind], 10.0)[0]) / stiffest)
     digits = 1 - math.floor(math.log10(gain))
     return round(math.floor(gain * 10.0**digits) / 10.0**digits, max(digits, 0))

@@ -20,7 +20,7 @@ from agents.formation.rigidity import Redundancy, Rigidity
 from agents.plugins.laws import Law
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
-from experiments.check.ideal_run import Prediction, closed_shares
+from experiments.check.ideal_run import Prediction, bearable_factors, closed_shares
 from experiments.check.realisation import (
     Shape,
     Solids,
@@ -256,7 +256,11 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
             spare = formation_redundancy(shape.position, here, silent)
         share = closed_shares(assignment.kinds, hz)
         within = experiment.duration_s
-        loop = modes(assignment.law, here, shape.position, share, hz, anchors=assignment.anchors, within_s=within)
+        bearable = bearable_factors(assignment.kinds, hz)
+        loop = modes(
+            assignment.law, here, shape.position, share, hz,
+            bearable=bearable, anchors=assignment.anchors, within_s=within,
+        )  # fmt: skip
     return Analysis(
         plan=plan,
         assignment=assignment,

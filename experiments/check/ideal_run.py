@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Final, NamedTuple
 
 import msgspec
@@ -23,10 +24,13 @@ from experiments.definition.experiment import Experiment, World
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
+from twins.models.quadrotor import RESPONSES, Response, linear_step
 
 FAR: Final = 1e6  # [m] walls that no robot meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
 WORK: Final = 6e6  # robot ticks, with that added, that are flown: 290 s of seven robots, 50 s of a thousand
+STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
+ROUNDED: Final = 1e-9  # of eigenvalues
 REPETITIONS: Final = 5  # flights with noise, each with another seed
 
 
@@ -48,6 +52,37 @@ class Prediction:
 def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
     """h (N,): the share of a position error that each robot closes between two decisions."""
     return 1.0 - np.exp(-np.array([kind.response for kind in kinds]) / hz)
+
+
+def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
+    """λ (N,): the largest factor with which goals g = p − λ p, decided at `hz`, leave a robot's loop stable.
+
+    On wheels a robot closes its share h of the error, and 2/h is where it hunts; a drone overshoots its goal, because
+    it must tilt first, and bears less.
+    """
+    factor = 2.0 / closed_shares(kinds, hz)
+    drones = {kind.name for kind in kinds} & RESPONSES.keys()
+    for name in drones:
+        factor[[kind.name == name for kind in kinds]] = _bearable_factor(RESPONSES[name], hz)
+    return factor
+
+
+@cache
+def _bearable_factor(response: Response, hz: float) -> float:
+    steps = max(round(STEPS_HZ / hz), 1)
+    period = np.linalg.matrix_power(linear_step(response, 0, 1.0 / (hz * steps)), steps)
+
+    def stable(factor: float) -> bool:
+        loop = period[:3, :3] + np.outer(period[:3, 3], [1.0 - factor, 0.0, 0.0])
+        return bool(np.abs(np.linalg.eigvals(loop)).max() <= 1.0 + ROUNDED)
+
+    low, high = 0.0, 1.0
+    while stable(high):
+        low, high = high, 2.0 * high
+    while high - low > ROUNDED * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
 
 
 def has_noise(experiment: Experiment) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.arrays import Array, Index, norm
 from agents.formation.anchors import Anchors
@@ -23,8 +24,10 @@ EVEN: Final = 1e-9  # of the fastest: a loop that is symmetric but for this has 
 class Modes:
     """The sampled loop near its target."""
 
-    gain: float  # largest real part of the eigenvalues of H M, what a decision takes from a mode; 2 is where it hunts
-    radius: float  # largest |1 − λ|: above 1 something grows
+    # largest real part of the eigenvalues of H M, what a decision takes from a mode, with the h of robots that bear as
+    # much as those of `bearable`: 2 is where it hunts
+    gain: float
+    radius: float  # largest |1 − λ| of modes whose sign stays: above 1 something grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does
     # modes that decay more slowly than was asked for, or not at all: in that time nothing brings them back
     free: int = 0
@@ -37,6 +40,7 @@ def modes(
     closed: Array,
     hz: float,
     *,
+    bearable: Array | None = None,
     anchors: Anchors | None = None,
     within_s: float = math.inf,
 ) -> Modes:
@@ -50,6 +54,8 @@ def modes(
         law: Its offset is differentiated numerically.
         position: (N, 3) where the formation is met [m].
         closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
+        bearable: (N,) largest factor between the error of a robot and what it is asked for with which it settles when
+            it is alone; None: 2/h_i.
         within_s: Modes with a longer time constant than this are free [s].
     """
     anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
@@ -63,21 +69,28 @@ def modes(
     taken = root[:, None] * slope * root[None, :]
     offset = law.offset(position, position[links.sender], links)
     offset = offset if anchors is None else offset + anchors.offset(position)
+    factor = 2.0 / closed if bearable is None else bearable
+    hardest = np.sqrt(np.repeat(2.0 / factor[receivers], 2))
+    gain = _eigenvalues(hardest[:, None] * slope * hardest[None, :]).real.max(initial=0.0)
     turned = np.stack([-offset[receivers, 1], offset[receivers, 0]], axis=1).ravel()
     expected = np.stack([0.0 * turned, 0.0 * turned, -root * turned], axis=1)
     taken = _remove_motions(taken, _rigid_motions(position, receivers, len(position)) / root[:, None], expected)
-    scale = float(np.abs(taken).max(initial=0.0))
-    if np.abs(taken - taken.T).max(initial=0.0) <= EVEN * scale:
-        values = np.linalg.eigvalsh(0.5 * (taken + taken.T)).astype(complex)
-    else:
-        values = np.linalg.eigvals(taken).astype(complex)
+    values = _eigenvalues(taken)
     left = np.abs(1.0 - values)
     with np.errstate(divide="ignore"):
         lasts = -1.0 / (hz * np.log(left[left < 1.0]))
     moves = lasts < lasts.min(initial=math.inf) / STANDING
     free = len(left) - int((lasts <= within_s).sum()) if math.isfinite(within_s) else 0
     slowest = lasts[moves].max(initial=0.0) or math.inf
-    return Modes(float(values.real.max(initial=0.0)), float(left.max(initial=0.0)), float(slowest), free)
+    return Modes(float(gain), float(left[values.real < 1.0].max(initial=0.0)), float(slowest), free)
+
+
+def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
+    """Eigenvalues; real ones of a matrix that is symmetric but for `EVEN`."""
+    scale = float(np.abs(matrix).max(initial=0.0))
+    if np.abs(matrix - matrix.T).max(initial=0.0) <= EVEN * scale:
+        return np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).astype(complex)
+    return np.linalg.eigvals(matrix).astype(complex)
 
 
 def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, receivers: Index) -> Array:

@@ -75,6 +75,8 @@ DATES = {
     "experiments/report/report.py",
     "experiments/run.py",
     "experiments/sweep/page.py",
+    "experiments/view/acting.py",
+    "experiments/view/gate.py",
     "experiments/view/live.py",
 }
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Annotated, ClassVar, Final
+from typing import ClassVar, Final
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask, span
 from agents.body.interface import BodyError
@@ -20,19 +18,12 @@ from twins.models.quadrotor import RESPONSES, Quadrotor
 
 
 class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Parameters of the point-mass engine."""
-
-    leaning: Annotated[
-        bool,
-        Meta(
-            description="quadrotors must tilt before they accelerate: more accurate, and formation gains must be lower"
-        ),
-    ] = False
+    """The point-mass engine has no parameters."""
 
     contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
-        return PointMassEngine(stage, partial(Quadrotor, leaning=True) if self.leaning else Quadrotor)
+        return PointMassEngine(stage)
 
 
 TWINLESS: Final = (  # remedy for a kind of which `has_model` is false

@@ -81,7 +81,7 @@ def test_a_row_knows_its_kind_its_pose_and_the_lower_of_two_limits():
     assert own.takes == ("twist", "velocity", "position")
     assert own.by_twist.tolist() == [True, False, False]
     assert own.by_position.tolist() == [False, False, True]
-    assert own.lag.tolist() == [0.1, 1 / 3, 1 / 3.5]
+    assert own.lag.tolist() == [0.1, 1 / 3, 0.4]
     np.testing.assert_array_equal(own.velocity, [[0.1, 0, 0], [0, 0, 0], [0, 0.2, 0]])
     np.testing.assert_array_equal(own.yaw, [1, 2, 3])
     assert len(near) == 0

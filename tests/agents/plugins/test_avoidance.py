@@ -139,7 +139,7 @@ def test_an_avoidance_obeys_the_limits_of_speed_and_arena():
     assert verdict.avoided.all()
     assert verdict.changed.all()
     outside = judged((CRAZYFLIE, TELLO), [[1.9, 0, 1, 0], [0] * 4], answer[:2], [[1.9, 0, 1], [1.96, 0, 1]])
-    np.testing.assert_allclose(outside.setpoint[:, 0], [1.95, -0.01])  # 1 cm beyond the margin, at a response of 1/s
+    np.testing.assert_allclose(outside.setpoint[:, 0], [1.93, -0.01])  # 1 cm beyond the margin, at a response of 1/s
 
 
 def test_what_is_no_number_is_not_taken_and_who_is_blind_is_not_moved():

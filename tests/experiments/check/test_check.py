@@ -41,13 +41,13 @@ def test_numbers_of_the_reference():
     assert (found.rank, found.rank_needed) == (11, 11)
     assert (found.rank_space, found.rank_space_needed) == (12, 15)
     assert found.residual_mm == pytest.approx(0.0, abs=1e-3)
-    assert found.loop_gain == pytest.approx(0.61, abs=0.02)
+    assert found.loop_gain == pytest.approx(0.96, abs=0.02)
     assert found.slowest_mode_s is not None
     assert 5.0 < found.slowest_mode_s < 40.0
     assert found.speed_needed == 0.15
     assert found.speed_available == pytest.approx(0.0952, abs=1e-4)
     assert found.acquired_s is not None
-    assert 12.0 <= found.acquired_s <= 14.0  # runs with noise: 13.1 s in the mean of 20 seeds
+    assert 13.0 <= found.acquired_s <= 16.0
     assert found.end["TB01"] == pytest.approx((0.15, 0.8, 0.0), abs=REACHED)
     assert found.end_inside
     assert 15.0 < found.messages_hz < 45.0  # 7 robots; published: 5.07 Hz for each follower
@@ -100,14 +100,14 @@ def test_a_hover_above_the_limit_names_the_limit():
 @pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize(
     ("gain", "code"),
-    [(5.0, None), (8.0, "rings"), (10.0, "hunts")],  # in a run in virtual time, 8 settles, 10 hunts
+    [(5.0, None), (8.0, "rings"), (12.0, "hunts")],  # of links without drones
 )
 def test_gains(gain, code):
     found = bad(PARK, f"formation.gain={gain}")
     assert found.keys() & {"rings", "hunts"} == ({code} if code else set())
     if code:
         assert found[code][0] == ("error" if code == "hunts" else "warning")
-        assert "below 5.9" in found[code][2]
+        assert "below 6.8" in found[code][2]
 
 
 class Steep(msgspec.Struct, frozen=True):
@@ -232,9 +232,9 @@ def test_distances_that_contradict_one_another_without_a_triangle():
 
 @pytest.mark.usefixtures("unflown")
 def test_only_the_case_at_fault_is_named():
-    found = bad(PARK, "cases.event.formation.gain=10")
+    found = bad(PARK, "cases.event.formation.gain=12")
     assert found["hunts"][1].startswith("in case 'event': the formation hunts")
-    assert found["hunts"][3] == "--set cases.event.formation.gain=10"
+    assert found["hunts"][3] == "--set cases.event.formation.gain=12"
 
 
 def test_only_the_cases_of_a_run_are_checked():
@@ -264,7 +264,7 @@ def test_the_table(capsys):
     assert "! KH01 follows at 0.095 m/s" in said
     assert "periodic 350.0 per second, event" in said
     assert said.endswith("no errors, 1 warning\n")
-    assert commands.check(PARK, settings=["formation.gain=10"], as_json=False) == 1
+    assert commands.check(PARK, settings=["formation.gain=12"], as_json=False) == 1
     assert "✗ the formation hunts" in capsys.readouterr().out
 
 

@@ -111,9 +111,9 @@ def test_hover_jitter_that_a_soft_formation_does_not_stand_is_told_as_it_is_in_r
     assert "acquired after 0.0 s without noise" in found.message
     assert "outside the tolerance of 50 mm later, in 5 of 5 flights (seeds 1 to 5)" in found.message
     assert late(soft, [101, 102, 103, 104]) == 4
-    stiff = flat_strip(1.0)  # the remedy
-    assert "soft" not in {each.code for each in check(of(stiff))}
-    assert late(stiff, [101, 102, 103, 104]) <= 1
+    calm = flat_strip(0.3, jitter=0.002)
+    assert "soft" not in {each.code for each in check(of(calm))}
+    assert late(calm, [101, 102, 103, 104]) == 0
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
 
 def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
     monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
-    codes = {each.code for each in check(of(document.read(PARK).cases()["event"]))}
+    codes = {each.code for each in check(of(document.read("triangle").cases()["event"]))}
     assert "acquired" in codes
 
 
@@ -275,7 +275,7 @@ def anchored(**changed) -> Experiment:
 
 def test_anchors_without_links_are_checked():
     claims = {each.code: each.message for each in check(of(anchored()))}
-    assert "CF01 is 0 mm off at the end" in claims["anchored"]
+    assert "CF01 is 8 mm off at the end" in claims["anchored"]
     assert "the anchors can be met" in claims["realisable"]
     assert figures(anchored()).end_error_mm is None
     late = {each.code: each for each in check(of(anchored(formation=Formation(anchors={"CF01": 1.0}, gain=1e-4))))}

@@ -1,5 +1,6 @@
 """Stiffest and slowest mode of the sampled loop."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -49,11 +50,11 @@ def by_hand(law, net, position, share, anchors=None):
 
 
 def test_stiffest_and_slowest_mode_of_the_reference():
-    reference = Plan(document.read("robotic-park").experiment).links
+    links, gain = Plan(document.read("robotic-park").experiment).links, 3.0
+    reference = msgspec.structs.replace(links, gain=np.full(len(links), gain))
     shape = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz
     found = modes(Distance(), reference, shape.position, np.full(7, 1.0 / hz), hz)
-    gain = 3.0
     assert found.slowest_s * gain == pytest.approx(108.0, abs=0.5)
     assert 2.0 / (found.gain * hz / gain) == pytest.approx(1.05, abs=0.005)
     assert found.radius < 1.0

@@ -8,7 +8,7 @@ import pytest
 from agents.body.kinds import CRAZYFLIE, TELLO
 from tests.twins.runge_kutta import runge_kutta
 from twins.models.onboard_flight import CLIMB, TOUCHDOWN
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.models.quadrotor import RESPONSES, Quadrotor, linear_step
 
 
 def flying(kinds=(CRAZYFLIE,), height=0.8, dt=0.01, yaw=0.0):
@@ -30,48 +30,90 @@ def fly(quadrotor, setpoint, seconds, dt=0.01):
     return np.array(path)
 
 
-def exact(target, kp, kv, limit, times):
-    """Fourth-order Runge-Kutta solution of v' = kv (clip(kp (target − p)) − v) from rest at 0."""
+def exact(response, axis, target, times):
+    """Fourth-order Runge-Kutta solution of a' = k_t (k_v (clip(k_p (target − p)) − v) − a) from rest at 0."""
+    gain, rate, limit, tilt = (getattr(response, name)[axis] for name in ("position", "velocity", "speed", "tilt"))
 
     def slope(y):
-        return np.array([y[1], kv * (np.clip(kp * (target - y[0]), -limit, limit) - y[1])])
+        wanted = rate * (np.clip(gain * (target - y[0]), -limit, limit) - y[1])
+        return np.array([y[1], y[2], tilt * (wanted - y[2])] if math.isfinite(tilt) else [y[1], wanted, 0.0])
 
-    y, found, h = np.zeros(2), [], times[1] - times[0]
+    y, found, h = np.zeros(3), [], times[1] - times[0]
     for _ in times[1:]:
         found.append(y[0])
         y = runge_kutta(slope, y, h)
     return np.array([*found, y[0]])
 
 
-def test_a_small_step_is_the_closed_form_of_a_damped_oscillator():
-    dt, step = 0.001, 0.2
-    path = fly(flying(dt=dt), [[step, 0.0, 0.8 + step, 0.0]], 4.0, dt)[:, 0]
-    t = dt * np.arange(1, len(path) + 1)
-    for axis, (kp, kv) in ((0, (2.0, 3.5)), (2, (2.5, 4.0))):
-        omega = math.sqrt(kp * kv)
-        zeta = kv / (2.0 * omega)
-        damped = omega * math.sqrt(1.0 - zeta**2)
-        envelope = np.exp(-zeta * omega * t) * (np.cos(damped * t) + zeta * omega / damped * np.sin(damped * t))
-        start = 0.8 if axis == 2 else 0.0
-        np.testing.assert_allclose(path[:, axis], start + step * (1.0 - envelope), atol=5e-4)
+@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("target", [0.05, 0.3, 1.0, 3.0])
+def test_steps_solve_the_stated_law(axis, target):
+    dt, setpoint = 0.001, [0.0, 0.0, 0.8, 0.0]
+    setpoint[axis] += target
+    path = fly(flying(dt=dt), [setpoint], 5.0, dt)[:, 0, axis] - (0.8 if axis == 2 else 0.0)
+    truth = exact(RESPONSES["crazyflie"], axis, target, dt * np.arange(5001))
+    np.testing.assert_allclose(path, truth[1:], atol=3e-3 * target)
+    assert path[-1] == pytest.approx(target, rel=0.01)
 
 
-@pytest.mark.parametrize("target", [0.3, 1.0, 3.0])
-def test_a_step_of_any_size_is_the_solution_of_its_law(target):
-    response = RESPONSES["crazyflie"]
-    path = fly(flying(), [[target, 0.0, 0.8, 0.0]], 5.0)[:, 0, 0]
-    times = 0.001 * np.arange(5001)
-    truth = exact(target, response.position[0], response.velocity[0], response.speed[0], times)
-    np.testing.assert_allclose(path, truth[10::10], atol=0.012)  # steps of 10 ms at 1 m/s
-    assert path[-1] == pytest.approx(target, abs=0.01)
+@pytest.mark.parametrize(
+    ("axis", "step", "rise_ms"), [(0, 0.3, 487), (0, 1.0, 730), (2, 0.3, 566), (2, 1.0, 733), (3, 1.0, 284)]
+)
+def test_steps_rise_like_the_firmware(axis, step, rise_ms):
+    """Rise times are those of the maker's firmware, compiled and run on a rigid body of 29 g."""
+    dt, setpoint, quadrotor = 0.001, np.array([0.0, 0.0, 0.8, 0.0]), flying(dt=0.001)
+    setpoint[axis] += step
+    path = []
+    for _ in range(3000):
+        quadrotor.command(setpoint[None])
+        quadrotor.advance()
+        path.append([*(quadrotor.position[0] - [0.0, 0.0, 0.8]), quadrotor.yaw[0]][axis] / step)
+    path = np.array(path)
+    assert dt * ((path > 0.9).argmax() - (path > 0.1).argmax()) == pytest.approx(1e-3 * rise_ms, rel=0.10)
 
 
-def test_it_is_never_faster_than_its_limit():
+@pytest.mark.parametrize("axis", [0, 2])
+def test_linear_step_is_the_model(axis):
+    quadrotor, dt = flying(dt=0.01), 0.01
+    state, path = np.array([0.0, 0.0, 0.0, 0.1]), []
+    setpoint = np.array([[0.0, 0.0, 0.8, 0.0]])
+    setpoint[0, axis] += 0.1
+    for _ in range(200):
+        quadrotor.command(setpoint)
+        quadrotor.advance()
+        state = linear_step(RESPONSES["crazyflie"], axis, dt) @ state
+        path.append((quadrotor.position[0, axis] - (0.8 if axis == 2 else 0.0), state[0]))
+    np.testing.assert_allclose(*np.transpose(path), atol=1e-12)
+
+
+def test_no_axis_exceeds_its_speed():
     quadrotor = flying()
     path = fly(quadrotor, [[50.0, -50.0, 30.0, 0.0]], 3.0)
-    speed = np.abs(np.diff(path, axis=0)) / 0.01
-    assert speed.max() <= 1.0 + 1e-9
-    assert speed[-1].min() > 0.99
+    speed = np.abs(np.diff(path, axis=0))[:, 0] / 0.01
+    limit = RESPONSES["crazyflie"].speed
+    # a third state may pass a limit by its overshoot
+    assert (speed.max(axis=0) <= np.multiply(1.2, limit)).all()
+    np.testing.assert_allclose(speed[-1], limit, rtol=0.01)
+
+
+def test_yaw_turns_the_shorter_way():
+    quadrotor = flying(yaw=math.radians(178.0))
+    turned = []
+    for _ in range(300):
+        before = quadrotor.yaw[0]
+        fly(quadrotor, [[0.0, 0.0, 0.8, math.radians(-178.0)]], 0.01)
+        turned.append(quadrotor.yaw[0] - before)
+    assert sum(turned) == pytest.approx(math.radians(4.0), abs=1e-3)
+    assert min(turned) >= 0.0
+
+
+def test_yaw_keeps_the_largest_rate():
+    quadrotor, turned = flying(), []
+    for _ in range(100):
+        before = quadrotor.yaw[0]
+        fly(quadrotor, [[0.0, 0.0, 0.8, 3.0]], 0.01)
+        turned.append((quadrotor.yaw[0] - before) / 0.01)
+    assert max(turned) == pytest.approx(CRAZYFLIE.turn_rate)
 
 
 def test_a_velocity_robot_follows_velocities_with_its_lag():
@@ -108,7 +150,7 @@ def test_take_off_climbs_over_the_place_and_stays(kind):
     assert quadrotor.yaw[0] == pytest.approx(0.5)
     halfway = 0.8 / CLIMB  # by then the polynomial has ended; the body lags behind it
     assert 0.4 < path[round(halfway / 0.01) - 1, 2] < 0.8
-    assert path[:, 2].max() < 0.8 + 0.05
+    assert path[:, 2].max() < 0.8 * 1.08  # the firmware's overshoot is 7 to 11 %
 
 
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
@@ -123,7 +165,7 @@ def test_landing_ends_on_the_floor_with_motors_off(kind):
     aloft = path[path[:, 2] > 0.0, 2]
     assert np.diff(aloft).min() > -2.2 * CLIMB * 0.01  # it does not drop: the polynomial peaks at 35/16 of its mean
     touch = path[:, 2] < TOUCHDOWN
-    assert touch.argmax() * 0.01 > 0.8 / CLIMB
+    assert touch.argmax() * 0.01 > 0.95 * 0.8 / CLIMB
 
 
 def test_a_landing_that_is_ordered_again_every_half_second_takes_no_longer():
