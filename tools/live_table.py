@@ -52,7 +52,7 @@ class Row:
     phase: str
     rank: Rank = Rank.FINE
     error: float | None = None  # [m]
-    rate: float = 0.0  # [1/s] of transmitted poses
+    rate: float = 0.0  # [Hz] of transmitted poses
     late: int | None = None  # ticks that were skipped
     lost: int | None = None  # samples of neighbours
     cpu: float | None = None  # share of a core; of its process, if several robots share one
@@ -69,7 +69,7 @@ class _Counters:
 
     status: Status
     cpu: float | None = None
-    rate: float = 0.0  # [1/s] of transmitted poses
+    rate: float = 0.0  # [Hz] of transmitted poses
     grew: dict[str, float] = field(default_factory=dict)  # [s, UTC] last growth, by counter
 
 

@@ -61,7 +61,7 @@ class Guidance(msgspec.Struct, frozen=True):
 
     guided: tuple[str, ...]  # robots whose goals it computes
     goals: int  # sent
-    goals_hz: float  # [1/s]
+    goals_hz: float  # [Hz]
     goal_bytes: int  # payload
     goals_lost: int  # not received by their robots; those of the last instant may still have been on their way
     heard: int  # poses received
@@ -80,7 +80,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
 
     robot: str
     kind: str
-    f_hz: float  # [1/s] transmissions
+    f_hz: float  # [Hz] transmission rate f: poses transmitted in a second
     messages: int  # transmissions, by the sequence numbers
     bytes: int  # payload sent
     # [m·s] ∫ e dt, e = Σ|d − distance| over the links on which it receives (on which it sends, if none)
