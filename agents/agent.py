@@ -306,11 +306,12 @@ class Agent:
         life, neighbours, guidance = self.lifecycle, self.neighbours, self.guidance
         if life.all_running:
             active = cruising = running = self._every_row
-            landing, climbing = self._no_row, None
+            landing, climbing, unstarted = self._no_row, None, self._no_row
         else:
             running, landing, active = life.phase == RUNNING, life.phase == LANDING, life.active
             climbing = life.climbing
             cruising = running | (life.phase == AIRBORNE)
+            unstarted = active & np.isinf(life.start_at)
         rows = RowStatus(
             self._ordered,
             cruising,
@@ -319,6 +320,7 @@ class Agent:
             self.goal_computer.without_neighbours() if neighbours.incomplete else None,
             None if guidance is None else running & guidance.unguided(now.t),
             None if guidance is None else guidance.stamp,
+            unstarted,
             self.goal[:, 2],
             self._setpoint,
             self._not_finite,

@@ -58,6 +58,8 @@ SUNK: Final = 0.15  # [m] below its goal
 SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
 CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
+STALLS_S: Final = 4.0  # a climb without that much more height for this long does not follow; one of
+STALLS_VELOCITY_S: Final = 10.0  # a device that is told velocities, and may need a second order to take off
 SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
@@ -75,6 +77,7 @@ class RowStatus(msgspec.Struct, frozen=True):
     without_neighbours: Mask | None  # the law has no input; None: nowhere
     unguided: Mask | None  # running without guidance; None: no row is guided
     goal_stamp: Array | None  # decision time of the goals of guided rows [s], −inf for others; None: no row is guided
+    unstarted: Mask  # on their way up, or in the air, without a start order
     goal_height: Array  # [m]
     setpoint: Array  # (N, 4) of the tick before, NaN for rows that their bodies drive by themselves
     not_finite: Mask  # the last setpoint was not finite
@@ -82,23 +85,36 @@ class RowStatus(msgspec.Struct, frozen=True):
 
 
 class Ascent:
-    """Progress of N rows of these kinds that climb: straight up, as their bodies do by themselves."""
+    """Progress of N rows that climb: straight up, as their bodies do by themselves.
 
-    def __init__(self, kinds: Sequence[Kind]) -> None:
+    A row whose measured height does not follow flies by a wrong one, higher and higher: its markers lie on the floor.
+    """
+
+    def __init__(self, kinds: Sequence[Kind], hover: Array) -> None:
+        """Of rows of these kinds that climb to `hover` (N,) [m]."""
         self._climbing: Mask = np.zeros(len(kinds), dtype=bool)
         self._begin = np.full((len(kinds), 2), np.nan)
         self._free = RUSH_S * np.array([kind.speed for kind in kinds]) + np.array([kind.radius for kind in kinds])
         self.aside = np.zeros(len(kinds))  # (N,) distance from there, seen from above [m]
         self.carried: Mask = self._climbing  # (N,) rows that are carried aside
-        self.any_carried = False
+        self._hover = hover
+        self._patience = np.where([kind.takes == "velocity" for kind in kinds], STALLS_VELOCITY_S, STALLS_S)
+        self._highest, self._risen_at = np.zeros(len(kinds)), np.zeros(len(kinds))  # [m], [s]
+        self.stalled: Mask = self._climbing  # (N,) rows that are measured to stay low
+        self.amiss = False  # whether a row is carried aside or stays low
 
-    def update(self, climbing: Mask, position: Array) -> None:
-        """Look at rows that are `climbing` (N,), at `position` (N, 3) [m]."""
+    def update(self, t: float, climbing: Mask, flying: Mask, position: Array) -> None:
+        """Look at rows that are `climbing` and `flying` (N,) at `t` [s], at `position` (N, 3) [m]."""
         begins, self._climbing = climbing & ~self._climbing, climbing.copy()
         self._begin = np.where(begins[:, None], position[:, :2], self._begin)
         self.aside = norm(position[:, :2] - self._begin)
         self.carried = climbing & (self.aside > self._free)
-        self.any_carried = some(self.carried)
+        height = position[:, 2]
+        rises = begins | ~flying | ~(height <= self._highest + STEP)
+        self._highest = np.where(rises, height, self._highest)
+        self._risen_at = np.where(rises, t, self._risen_at)
+        self.stalled = climbing & (self._hover - height > SUNK) & (t - self._risen_at > self._patience)
+        self.amiss = some(self.carried) or some(self.stalled)
 
 
 class Descent:
@@ -144,7 +160,7 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
-        self._ascent = Ascent(assignment.kinds)
+        self._ascent = Ascent(assignment.kinds, assignment.hover)
         self._climbed: Mask | None = None
         self._none: Mask = ~self._every_row
         self._descent = Descent(len(self._flies), float(self._limits.high[2]))
@@ -168,8 +184,9 @@ class Detector:
         self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
         if rows.climbing is not self._climbed:  # while no row climbs it is None
             self._climbed = rows.climbing
-            self._ascent.update(self._none if rows.climbing is None else rows.climbing & self._flies, state.position)
-        if some(self._obedience.still) or some(self._obedience.strays) or self._ascent.any_carried:
+            climbing = self._none if rows.climbing is None else rows.climbing & self._flies
+            self._ascent.update(now.t, climbing, state.flying, state.position)
+        if some(self._obedience.still) or some(self._obedience.strays) or self._ascent.amiss:
             found.append(self._disobedient(self._obedience, self._ascent))
         if not now.where.all_valid:
             found.append(self._position_and_arena(now))
@@ -194,7 +211,7 @@ class Detector:
         if health.just_resumed(now.t):
             found.append(self._not_refreshed(now, rows))
         if health.troubled:
-            found.append(self._surroundings(now.t, health))
+            found.append(self._surroundings(now.t, health, rows))
         return found
 
     def _receivers(self, links: Mask) -> Mask:
@@ -286,7 +303,10 @@ class Detector:
                 return f"{ascent.aside[row]:.2f} m aside while it climbs"
             return f"{obedience.strayed[row]:.2f} m lately"
 
-        yield Observation(Cause.STILL, obedience.still, lambda row: f"told {obedience.told[row]:.2f} m in vain")
+        def still(row: int) -> str:
+            return "it does not rise" if ascent.stalled[row] else f"told {obedience.told[row]:.2f} m in vain"
+
+        yield Observation(Cause.STILL, obedience.still | ascent.stalled, still)
         yield Observation(Cause.STRAYING, obedience.strays | ascent.carried, astray)
 
     def _separation_of_robots(self, now: Situation, limit: float) -> Iterator[Observation]:
@@ -347,13 +367,14 @@ class Detector:
 
         return Observation(cause, self._receivers(there), detail)
 
-    def _surroundings(self, t: float, health: ProcessHealth) -> Iterator[Observation]:
+    def _surroundings(self, t: float, health: ProcessHealth, rows: RowStatus) -> Iterator[Observation]:
         """Router, conductor and control loop."""
         if health.offline_since < np.inf:
             yield Observation(Cause.ROUTER, self._every_row, lambda _: f"for {t - health.offline_since:.1f} s")
         elif health.conductor_lost_since < np.inf:
             since = t - health.conductor_lost_since
             yield Observation(Cause.CONDUCTOR, self._every_row, lambda _: f"for {since:.1f} s")
+            yield Observation(Cause.UNSTARTED, rows.unstarted, lambda _: f"the conductor is gone for {since:.1f} s")
         if health.loop_failing:
             text = f"{health.missed_share:.0%} of the last second's"
             yield Observation(Cause.LATE, self._every_row, lambda _: text)

@@ -49,6 +49,7 @@ class Rule:
     place: bool = True  # a hold keeps the place where it began; else only setpoints stop
     landing: bool = False  # checked while a robot lands as well
     grounded: Outcome | None = None  # `then` of robots that do not fly, where different
+    grounded_s: float = 0.0  # by which their `then` comes later [s]
 
 
 class Cause(IntEnum):
@@ -93,11 +94,12 @@ class Cause(IntEnum):
     FOREIGN = Rule("a tool sends poses of a neighbour", Outcome.WARN, after_s=1.0)  # not late ones of a former process
     REFUSED = Rule("all poses of a neighbour are refused", Outcome.WARN)  # it counts as lost, too
     STANDSTILL = Rule("its process stood still", Outcome.HOLD)
-    # in the air a position that does not follow is a wrong one, by which the robot would fly away
-    STILL = Rule("it is told to move and does not", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded=Outcome.WARN)
+    # a position that does not follow is a wrong one, by which the robot would go away; on wheels it may only be stuck
+    STILL = Rule("it is told to move and does not", Outcome.WARN, then=Outcome.LAND, then_s=0.0, grounded_s=2.0)
     STRAYING = Rule("it moves and is not told to", Outcome.LAND)
     UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
     HOVERING = Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True)
+    UNSTARTED = Rule("nobody will start it", Outcome.LAND)  # it would hover until its battery is empty
 
 
 _LOST: Final[Mapping[str, Outcome]] = {
@@ -119,6 +121,7 @@ def rules(limits: Limits) -> list[Rule]:
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
         Cause.ROUTER: {"after_s": limits.link_silence_s, "then_s": limits.offline_s},
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},
+        Cause.UNSTARTED: {"after_s": limits.offline_s},
         Cause.LANDING: {"after_s": limits.landing_s},
     }
     return [replace(cause.rule, **chosen.get(cause, {})) for cause in Cause]  # type: ignore[arg-type]
@@ -177,6 +180,7 @@ class Hazards:
         for row, rule in enumerate(table):
             if rule.grounded is not None:
                 then[row] = np.where(flies, then[row], rule.grounded)
+            self._then_s[row] += np.where(flies, 0.0, rule.grounded_s)
         self._then = then
         self._repeats, self._place, self._landing = mask("repeats"), mask("place"), mask("landing")
         self._since, self._begun, self._last = np.full((3, *shape), NEVER)

@@ -121,6 +121,26 @@ def test_a_drone_that_is_carried_aside_while_it_climbs_lands():
     assert happened(swarm)["F"] == ["land: it moves and is not told to: 0.57 m aside while it climbs"]
 
 
+@pytest.mark.parametrize(("kind", "patience_s"), [("crazyflie", 4.0), ("tello", 10.0)])
+def test_a_climb_lands_if_its_measured_height_stays(kind, patience_s):
+    robots = {"F": Robot(kind=kind, start=[0.1, 0.2], hover=0.5)}
+    swarm = Swarm(pair(robots=robots, formation=Formation())).run(0.1)
+    assert swarm.agent("F").lifecycle.takeoff(0) == ""
+    swarm.run(0.1)
+    noise = np.random.default_rng(1)
+
+    def fallen_markers(t, state):
+        state.position[0] = [0.1, 0.2, 0.02] + 5e-4 * noise.standard_normal(3)
+        state.velocity[0] = 0.0
+        return state
+
+    swarm.groups[0].spoil = fallen_markers
+    swarm.run(patience_s - 0.2)
+    assert not happened(swarm)["F"]
+    swarm.run(0.3)
+    assert happened(swarm)["F"] == ["land: it is told to move and does not: it does not rise"]
+
+
 @pytest.mark.parametrize("ahead_s", [0.3, 100.0, np.inf])
 def test_a_silent_body_whose_clock_is_ahead_lands(ahead_s):
     swarm = drone().running().run(0.3)
@@ -267,6 +287,18 @@ def test_without_a_conductor(choice, phase):
     swarm.run(0.2)
     assert swarm.phase("F") == phase
     assert "the conductor is gone: for 2.0 s" in happened(swarm)["F"][0]
+
+
+def test_a_drone_that_nobody_starts_lands():
+    swarm = drone(safety=Safety(offline_s=3.0)).run(0.1)
+    assert swarm.agent("F").lifecycle.takeoff(0) == ""
+    swarm.run(5.0)
+    assert swarm.phase("F") == AIRBORNE
+    swarm.agent("F").health.conductor_lost_since = swarm.t
+    swarm.run(2.9)
+    assert swarm.phase("F") == AIRBORNE
+    swarm.run(0.2)
+    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (LANDING, ["nobody will start it"])
 
 
 def test_a_control_loop_that_hardly_runs_holds_and_then_lands():

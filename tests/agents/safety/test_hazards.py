@@ -71,6 +71,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.STRAYING: [(0, "LAND")],
     Cause.UNREACHABLE: [(50, "WARN")],
     Cause.HOVERING: [(200, "WARN")],
+    Cause.UNSTARTED: [(1000, "LAND")],
 }
 
 
@@ -102,9 +103,9 @@ def test_a_ground_robot_without_a_position_stands_for_ever():
 
 def test_a_robot_that_does_not_move_lands_unless_its_world_may_be_paused():
     assert Bench().see(20.0, Cause.STILL).changes() == [(0, "LAND")]
-    assert Bench().see(20.0, Cause.STILL).changes(row=1) == [(0, "WARN")]
+    assert Bench().see(20.0, Cause.STILL).changes(row=1) == [(0, "WARN"), (200, "LAND")]
     in_world = Bench(hold_s=np.array([10.0, 10.0])).see(20.0, Cause.STILL)
-    assert in_world.changes() == [(0, "WARN")]
+    assert [in_world.changes(row) for row in (0, 1)] == [[(0, "WARN")]] * 2
 
 
 def test_choices_of_an_experiment():

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.decision.lifecycle import DONE
 from agents.safety.obedience import Obedience
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.agents.swarm import Swarm
 from twins.models.differential import Differential
@@ -135,3 +137,20 @@ def test_a_run_reports_wheels_that_stand_and_halts_wheels_that_run_away():
             swarm = Swarm(pair()).running().run(8.0)
         texts = [each.text for each in swarm.agent("A").hazards.incidents if each.row == 0]
         assert any(text.startswith(expected) for text in texts), texts
+
+
+def test_wheels_led_by_a_dead_position_halt():
+    robots = {"A": Robot(kind="khepera4", start=[-0.4, 0.0])}
+    swarm = Swarm(pair(robots=robots, formation=Formation())).running().run(1.0)
+    assert swarm.agent("A").go(0, (1.2, 0.0), swarm.t) == ""
+    noise, place = np.random.default_rng(1), swarm.row("A", "position").copy()
+
+    def dead(t, state):
+        state.position[0, :2] = place[:2] + 3e-4 * noise.standard_normal(2)
+        state.velocity[0] = 0.0
+        return state
+
+    swarm.groups[0].spoil = dead
+    swarm.run(20.0)
+    assert swarm.phase("A") == DONE
+    assert swarm.row("A", "truth")[0] < 1.0  # it stands in the room, not 3 m beyond its wall
