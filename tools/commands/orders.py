@@ -321,7 +321,7 @@ def _stop_all(stops: Sequence[EmergencyStop], *, dry_run: bool, as_json: bool) -
     failures = [stop.failure for stop in stops if stop.failure is not None]
     if len(failures) == len(stops):
         raise failures[-1]
-    where = "; ".join(f"in the realm '{stop.realm}' {stop.where}" for stop in stops if stop.failure is None)
+    where = "; ".join(f"in the realm '{stop.realm}', {stop.where}" for stop in stops if stop.failure is None)
     print(
         f"{'no robot' if dry_run else 'NOTHING WAS STOPPED: no robot'} is seen {where}. Name the router of the run: "
         "--connect, which `./zenpark run` prints when it starts, or --connect @FOLDER/network.txt of its folder",
