@@ -11,6 +11,7 @@ watchdog`), and needs Python 3.10 and the rclpy of ROS 2 Humble or later there, 
 import argparse
 import importlib
 import os
+import signal
 import sys
 import time
 from typing import Any
@@ -120,17 +121,22 @@ def main(words: "list[str]") -> int:
     )
     rclpy = importlib.import_module("rclpy")
     asked = parser.parse_args(importlib.import_module("rclpy.utilities").remove_ros_args(args=["watchdog", *words])[1:])
-    rclpy.init(args=["watchdog", *words])
-    kind = wait_for_type(rclpy, asked.topic) if asked.type == "auto" else TYPES[asked.type]
-    node = Node(rclpy, asked.topic, kind, asked.silence)
-    told = (KeyboardInterrupt, importlib.import_module("rclpy.executors").ExternalShutdownException)
+    # the handlers of rclpy would end the context at once: no zero could be sent any more
+    own = importlib.import_module("rclpy.signals").SignalHandlerOptions.NO
+    rclpy.init(args=["watchdog", *words], signal_handler_options=own)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    node = None
     try:
+        kind = wait_for_type(rclpy, asked.topic) if asked.type == "auto" else TYPES[asked.type]
+        node = Node(rclpy, asked.topic, kind, asked.silence)
         rclpy.spin(node.node)
-    except told:
+    except KeyboardInterrupt:
         return 0
     finally:
         if rclpy.ok():
-            node.stop()
+            if node is not None:
+                node.stop()
             rclpy.shutdown()
     return 0
 

@@ -145,11 +145,11 @@ def test_tests_run_in_two_parts_and_none_is_tried_again(bootstrap, started, caps
     assert re.search(rf"{titles[1]}: failed in \d+ s\n$", said)
 
 
-def test_all_builds_a_zenohd_before_the_tests_of_processes_and_spoils_a_million_inputs(bootstrap, started):
+def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
     bootstrap.test(["--all"])
     modules = [module[0] for module in started[3:]]
-    assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "pytest"]
-    assert [module[2] for module in (started[3], started[6])] == ["not system", "system"]
+    assert modules == ["pytest", "tests.fuzz", "tests.system.zenohd", "tests.system.rclpy_wheels", "pytest"]
+    assert [module[2] for module in (started[3], started[7])] == ["not system", "system"]
 
 
 def test_arguments_go_to_pytest_in_place_of_the_parts(bootstrap, started):

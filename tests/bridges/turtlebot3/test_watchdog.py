@@ -155,7 +155,7 @@ class _Node:
     def create_subscription(self, *a): pass
     def create_timer(self, *a): pass
     def get_logger(self): return type("Log", (), {"info": staticmethod(lambda t: print(t, sys.argv, flush=True))})
-def init(args=None): pass
+def init(args=None, signal_handler_options=None): pass
 def create_node(name): return _Node(name)
 def spin_once(node, timeout_sec=0): pass
 def spin(node): time.sleep(600)
@@ -174,7 +174,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         folder.mkdir(parents=True)
     (site / "rclpy" / "__init__.py").write_text(ROS)
     (site / "rclpy" / "utilities.py").write_text("def remove_ros_args(args): return args[:args.index('--ros-args')]\n")
-    (site / "rclpy" / "executors.py").write_text("class ExternalShutdownException(Exception): pass\n")
+    (site / "rclpy" / "signals.py").write_text("class SignalHandlerOptions: NO = None\n")
     (site / "geometry_msgs" / "__init__.py").touch()
     (site / "geometry_msgs" / "msg.py").write_text("class Twist: pass\nclass TwistStamped: pass\n")
     (site / "setup.sh").write_text(f"export PYTHONPATH={site}\n")

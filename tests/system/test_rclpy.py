@@ -1,0 +1,93 @@
+"""A real ROS 2, rclpy with Fast DDS: types and CDR as it has them, and the watchdog of a TurtleBot3 under it.
+
+`tests/system/rclpy_wheels.py` installs it; where there is none, these tests are skipped and say why.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.network import messages
+from agents.protocols import ros2
+from bridges.ros2 import diagnostic, scan, transform
+from tests.fuzz.targets_ros import ros_messages
+from tests.system.rclpy_wheels import APART, LOOPBACK, PYTHON, missing
+
+WHY = missing()
+pytestmark = [pytest.mark.system, pytest.mark.skipif(bool(WHY), reason=WHY)]
+SIDE = Path(__file__).with_name("rclpy_side.py")
+KINDS = {value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value}
+PADDED = {ros2.ODOMETRY, ros2.DIAGNOSTIC_ARRAY}  # Fast CDR leaves padding undefined
+WITHOUT_WHEEL = {ros2.TF_MESSAGE}  # a list of TransformStamped; its hash is tested against the published one
+
+
+def ask(folder: Path, *words: str, given: object = None) -> Any:
+    """The answer of `rclpy_side.py`, in a network of its own."""
+    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "30", "ROS_LOG_DIR": str(folder)}
+    own |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # shared memory stays behind when a process is killed
+    path = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "RMW_", "PYTHON"))}
+    done = subprocess.run(
+        [*APART, *LOOPBACK, str(PYTHON), str(SIDE), *words],
+        input=json.dumps(given), capture_output=True, text=True, timeout=110, env={**path, **own}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def payloads() -> dict[str, bytes]:
+    """A message of each type that this project uses, as its own CDR."""
+    types = ros2.types("kilted")
+    state = messages.State("tb3", 1, 1.7e9, "running", (1.0, 2.0, 0.5), None, 0.3, None, None, 0.0)
+    place = transform(types, state, (1.0, 2.0, 0.5), "tb3")
+    bearing = np.radians(np.arange(360.0)).round(6).tolist()
+    distance = [None, *np.linspace(0.12, 3.5, 359).round(6).tolist()]
+    sweep = messages.Ranges("tb3", 1.7e9, bearing, [0.0] * 360, distance)
+    status = diagnostic(types, "tb3", 1, "running; LOCKED", {"battery": "0.750", "missing": ""})
+    made = {
+        ros2.TRANSFORM_STAMPED: place,
+        ros2.TF_MESSAGE: types.make(ros2.TF_MESSAGE, transforms=[place, place]),
+        ros2.LASER_SCAN: scan(types, sweep, "tb3"),
+        ros2.DIAGNOSTIC_ARRAY: types.make(ros2.DIAGNOSTIC_ARRAY, header=types.header(1.7e9, ""), status=[status] * 2),
+    }
+    return ros_messages() | {kind: types.encode(message, kind) for kind, message in made.items()}
+
+
+def test_types_and_cdr_are_those_of_rclpy(tmp_path: Path) -> None:
+    ours, types = payloads(), ros2.types("kilted")
+    assert set(ours) == KINDS
+    theirs = ask(tmp_path, "types", given={kind: payload.hex() for kind, payload in ours.items()})
+    assert {kind for kind, answer in theirs.items() if answer is None} == WITHOUT_WHEEL
+    answers = {kind: answer for kind, answer in theirs.items() if answer is not None}
+    for distro in ("jazzy", "kilted"):
+        assert {kind: code for kind, (code, _) in answers.items()} == {
+            kind: ros2.types(distro).hash(kind) for kind in answers
+        }
+    for kind, (_, payload) in answers.items():
+        raw = bytes.fromhex(payload)
+        assert len(raw) == len(ours[kind])
+        assert types.encode(types.decode(raw, kind), kind) == ours[kind]
+        assert raw == ours[kind] or kind in PADDED
+
+
+@pytest.mark.parametrize("kind", [ros2.TWIST, ros2.TWIST_STAMPED])
+def test_watchdog_stops_robot_of_killed_commander(tmp_path: Path, kind: str) -> None:
+    printed = subprocess.run(
+        [sys.executable, "-m", "tools.guard", "hosts", "watchdog"], capture_output=True, check=True
+    )
+    watchdog = tmp_path / "watchdog.py"
+    watchdog.write_bytes(printed.stdout)
+    answer = ask(tmp_path, "drive", kind, str(watchdog))
+    speeds = answer["killed"]
+    last = len(speeds) - 1 - speeds[::-1].index(0.1)
+    assert speeds[: last + 1].count(0.1) >= 20
+    assert set(speeds[last + 1 :]) == {0.0}
+    assert answer["ended"] == 0
+    assert 0.0 in answer["told"], "a watchdog that is ended stops the robot first"
