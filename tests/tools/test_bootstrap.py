@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system import zenohd
+from tests.system import rclpy_wheels, zenohd
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -155,6 +155,19 @@ def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
 def test_arguments_go_to_pytest_in_place_of_the_parts(bootstrap, started):
     bootstrap.test(["--quick", "tests/agents", "-x"])
     assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
+
+
+def test_why_there_is_no_rclpy_is_said(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(rclpy_wheels, "CACHE", tmp_path)
+    monkeypatch.setattr(rclpy_wheels, "REASON", tmp_path / "reason.txt")
+    assert "`./zenpark test --all` installs one" in rclpy_wheels.missing()
+    for said, why in (
+        ("no index", f"no rclpy in {tmp_path}: no index"),
+        ("", "no unshare, to keep ROS off the network"),
+    ):
+        monkeypatch.setattr(rclpy_wheels, "_install", lambda said=said: said)
+        assert rclpy_wheels.install() == rclpy_wheels.missing() == why
 
 
 def test_why_there_is_no_zenohd_is_said_by_the_tests_that_are_skipped(monkeypatch, tmp_path):
