@@ -288,7 +288,7 @@ class Agent:
             if self.guidance is not None:
                 lacks |= self.guidance.rows_without_goal()
         failing = self._preflight.check(now, (lacks, self.missing_neighbours))
-        lost = self._preflight.lost(t, failing)
+        life.failing, lost = failing, self._preflight.lost(t, failing)
         ready = np.ones(len(lacks), dtype=bool)
         for row, reason in failing.items():
             ready[row] = life.phase[row] == READY and row not in lost

@@ -55,6 +55,7 @@ class Lifecycle:
         self.phase = np.full(rows, IDLE)
         self.start_at = np.full(rows, np.inf)
         self.reason, self._waits = [""] * rows, [""] * rows
+        self.failing: dict[int, str] = {}  # rows that fail a check on this tick, though they may be ready, and why
         self.moved = False  # whether a phase changed on the last tick, or by an order since the one before
         self._before = self.phase.tobytes()
         self._flies, self._hover, self._duration = flies, hover, duration
@@ -69,6 +70,8 @@ class Lifecycle:
             return ""  # an order may be repeated when its reply was lost
         if phase != READY:
             return f"cannot take off while {phase.word}" + (f": {self.reason[row]}" if self.reason[row] else "")
+        if row in self.failing:  # it is being lifted, say: a failure that does not last is over when asked again
+            return f"cannot take off now: {self.failing[row]}"
         self._climbing[row] = True
         self._due["takeoff"].append(row)
         return ""

@@ -12,10 +12,11 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, clamp, every, norm, some
-from agents.body.interface import BodyState
+from agents.body.interface import BodyState, Rays
 from agents.body.kinds import Kind
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import NeighbourStates
+from agents.decision.perception import SCAN_S
 from agents.safety.hazards import Cause, Observation
 from agents.safety.landing import LOW, SLOW, Landing
 from agents.safety.obedience import RUSH_S, Obedience
@@ -158,6 +159,8 @@ class Detector:
         self._all_fly = self._flies.tobytes()
         links, avoidance_only = assignment.links, assignment.avoidance_only
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
+        avoids = self._every_row if assignment.avoids is None else assignment.avoids
+        self._avoids = avoids & (assignment.avoidance is not None)
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
         self._ascent = Ascent(assignment.kinds, assignment.hover)
@@ -180,6 +183,8 @@ class Detector:
             found.append(self._orders(rows))
         if state.heard is not None:
             found.append(self._silent_devices(now.t, state.heard))
+        if state.rays is not None and some(old := now.t - state.rays.time > SCAN_S):
+            found.append(self._silent_rays(now.t, state.rays, old, rows))
         watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
         self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
         if rows.climbing is not self._climbed:  # while no row climbs it is None
@@ -294,6 +299,14 @@ class Detector:
     def _silent_devices(self, t: float, heard: Array) -> Iterator[Observation]:
         silent = t - heard > self._limits.own_silence_s
         yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
+
+    def _silent_rays(self, t: float, rays: Rays, old: Mask, rows: RowStatus) -> Iterator[Observation]:
+        """Rows that avoid by range readings, all of which are `old` (R,)."""
+        silent = np.zeros_like(self._none)
+        silent[rays.row] = True
+        silent[rays.row[~old]] = False
+        silent &= self._avoids & rows.cruising
+        yield Observation(Cause.UNSEEING, silent, lambda row: f"for {t - rays.time[rays.row == row].max():.1f} s")
 
     def _disobedient(self, obedience: Obedience, ascent: Ascent) -> Iterator[Observation]:
         """Rows that do not move as they are told, or move otherwise."""

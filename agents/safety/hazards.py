@@ -99,6 +99,7 @@ class Cause(IntEnum):
     STRAYING = Rule("it moves and is not told to", Outcome.LAND)
     UNREACHABLE = Rule("its device does not answer", Outcome.WARN, after_s=0.5, landing=True)
     HOVERING = Rule("it is told to land and hovers", Outcome.WARN, after_s=2.0, landing=True)
+    UNSEEING = Rule("its range sensors are silent", Outcome.HOLD)  # avoidance would drive it against what it saw
     UNSTARTED = Rule("nobody will start it", Outcome.LAND)  # it would hover until its battery is empty
 
 

@@ -50,7 +50,7 @@ def main(endpoint: str, world: str, names: Sequence[str]) -> None:
                 twist = None
                 while (sample := commands[name].handler.try_recv()) is not None:
                     command = json.loads(sample.payload.to_string())
-                    if command["seq"] > last_seq[name]:
+                    if command["seq"] > last_seq[name] or command["action"] == "stop":
                         last_seq[name], received[name] = command["seq"], time.monotonic()
                         twist = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
                 if twist is None and time.monotonic() - received[name] > PATIENCE_S:

@@ -62,10 +62,17 @@ def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         `{"seeds": [...], "cases": {case: {"mean" | "ratio": {index: {"mean", "std", "ci95", "n"}}}}}`. `n` counts the
-        seeds for which the value is known; the half-width is Student's, None for fewer than two.
+        seeds for which the value is known; the half-width is Student's, None for fewer than two. Of runs that were
+        spoiled or interrupted, which the means include, also `{"flawed": {case: {seed: [reason, ...]}}}`.
     """
     cases = list(dict.fromkeys(case for each in documents for case in each["cases"]))
-    return {
+    flawed: dict[str, dict[int, list[str]]] = {}
+    for each in documents:
+        for case, found in each["cases"].items():
+            cut = [f"interrupted after {found['duration_s']:.1f} s"] if found.get("interrupted") else []
+            if reasons := [*found.get("spoiled", ()), *cut]:
+                flawed.setdefault(case, {})[each["seed"]] = reasons
+    return ({"flawed": flawed} if flawed else {}) | {
         "seeds": [each["seed"] for each in documents],
         "cases": {
             case: {

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.interface import BodyState
+from agents.body.interface import BodyState, Rays
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
 from agents.safety.detection import SLOWEST, Descent, tilt_angle, tilted
@@ -287,6 +287,30 @@ def test_without_a_conductor(choice, phase):
     swarm.run(0.2)
     assert swarm.phase("F") == phase
     assert "the conductor is gone: for 2.0 s" in happened(swarm)["F"][0]
+
+
+@pytest.mark.parametrize("avoids", [True, False])
+def test_wheels_whose_range_sensor_dies_hold(avoids):
+    robots = {"A": Robot(kind="turtlebot3", start=[-1.0, 0.0])}
+    swarm = Swarm(
+        pair(robots=robots, formation=Formation(), **({"avoidance": "potential"} if avoids else {}))
+    ).running()
+    none = np.zeros(4)
+    scans = {"last": None}
+
+    def scanner(t, state):
+        if t < 3.0:
+            scans["last"] = Rays(none.astype(np.intp), none + t, np.linspace(0.0, 3.0, 4), none, none + np.nan)
+        state.rays = scans["last"]
+        return state
+
+    swarm.groups[0].spoil = scanner
+    swarm.run(3.9 - swarm.t)
+    assert swarm.agent("A").go(0, (1.0, 0.0), swarm.t) == ""
+    assert not happened(swarm)["A"]
+    swarm.run(6.0)
+    assert happened(swarm)["A"] == (["hold: its range sensors are silent: for 1.0 s"] if avoids else [])
+    assert (swarm.row("A", "truth")[0] < -0.9) == avoids
 
 
 def test_a_drone_that_nobody_starts_lands():

@@ -71,6 +71,7 @@ EXPECTED = {  # of a drone: outcomes, and the ticks at which they begin while th
     Cause.STRAYING: [(0, "LAND")],
     Cause.UNREACHABLE: [(50, "WARN")],
     Cause.HOVERING: [(200, "WARN")],
+    Cause.UNSEEING: [(0, "HOLD")],
     Cause.UNSTARTED: [(1000, "LAND")],
 }
 

@@ -49,6 +49,7 @@ def test_and_is_ready_no_more_when_it_lasts(what):
     spoiled(swarm, **values)
     swarm.run(0.4)
     assert agent.lifecycle.phase[0] == READY  # what flickers does not matter
+    assert agent.lifecycle.takeoff(0) == f"cannot take off now: {reason}"
     del swarm.groups[0].spoil
     swarm.run(0.4)
     spoiled(swarm, **values)

@@ -304,6 +304,7 @@ def test_spread_over_seeds():
     ]
     found = statistics.across_seeds(documents)
     assert found["seeds"] == [0, 1, 2, 3]
+    assert "flawed" not in found
     assert found["cases"]["a"]["mean"]["iae"] == {
         "mean": 2.0,
         "std": 1.0,
@@ -320,6 +321,14 @@ def test_spread_over_seeds():
 )
 def test_student_quantiles_against_the_printed_table(freedom: int, quantile: float):
     assert statistics.student_95(freedom) == pytest.approx(quantile, rel=1.5e-3)
+
+
+def test_flawed_seeds_are_named_beside_their_mean():
+    whole, half = measure.measure(park("a", seed=1)), measure.measure(cut(park("a", seed=2), 20.0))
+    half = msgspec.structs.replace(half, spoiled=("robots failed",))
+    documents = [metrics_files.document("x", each.seed, [each]) for each in (whole, half)]
+    found = statistics.across_seeds(documents)
+    assert found["flawed"] == {"a": {2: ["robots failed", f"interrupted after {half.duration_s:.1f} s"]}}
 
 
 def test_ratios_pair_seeds_or_divide_by_the_mean():
