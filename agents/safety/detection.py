@@ -161,6 +161,9 @@ class Detector:
         self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
         avoids = self._every_row if assignment.avoids is None else assignment.avoids
         self._avoids = avoids & (assignment.avoidance is not None)
+        self._rays: Rays | None = None
+        # (N,) time of the newest range readings [s]; infinity before the first, and of rows that do not avoid
+        self._scanned = np.full(len(self._flies), np.inf)
         self._separation = Separation(assignment)
         self._obedience = Obedience(assignment.kinds)
         self._ascent = Ascent(assignment.kinds, assignment.hover)
@@ -183,10 +186,10 @@ class Detector:
             found.append(self._orders(rows))
         if state.heard is not None:
             found.append(self._silent_devices(now.t, state.heard))
-        if state.rays is not None and some(old := now.t - state.rays.time > SCAN_S):
-            found.append(self._silent_rays(now.t, state.rays, old, rows))
-        watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
-        self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
+        if state.rays is not self._rays:
+            self._note_rays(state.rays)
+        if some(unseeing := now.t - self._scanned > SCAN_S):
+            found.append(self._silent_rays(now.t, unseeing & rows.cruising))
         if rows.climbing is not self._climbed:  # while no row climbs it is None
             self._climbed = rows.climbing
             climbing = self._none if rows.climbing is None else rows.climbing & self._flies
@@ -300,13 +303,16 @@ class Detector:
         silent = t - heard > self._limits.own_silence_s
         yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
 
-    def _silent_rays(self, t: float, rays: Rays, old: Mask, rows: RowStatus) -> Iterator[Observation]:
-        """Rows that avoid by range readings, all of which are `old` (R,)."""
-        silent = np.zeros_like(self._none)
-        silent[rays.row] = True
-        silent[rays.row[~old]] = False
-        silent &= self._avoids & rows.cruising
-        yield Observation(Cause.UNSEEING, silent, lambda row: f"for {t - rays.time[rays.row == row].max():.1f} s")
+    def _note_rays(self, rays: Rays | None) -> None:
+        """Note the time of the newest readings of rows that avoid by them."""
+        self._rays = rays
+        if rays is not None:
+            newest = np.full(len(self._flies), -np.inf)
+            np.maximum.at(newest, rays.row, rays.time)
+            self._scanned = np.where(np.isfinite(newest) & self._avoids, newest, self._scanned)
+
+    def _silent_rays(self, t: float, rows: Mask) -> Iterator[Observation]:
+        yield Observation(Cause.UNSEEING, rows, lambda row: f"for {t - self._scanned[row]:.1f} s")
 
     def _disobedient(self, obedience: Obedience, ascent: Ascent) -> Iterator[Observation]:
         """Rows that do not move as they are told, or move otherwise."""

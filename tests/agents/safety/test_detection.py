@@ -301,7 +301,7 @@ def test_wheels_whose_range_sensor_dies_hold(avoids):
     def scanner(t, state):
         if t < 3.0:
             scans["last"] = Rays(none.astype(np.intp), none + t, np.linspace(0.0, 3.0, 4), none, none + np.nan)
-        state.rays = scans["last"]
+        state.rays = scans["last"] if t < 5.0 else None  # old ones are dropped
         return state
 
     swarm.groups[0].spoil = scanner
