@@ -30,6 +30,7 @@ UNREAD_S: Final = 2.0  # drones land when their process has not read the state f
 ON_GROUND_S: Final = 3.0  # low for this long, motors not running: on the ground
 LANDED_ALONE_S: Final = 20.0  # silent for this long: landed by itself
 LOW: Final = 30  # [cm] the reported height is rounded and drifts
+TOO_HIGH_M: Final = 1.0  # [m] above the end of its climb, by its own height: its positions are those of something else
 UNORDERED: Final = 3  # seconds on the motors' clock of a high drone that rests: it flies without an order
 REFUSALS: Final = 3  # answers in a row that refuse the sticks: the note says so
 REFUSED_S: Final = 1.0  # for so long after the last of them
@@ -219,6 +220,8 @@ class TelloPilot:
             self._land_unattended(now)
         elif self.battery < self._settings.low_battery:
             self.land(now, f"landing: battery at {self.battery:.0%}")
+        elif self.duty is Duty.HOLD and 0.01 * self._height > self.hold_position[2] - self._floor + TOO_HIGH_M:
+            self.land(now, f"landing: it is {0.01 * self._height:.1f} m high, and its positions do not rise with it")
         elif self._on_ground(now):
             self._rest(f"landed by itself, battery at {self.battery:.0%}")
         else:

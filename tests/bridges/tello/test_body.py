@@ -76,6 +76,17 @@ def test_it_climbs_to_its_height_and_holds_its_place_until_setpoints_come():
     assert cockpit.drone.sticks[-1] == (0, 0, 0, 0)  # a setpoint of half a second ago is none
 
 
+def test_a_climb_with_markers_on_the_floor_ends():
+    cockpit = Cockpit().fly()
+    pilot = cockpit.pilot
+    pilot.position = (1.0, 2.0, 0.02)
+    cockpit.pass_(1.0, h=150, time=5)
+    assert pilot.duty is Duty.HOLD
+    cockpit.pass_(0.2, h=170)
+    assert (pilot.duty, cockpit.drone.said[-1]) == (Duty.LAND, "land")
+    assert pilot.trouble == "landing: it is 1.7 m high, and its positions do not rise with it"
+
+
 def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before():
     """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
     cockpit = Cockpit().fly()
