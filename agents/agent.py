@@ -25,6 +25,7 @@ from agents.decision.position_control import PositionController
 from agents.decision.transmission import Transmission, Transmitter
 from agents.network.messages import Setpoint
 from agents.plugins.calls import call
+from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, RowStatus
 from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.landing import Landing
@@ -93,7 +94,8 @@ class Agent:
         self.origins: dict[int, Setpoint] = {}  # of restarted rows, from their start orders
         self._no_row: Mask = np.zeros(rows, dtype=bool)
         self._every_row: Mask = np.ones(rows, dtype=bool)
-        self._not_finite = self._no_row
+        self._not_finite = self._blind = self._no_row  # (N,) rows without a valid pose when poses were last due,
+        self._place = np.full((rows, 3), np.nan)  # and where they were last known (N, 3) [m]
         self._now: Situation
 
     # ------------------------------------------------------------------ inputs
@@ -229,11 +231,23 @@ class Agent:
         self._asked = question
         error, energy = self.goal_computer.errors(t, state.position)
         self.error = error if where.all_valid else np.where(where.invalid, np.nan, error)
-        return self.transmitter.transmit(
+        sent = self.transmitter.transmit(
             t, state.position, state.velocity,
             error=error, energy=energy, start=life.start_at, offset=self.offset,
             setpoint=self._setpoint,
         )  # fmt: skip
+        return sent if assignment.predictor is HOLD else self._add_blind(sent, state.position, where.invalid)
+
+    def _add_blind(self, sent: Transmission, position: Array, blind: Mask) -> Transmission:
+        """Add rows on wheels that have just become `blind` (N,), at rest: others would follow them by prediction."""
+        stand = blind & ~self._blind & ~self._flies & np.isfinite(self._place).all(axis=1)
+        self._blind, place = blind, self._place
+        self._place = np.where(blind[:, None], place, position)
+        if not some(stand):
+            return sent
+        rows = np.union1d(sent.rows, np.flatnonzero(stand))
+        standing = np.where(stand[:, None], 0.0, sent.velocity)
+        return Transmission(rows, np.where(stand[:, None], place, sent.position), standing)
 
     def act(self, t: float, state: BodyState, transmission: Transmission) -> Actions:
         """Second half of a tick: goals, setpoints and commands."""

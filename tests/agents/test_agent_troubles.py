@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Phase
+from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import drone, pair
 from tests.agents.swarm import Swarm
 
@@ -132,3 +133,20 @@ def test_a_ground_robot_that_is_not_running_stands():
     phase, setpoint = swarm.column("phase"), swarm.column("setpoint")
     assert not setpoint[(phase < AIRBORNE) | (phase > RUNNING)].any()
     assert setpoint[phase == RUNNING].any()
+
+
+def test_followers_of_wheels_that_lost_their_position_stop():
+    robots = {"A": Robot(kind="khepera4", start=[-1.5, 0.0]), "B": Robot(kind="khepera4", start=[-1.0, 0.0])}
+    shape = Formation(links={"B > A": 0.5})
+    swarm = Swarm(pair(robots=robots, formation=shape, prediction={"kind": "constant-velocity"}), [["A"], ["B"]])
+    swarm.running()
+    assert swarm.agent("B").go(0, (1.5, 0.0), swarm.t) == ""
+    swarm.run(2.5)
+
+    def lost(t, state):
+        state.position[0] = np.nan
+        return state
+
+    swarm.groups[1].spoil = lost
+    swarm.run(20.0)
+    assert np.linalg.norm(swarm.row("A", "truth") - swarm.row("B", "truth")) > 0.4
