@@ -42,6 +42,7 @@ NEAR = [
 NEAR_TRIANGLE = [
     "--set", "robots.KH01.start=[-0.35, -0.3]", "--set", "robots.KH02.start=[0.35, -0.3]",
     "--set", "robots.CF01.start=[0.05, 0.44]", "--set", "robots.CF01.hover=0.3",
+    "--set", "formation.gain=1.4",  # its links are more level than those of the file, and pull more
 ]  # fmt: skip
 
 

@@ -23,6 +23,8 @@ duration_s = {duration}
 [robots]
 CF01 = {{ kind = "crazyflie", start = [-0.3, 0.0], hover = {hover} }}
 KH01 = {{ kind = "khepera4", start = [0.3, 0.0] }}
+[formation]
+gain = 1.0
 [formation.links]
 "CF01 - KH01" = {apart}
 [cases.first]

@@ -39,7 +39,7 @@ start = [-0.6, -0.2]
 """
 
 
-LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3")  # soon up, and down
+LOW = ("robots.CF01.hover=0.3", "spares.S1.hover=0.3", "formation.gain=1.4")  # soon up, and down
 
 
 class Lab:

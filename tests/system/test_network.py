@@ -34,14 +34,20 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
 
 def virtual(duration_s: float) -> Trace:
     """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
-    experiment: Experiment = load("triangle", *BAD, f"duration_s={duration_s}").cases()["periodic"]
+    experiment: Experiment = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()[
+        "periodic"
+    ]
     return Logbook(simulate(experiment, [experiment.seed]), experiment, "periodic").trace()
 
 
 @pytest.mark.mechanism("modelled channel in real time")
 def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    changes = [part for change in (*BAD, "duration_s=3", "robots.CF01.hover=0.3") for part in ("--set", change)]
+    changes = [
+        part
+        for change in (*BAD, "duration_s=3", "robots.CF01.hover=0.3", "formation.gain=1.4")
+        for part in ("--set", change)
+    ]
     flight = Flight(folder, "triangle", "--case", "periodic", "--json", "--no-report", *changes)
     code, out = flight.finish(60.0)
     assert code == 0, flight.said

@@ -58,8 +58,8 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
     try:
         if disk_full:
             mended = recording.with_name("mended.mcap")
-            recover(recording, mended)
-            recording = mended
+            if not recover(recording, mended).complete:
+                recording = mended
         read = playback.read(recording)
     except (ExplainedError, OSError) as error:
         return [f"the recording does not open: {error}"]

@@ -24,6 +24,7 @@ HELD_M: Final = 0.25  # largest distance of a robot that no process steers
 NOTICE_S: Final = 1.0  # after which it must have stopped
 DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
 NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
+STATUS_S: Final = 1.5  # a status is this old at most
 REFUSED: Final = 2  # exit code of a process whose name is taken
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
 LATEST_S: Final = 4.0  # before the end no fault is begun that could not heal
@@ -122,10 +123,14 @@ class ActiveFault:
         return f"{', '.join(blind)}: not noticed that its position is wrong" if blind else ""
 
     def deaf_to(self) -> list[str]:
-        """Living robots whose poses the victim has not received since the fault was lifted."""
+        """Living robots that have transmitted since the fault was lifted, and the victim received none of their poses.
+
+        Robots at rest do not transmit by events. A status says how many were sent until a second before.
+        """
         observer, victim = self.observer, self.victim
         senders = [name for name, receivers in observer.receivers.items() if victim in receivers and name in self.live]
-        return [name for name in senders if observer.received_at.get((victim, name), 0.0) < self.lifted]
+        spoke = [name for name in senders if observer.sent_at.get(name, 0.0) > self.lifted + STATUS_S]
+        return [name for name in spoke if observer.received_at.get((victim, name), 0.0) < self.lifted]
 
     def receivers(self) -> list[str]:
         """Living robots that receive the poses of the victim."""

@@ -142,6 +142,7 @@ class Observer:
         self.alive: set[str] = set()  # robots whose token stands
         self.orders: list[messages.Command] = []  # commands other than "drive", since the list was emptied
         self.received_at: dict[tuple[str, str], float] = {}  # when (receiver, sender) last reported a pose
+        self.sent_at: dict[str, float] = {}  # when a robot last reported a further transmission
         self.wrong: list[str] = []  # violations since the last `violations`
         self.connected = True  # a router is there
 
@@ -151,6 +152,8 @@ class Observer:
         self.connected = network.connected(self.session)
         self.events += self._events.read()
         for status in self._statuses.read():
+            if (before := self.status.get(status.robot)) is None or status.sent != before.sent:
+                self.sent_at[status.robot] = now
             self.status[status.robot], self.status_at[status.robot] = status, now
         for truth in self._truths.read():
             self.invariants.place(truth.robot, truth.position)

@@ -188,5 +188,5 @@ def test_the_table_of_the_docs_has_every_family_with_its_defaults():
         kind = registry.struct(registry.TRIGGERS, name)
         defaults = {field.name: field.default for field in msgspec.structs.fields(kind)}
         own = set(kind.__struct_fields__) - set(Trigger.__struct_fields__)
-        said = {field: float(value) for field, value in re.findall(r"`(\w+)` ([0-9]+(?:\.[0-9]+)?)", parameters)}
+        said = {field: float(value) for field, value in re.findall(r"`(\w+)`: \$[^$]+\$, ([0-9.]+)", parameters)}
         assert said == {field: defaults[field] for field in own}, name

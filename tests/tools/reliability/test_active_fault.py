@@ -109,6 +109,9 @@ def test_refused_landing_ends_on_the_floor(it):
 def test_sleeper_must_hear_its_senders(it):
     it.observer.receivers = {"KH01": {"CF01"}, "KH02": {"KH01"}, "CF01": {"KH01"}}
     it.observer.received_at, it.lifted = {("CF01", "KH01"): 5.0}, 6.0
+    it.observer.sent_at = {"KH01": 7.0}
+    assert it.deaf_to() == []  # that may have been sent before
+    it.observer.sent_at["KH01"] = 8.0
     assert it.deaf_to() == ["KH01"]
     it.observer.received_at["CF01", "KH01"] = 6.5
     assert it.deaf_to() == []
