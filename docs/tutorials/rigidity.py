@@ -122,7 +122,7 @@ show(frameworks(), OUT / "rigidity-frameworks")
 
 # %%
 CORNERS = "ABCD"
-GAIN = 1.0  # μ [1/(m² decision)]
+GAIN = 0.3  # μ [1/(m² decision)]
 STARTS = {
     "first": [(-0.5, -0.3), (0.6, -0.5), (0.9, 0.3), (-0.1, 0.5)],
     "second": [(-0.4, -0.5), (0.4, -0.6), (0.2, 0.4), (-0.6, 0.3)],
@@ -130,7 +130,7 @@ STARTS = {
 
 
 def formation(
-    starts: list[tuple[float, float]], heights: list[float], lengths: dict[str, float], duration_s: float = 30.0
+    starts: list[tuple[float, float]], heights: list[float], lengths: dict[str, float], duration_s: float = 60.0
 ) -> Document:
     """Drones A, B, ... that hold their heights and keep distances [m]."""
     robots = [
@@ -237,7 +237,7 @@ print(f"a tent cannot be higher than {LIMIT:.4f} m")
 assert abs(LIMIT - 0.806) < 1e-3
 
 
-def tent(rise: float, push: float = 0.0, duration_s: float = 30.0) -> Document:
+def tent(rise: float, push: float = 0.0, duration_s: float = 60.0) -> Document:
     """The tent with its top `rise` above the others, which starts `push` beside its place [m]."""
     aside = np.sqrt(max(LEG**2 - rise**2 - (BASE / 2.0) ** 2, 0.0)) + push
     starts = [(-BASE / 2.0, 0.0), (BASE / 2.0, 0.0), (0.0, float(aside))]
@@ -305,7 +305,7 @@ assert rigid_motions(line, in_the_plane(line)) == 4
 
 def measured_s(rise: float) -> float:
     """Time constant with which the tent closes after a push of its top by 1 cm [s]."""
-    trace = simulate(tent(rise, push=0.01, duration_s=40.0)).traces["default"]
+    trace = simulate(tent(rise, push=0.01, duration_s=120.0)).traces["default"]
     error = np.abs(norm(trace.true_position[:, 2] - trace.true_position[:, 0]) - LEG)
     use = (trace.time > 3.0) & (error > 1e-7)
     return float(-1.0 / np.polyfit(trace.time[use], np.log(error[use]), 1)[0])
@@ -329,13 +329,15 @@ h = float(closed_shares([CRAZYFLIE], HZ)[0])
 assert np.allclose(slowest[2:], 1.0 / (HZ * h * GAIN * np.array(eigenvalue[2:])), rtol=0.05)
 faster = 1.0 - np.array(constant) / np.array(slowest)
 assert np.all(faster > 0.0)
-assert np.all(faster < 0.3)
-assert np.all(faster[3:] < 0.08)
+assert np.all(faster < 0.06)
+assert 4.0 < constant[0] < 5.0
+assert 35.0 < constant[-1] < 40.0
 
 # %% [markdown]
-# Between 0.7 m and 0.795 m the time constant grows from one second to eleven, and beyond 0.806 m nothing closes.
-# The prediction is the better the slower the mode, for the reason that the lesson on consensus found: it knows
-# nothing of the lag with which a drone gets up to speed.
+# Between 0.7 m and 0.795 m the time constant grows from under five seconds to 37, and beyond 0.806 m nothing closes.
+# Measured, it is 3 to 6 % less than predicted. In fast modes that is what the lesson on consensus found: the prediction
+# knows nothing of the lag with which a drone gets up to speed. Near the limit the push adds to that: 1 cm is no longer
+# small beside the 13 cm by which the top leans aside.
 #
 # The reference experiment has its three drones at 0.80 m. That is 6 mm below the limit. What does that cost?
 
