@@ -205,14 +205,14 @@ class Agent:
         self.goal_computer.update_links(t)
         life = self.lifecycle
         watched = self._every_row if life.all_running else life.active | (life.phase == LANDING)
-        jump = self._continuity.jumps(state.time, state.position, watched)
+        jump = self._continuity.jumps(state.time, state.position, watched, state.yaw)
         if self._external.doubted:
             jump = self._external.jump if jump is None else np.fmax(jump, self._external.jump)
         if jump is not None:
             unknown = ~np.isnan(jump) | self._external.deceived
             state = replace(state, position=np.where(unknown[:, None], np.nan, state.position))
         where = self._safety.validate_poses(state.position, state.yaw, t - state.time)
-        self._now = Situation(t, state, where, self.neighbours, self.health, jump)
+        self._now = Situation(t, state, where, self.neighbours, self.health, jump, self._continuity.turned)
         ready = self._ready(self._now) if life.waiting else self._no_row  # all rows have taken off
         commands = life.advance(t, ready, state.position, state.velocity, state.flying)
         if commands is not None or self.landing.any_aside:

@@ -95,7 +95,7 @@ class ExternalBody:
             raise BodyError(f"{', '.join(self._names)}: {error}") from None
         session, keys, mime = self._session, self._keys, messages.MIME["json"]
         rows = range(len(self._names))
-        self._positions = MeasuredPositions(session, keys, self._names, rows, REACH, exact=rows)
+        self._positions = MeasuredPositions(session, keys, self._names, rows, REACH, exact=rows, silence_s=FRESH_S)
         self._ranges = RangeInbox(session, keys, self._names, rows)
         self._setpoints = [pubsub.publisher(session, keys.setpoint(name), mime) for name in self._names]
         self._orders = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import nan
+from math import inf, nan
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,8 @@ from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
 
 REPEATED_S: Final = 0.3  # [s] without a new pose: the note says so
+SECOND_S: Final = 1.0  # [s] after its last sample a second source is not told of any more
+SECOND: Final = "a second source sends its position, and is refused"  # note of such a robot
 FROZEN: Final = "its measured position repeats itself to the last bit"  # note of such a robot
 
 
@@ -23,6 +25,7 @@ class MeasuredPositions:
     """Subscriptions to the keys `position` of some rows; polled.
 
     A pose that is equal to the one before to the last bit was not measured: its source is frozen, and it is left out.
+    Of several sources, as their samples name them, the first stays until it is silent or frozen.
     """
 
     def __init__(
@@ -34,11 +37,13 @@ class MeasuredPositions:
         reach: messages.Vector,
         *,
         exact: Sequence[int] = (),
+        silence_s: float,
     ) -> None:
         """Subscribe for `rows` of the robots `names`; positions beyond `reach` [m] are refused.
 
         Args:
             exact: Rows whose positions a simulation knows without noise; theirs may repeat.
+            silence_s: Time without a new position after which another source takes over [s].
         """
         self._names, self._reach = tuple(names), reach
         # (N,) [s] stamp of the last position of each row less the time of its arrival: the clock of its source is ahead
@@ -46,7 +51,11 @@ class MeasuredPositions:
         self.ahead: Array = np.full(len(self._names), nan)
         self.malformed = [0] * len(self._names)  # (N,) refused positions
         self.trouble = [""] * len(self._names)  # (N,) reason of the last refusal
-        self._exact = frozenset(exact)
+        self._exact, self._silence_s = frozenset(exact), silence_s
+        self._sources: dict[int, str | None] = {}  # session of the source of each row, None if it names none,
+        self._alive_at: dict[int, float] = {}  # and the arrival of its last position that was new [s]
+        self._foreign_at: dict[int, float] = {}  # arrival of the last position from a second source [s]
+        self._received_at = -inf  # the last call [s]
         self._last: dict[int, tuple[messages.Vector, float | None]] = {}
         self._new_at: dict[int, float] = {}  # arrival of the last pose that was new [s],
         self._repeats: dict[int, bool] = {}  # and whether others came since
@@ -65,12 +74,43 @@ class MeasuredPositions:
 
         Yields row, time of measurement [s], position (3,) [m], and yaw [rad], NaN if unknown.
         """
+        if now - self._received_at > self._silence_s:  # a standstill here is no silence of a source
+            self._alive_at = dict.fromkeys(self._alive_at, now)
+        self._received_at = now
         for row, inbox in self._inboxes.items():
-            for measured in inbox.read(partial(self._check, row, utc, now)):
+            for measured, sample in inbox.read_samples():
+                source = pubsub.session_of(sample)
+                if self._is_foreign(row, source, now):
+                    self._foreign_at[row] = now
+                    self._note_refusal(row, "", SECOND)
+                    continue
+                try:
+                    self._check(row, utc, now, measured)
+                except messages.Malformed as error:
+                    self._note_refusal(row, "", str(error))
+                    continue
+                self._note_source(row, source, (measured.position, measured.yaw), now)
                 if not self._is_new(row, (measured.position, measured.yaw), now):
                     continue
                 yaw = nan if measured.yaw is None else measured.yaw
                 yield row, validation.taken(measured.stamp - utc, now), np.array(measured.position), yaw
+
+    def _is_foreign(self, row: int, source: str | None, now: float) -> bool:
+        """Whether another source than `source` is there for a row."""
+        if row not in self._sources or source == self._sources[row]:
+            return False
+        return now - self._alive_at[row] <= self._silence_s
+
+    def _note_source(
+        self, row: int, source: str | None, pose: tuple[messages.Vector, float | None], now: float
+    ) -> None:
+        """A pose of a row from the source that is not foreign; a frozen source is not alive."""
+        if row not in self._sources or source != self._sources[row]:
+            self._sources[row] = source
+            self._last.pop(row, None)
+            self._alive_at[row] = now
+        elif row in self._exact or pose != self._last.get(row):
+            self._alive_at[row] = now
 
     def _is_new(self, row: int, pose: tuple[messages.Vector, float | None], now: float) -> bool:
         """Whether a pose was measured; of the first one that is known when the next one differs."""
@@ -83,14 +123,16 @@ class MeasuredPositions:
         return before is not None and not self._repeats[row]
 
     def annotate(self, state: BodyState, now: float) -> None:
-        """Write to the state of the bodies at `now` [s] how far stamps are ahead, and which sources are frozen."""
+        """Write to the state of the bodies at `now` [s] how far stamps are ahead, and what is wrong with sources."""
         known = np.isfinite(self.ahead)
         state.ahead = self.ahead if state.ahead is None else np.where(known, self.ahead, state.ahead)
         frozen = [row for row, repeats in self._repeats.items() if repeats and now - self._new_at[row] > REPEATED_S]
-        if frozen:
+        second = [row for row, at in self._foreign_at.items() if now - at <= SECOND_S]
+        if frozen or second:
             notes = list(state.notes) or [""] * len(self._names)
-            for row in frozen:
-                notes[row] = "; ".join(filter(None, (FROZEN, notes[row])))
+            for what, rows in ((FROZEN, frozen), (SECOND, second)):
+                for row in rows:
+                    notes[row] = "; ".join(filter(None, (what, notes[row])))
             state.notes = tuple(notes)
 
     def _check(self, row: int, utc: float, now: float, measured: messages.Position) -> None:

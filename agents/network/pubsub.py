@@ -89,6 +89,17 @@ def publisher(
     )
 
 
+def source_of(publisher: zenoh.Publisher) -> zenoh.SourceInfo:
+    """What tells the samples of a plain publisher from those of another one; `session_of` reads it."""
+    return zenoh.SourceInfo(publisher.id, 0)
+
+
+def session_of(sample: zenoh.Sample) -> str | None:
+    """Session that published a sample, if the sample names it."""
+    source = sample.source_info
+    return None if source is None else str(source.source_id.zid)
+
+
 def subscriber(session: zenoh.Session, key: str, depth: int = 256) -> zenoh.Subscriber[Handler[zenoh.Sample]]:
     """The other end of `publisher`: the newest `depth` samples wait in `.handler`."""
     return session.declare_subscriber(key, RingChannel(depth))

@@ -286,7 +286,12 @@ class Runtime:
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = np.flatnonzero(self._setup.located).tolist()
         exact = np.flatnonzero(self._setup.exact).tolist()
-        self._located = MeasuredPositions(session, keys, names, located, self._reach, exact=exact) if located else None
+        silence_s = self.agent.assignment.limits.own_silence_s
+        self._located = (
+            MeasuredPositions(session, keys, names, located, self._reach, exact=exact, silence_s=silence_s)
+            if located
+            else None
+        )
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._from_world = np.array(seen_by_world, dtype=np.intp)

@@ -102,7 +102,7 @@ class NeighbourSubscription:
         before = self._received_at  # poses that waited while this process stood still count as one reception
         order = self._order
         for pose, sample in received:
-            session = _session_of(sample)
+            session = pubsub.session_of(sample)
             if order.is_foreign(session):
                 self.foreign += 1
                 continue
@@ -155,12 +155,6 @@ class NeighbourSubscription:
         elif now > self._old_at:  # poses that waited while this process stood still arrive at once, and count once
             self._old, self._old_at = self._old + 1, now
             self.behind = age if self._old >= PROOFS else 0.0
-
-
-def _session_of(sample: zenoh.Sample) -> str | None:
-    """Session that published a sample, if the sample names it."""
-    source = sample.source_info
-    return None if source is None else str(source.source_id.zid)
 
 
 NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB

@@ -170,6 +170,8 @@ class Detector:
         self._climbed: Mask | None = None
         self._none: Mask = ~self._every_row
         self._descent = Descent(len(self._flies), float(self._limits.high[2]))
+        # (N,) rows that leaned on the tick before, and the time of the first sample of that [s]
+        self._leaned, self._leans_since = self._none, np.zeros(len(self._flies))
 
     def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
         """Causes that are present."""
@@ -249,6 +251,8 @@ class Detector:
         t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
 
         def lost(row: int) -> str:
+            if now.turned is not None and np.isfinite(now.turned[row]):
+                return f"its yaw jumped by {now.turned[row]:.2f} rad"
             if now.jump is not None and np.isfinite(now.jump[row]):
                 return f"it jumped by {now.jump[row]:.2f} m"
             if not np.isfinite(state.position[row]).all():
@@ -271,7 +275,7 @@ class Detector:
             off = clock_off(state.ahead, limits.own_silence_s)
             yield Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead))
         if state.attitude is not None:
-            attitude, leans = state.attitude, tilted(state.attitude, limits.tilt) & self._flies & state.flying
+            attitude, leans = state.attitude, self._leaning(state, state.attitude)
             lean = f"it leans {{:.0f}}° (limit {degrees(limits.tilt):.0f}°)"
             yield Observation(Cause.TILT, leans, lambda row: lean.format(degrees(tilt_angle(attitude, row))))
         if some(rows.landing):
@@ -279,6 +283,13 @@ class Detector:
             yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s without a descent")
             yield Observation(Cause.HOVERING, hovers, lambda row: f"at {state.position[row, 2]:.2f} m")
             yield Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below)
+
+    def _leaning(self, state: BodyState, attitude: Array) -> Mask:
+        """Rows (N,) that lean, by a first sample or a newer one: the first one alone, repeated, proves nothing."""
+        leans = tilted(attitude, self._limits.tilt) & self._flies & state.flying
+        begins, self._leaned = leans & ~self._leaned, leans
+        self._leans_since = np.where(begins, state.time, self._leans_since)
+        return np.asarray(leans & (begins | (state.time > self._leans_since)))
 
     def _spent(self, state: BodyState, low: Mask, rows: RowStatus) -> Iterator[Observation]:
         """Battery, which is `low` (N,), and motors."""

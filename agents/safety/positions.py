@@ -7,7 +7,7 @@ hand. One that is not believed reaches neither the decision nor, where it is mea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, nan, remainder, tau
+from math import isfinite, nan, pi, remainder, tau
 from typing import Final
 
 import numpy as np
@@ -23,7 +23,7 @@ MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the tim
 
 
 class Continuity:
-    """Jumps of the measured positions of N rows.
+    """Jumps of the measured positions of N rows, and, on wheels, of their yaw, by which they drive.
 
     A row has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
     """
@@ -32,18 +32,28 @@ class Continuity:
         """A jump is longer than `jump_m`, one number or one for each row [m]."""
         self._fastest, self._jump = REACH * np.array([kind.speed for kind in kinds]), jump_m
         self._place, self._time = np.full((len(kinds), 3), np.nan), np.zeros(len(kinds))  # last plausible ones
+        self._wheels: Mask = np.array([kind.takes == "twist" for kind in kinds], dtype=bool)
+        self._any_wheels = some(self._wheels)
+        self._turn_rate = REACH * np.array([kind.turn_rate for kind in kinds])
+        self._yaw, self._none = np.full(len(kinds), np.nan), np.zeros(len(kinds))  # last plausible ones, no turns
         self._out: Mask = np.zeros(len(kinds), dtype=bool)
+        self.turned: Array | None = None  # (N,) [rad] of rows whose yaw jumped, NaN of others; None: of no row
 
-    def jumps(self, time: Array, position: Array, watched: Mask) -> Array | None:
+    def jumps(self, time: Array, position: Array, watched: Mask, yaw: Array | None = None) -> Array | None:
         """Lengths (N,) [m] of the jumps of rows, NaN of those that have not; None if no row has.
 
-        The `position` (N, 3) [m] was measured at `time` (N,) [s]. Rows that are not `watched` (N,), not in motion, may
-        be carried, and begin anew unless they have jumped.
+        The `position` (N, 3) [m] and `yaw` (N,) [rad] were measured at `time` (N,) [s]. A row whose yaw jumped is one
+        of them; `turned` tells by how much. Rows that are not `watched` (N,), not in motion, may be carried, and begin
+        anew unless they have jumped.
         """
         moved = position - self._place
         squared = np.vecdot(moved, moved)
-        if every(watched) and every(squared < self._jump**2):
-            self._place, self._time = position.copy(), time.copy()
+        yaw = yaw if self._any_wheels else None
+        turns = self._none if yaw is None else self._turns(yaw)
+        if every(watched) and every(squared < self._jump**2) and every(turns < FLIP):
+            self._place, self._time, self.turned = position.copy(), time.copy(), None
+            if yaw is not None:
+                self._yaw = np.where(np.isfinite(yaw), yaw, self._yaw)
             if some(self._out):
                 self._out = np.zeros(len(time), dtype=bool)
             return None
@@ -52,16 +62,26 @@ class Continuity:
         known = np.isfinite(time) & np.isfinite(self._time)
         since = np.clip(np.subtract(time, self._time, out=np.zeros_like(time), where=known), 0.0, GAP_S)
         plausible = self._jump + np.where(self._out, 0.0, self._fastest * since)
-        self._out = watched & ((gap > plausible) | (unknown & self._out))
+        turned = watched & (turns > FLIP + np.where(self._out, 0.0, self._turn_rate * since))
+        self.turned = np.where(turned, turns, np.nan) if some(turned) else None
+        self._out = (watched & ((gap > plausible) | (unknown & self._out))) | turned
+        if yaw is not None:
+            self._yaw = np.where(self._out | (watched & ~np.isfinite(yaw)), self._yaw, yaw)
         kept = self._out | unknown
         self._place = np.where(kept[:, None], self._place, position)
         self._time = np.where(kept, self._time, time)
         return np.where(self._out, gap, np.nan) if some(self._out) else None
 
+    def _turns(self, yaw: Array) -> Array:
+        """Angles (N,) [rad] from the last plausible `yaw` (N,); 0 of rows without wheels, or without a yaw."""
+        known = self._wheels & np.isfinite(yaw) & np.isfinite(self._yaw)
+        angle = np.subtract(yaw, self._yaw, out=np.zeros_like(yaw), where=known)
+        return np.asarray(np.abs(np.mod(angle + pi, tau) - pi))
+
     def forget(self, row: int) -> None:
-        """A row is where its position says, wherever that is."""
-        self._place, self._out = self._place.copy(), self._out.copy()
-        self._place[row], self._out[row] = np.nan, False
+        """A row is where its position says, wherever that is, and its yaw is right."""
+        self._place, self._yaw, self._out = self._place.copy(), self._yaw.copy(), self._out.copy()
+        self._place[row], self._yaw[row], self._out[row] = np.nan, np.nan, False
 
 
 class ExternalPositions:

@@ -71,3 +71,4 @@ class Situation(msgspec.Struct, frozen=True):
     neighbours: NeighbourStates  # of the rows
     health: ProcessHealth  # of the process around the decision
     jump: Array | None = None  # (N,) [m] of rows whose position jumped: `state` has none of them; None: of no row
+    turned: Array | None = None  # (N,) [rad] of those of them whose yaw jumped, NaN of others; None: of no row

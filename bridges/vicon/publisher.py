@@ -128,7 +128,8 @@ class Positions:
 
     def publish(self, robot: str, stamp: float, segment: Segment, yaw: float) -> None:
         """Publish the pose of a robot at UTC time `stamp` [s]."""
-        self._publishers[robot].put(messages.encode(messages.position(robot, stamp, segment.position, yaw)))
+        publisher, said = self._publishers[robot], messages.position(robot, stamp, segment.position, yaw)
+        publisher.put(messages.encode(said), source_info=pubsub.source_of(publisher))
 
 
 class Bridge:

@@ -229,6 +229,7 @@ class Net:
             "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
             "pose_publisher": mute,
             "publisher": mute,
+            "source_of": lambda _publisher: None,
             "LastValue": mute,
             "alive_token": mute,
         }

@@ -332,7 +332,8 @@ class Exchange:
         for (name, publisher), place, heading in zip(
             publishers.items(), position.round(6).tolist(), yaw.round(6).tolist(), strict=True
         ):
-            publisher.put(messages.encode(messages.position(name, stamp, place, heading), encoding))
+            said = messages.encode(messages.position(name, stamp, place, heading), encoding)
+            publisher.put(said, source_info=pubsub.source_of(publisher))
 
     def _sweep(self, rays: Rays, stamp: float) -> None:
         """Publishes the readings of rows that have new ones."""

@@ -1,12 +1,13 @@
 """Positions by a clock that is off: what is stamped ahead hides no silence, and people are told how far it is off."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from agents.body.fleet import assemble
-from agents.body.measured_positions import FROZEN, MeasuredPositions
+from agents.body.measured_positions import FROZEN, SECOND, MeasuredPositions
 from agents.decision.lifecycle import Phase
 from agents.network import messages
 from agents.network.keys import Keys
@@ -16,6 +17,7 @@ from experiments.definition import bodies
 from experiments.definition.experiment import Formation, Robot
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
+from tests.agents.runtime.test_pose_inbox import Sample
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
 
@@ -32,7 +34,7 @@ def position(stamp: float, robot: str = "T") -> bytes:
 def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_of_as_well() -> None:
     net = Net()
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1])  # type: ignore[arg-type]
+        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1], silence_s=0.5)  # type: ignore[arg-type]
         assert np.isnan(heard.ahead).all()
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
@@ -118,7 +120,7 @@ def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -
 def test_a_pose_that_repeats_itself_is_none(exact: list[int], expected: list[float]) -> None:
     net, taken = Net(), []
     with net.worn():
-        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=exact)  # type: ignore[arg-type]
+        heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=exact, silence_s=0.5)  # type: ignore[arg-type]
         for tick in range(5):
             t = 8.0 + 0.1 * tick
             place = messages.Position("T", UTC + t, (0.1, 0.2, 0.0 if tick < 3 else 0.001), 0.3)
@@ -137,3 +139,31 @@ def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> 
         (held, text), (landed, _), *_ = [each for each in said if "its own position is lost" in each[1]]
         assert text.startswith("hold: its own position is lost: the last is 0.5")
         assert [held - frozen_s, landed - frozen_s] == pytest.approx([0.5, 0.8], abs=0.03)
+
+
+def test_the_first_of_two_sources_stays_until_silent() -> None:
+    net, taken = Net(), []
+    with net.worn():
+        heard = MeasuredPositions(net.session, KEYS, ("T",), [0], (9.0, 9.0, 9.0), silence_s=0.45)  # type: ignore[arg-type]
+
+        def tell(t: float, *places: tuple[str | None, float]) -> list[float]:
+            for session, x in places:
+                payload = messages.encode(messages.Position("T", UTC + t, (x + 0.001 * t, 0.0, 0.0), 0.3))
+                for channel in net.channels:
+                    channel.add(Sample(KEYS.position("T"), payload, session=session))
+            return [round(float(position[0])) for _, _, position, _ in heard.receive(UTC, t)]
+
+        both: list[tuple[str | None, float]] = [("a", 1.0), ("b", 2.0)]
+        taken = [tell(8.0 + 0.1 * tick, *both) for tick in range(4)]
+        assert taken == [[], [1], [1], [1]]
+        assert heard.malformed == [4]
+        state = SimpleNamespace(ahead=None, notes=())
+        heard.annotate(state, 8.4)  # type: ignore[arg-type]
+        assert state.notes == (SECOND,)
+        taken = [tell(8.4 + 0.1 * tick, ("b", 2.0)) for tick in range(8)]
+        assert taken == [[]] * 5 + [[2]] * 3
+        assert tell(9.2, *both) == [2], "the first one is the second now"
+        assert tell(11.0, *reversed(both)) == [2], "nothing was received meanwhile"
+        state = SimpleNamespace(ahead=None, notes=())
+        heard.annotate(state, 12.5)  # type: ignore[arg-type]
+        assert state.notes == ()

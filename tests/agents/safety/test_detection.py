@@ -1,6 +1,7 @@
 """Detection of hazards: causes as robots meet them, and whatever happens a robot ends up stopped or landed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,6 +93,30 @@ def test_a_drone_that(what):
     assert swarm.phase("F") == phase
     told = happened(swarm)["F"]
     assert any(each.startswith(text) for each in told) if text else told == []
+
+
+@pytest.mark.parametrize(("samples", "phase"), [(1, RUNNING), (2, DONE)])
+def test_a_lean_takes_two_samples(samples, phase):
+    swarm = drone().running().run(0.3)
+    for sample in range(samples):  # telemetry that stops with the last one
+        spoiled(swarm, attitude=leant(1.4), time=swarm.t + 0.01 * sample)
+        swarm.step()
+    swarm.run(0.3)
+    assert swarm.phase("F") == phase
+
+
+def test_wheels_whose_yaw_jumps_stand():
+    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.3)
+    group = swarm.groups[0]
+    group.spoil = lambda t, state: replace(state, yaw=state.yaw + 1.2)
+    swarm.run(0.5)
+    assert any("its yaw jumped by 1.2" in text for text in happened(swarm)["A"])
+    place = group.state.true_position.copy()
+    swarm.run(1.0)
+    assert group.state.true_position == pytest.approx(place, abs=1e-3)
+    assert swarm.agent("A").start(0, swarm.t) == ""
+    swarm.run(0.1)
+    assert not swarm.agent("A").hazards.held[0]
 
 
 def test_wheels_whose_position_is_old_know_no_error():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4
-from agents.safety.positions import JUMP_M, REACH, Continuity, ExternalPositions
+from agents.safety.positions import FLIP, JUMP_M, REACH, Continuity, ExternalPositions
 
 
 def test_a_jump_is_farther_than_a_robot_can_move_between_two_measurements():
@@ -35,6 +35,27 @@ def test_rows_that_are_not_watched_or_forgotten_are_where_their_position_says():
     continuity.forget(1)
     assert continuity.jumps(np.full(2, 0.02), there, both) is None
     assert continuity.jumps(np.full(2, 0.03), here, both) == pytest.approx([math.sqrt(3.0)] * 2)
+
+
+def test_wheels_whose_yaw_jumps_have_jumped():
+    kinds, still, watched = [KHEPERA4, CRAZYFLIE], np.zeros((2, 3)), np.ones(2, dtype=bool)
+
+    def turns(*yaws, kinds=kinds, watched=watched):
+        continuity = Continuity(kinds)
+        found = [continuity.jumps(np.full(2, t), still, watched, np.full(2, yaw)) for t, yaw in yaws][-1]
+        assert (found is None) == (continuity.turned is None)
+        return continuity.turned
+
+    most = FLIP + REACH * KHEPERA4.turn_rate * 0.02
+    assert turns((0.0, 0.0), (0.02, most - 0.001)) is None
+    assert turns((0.0, 0.0), (0.02, most + 0.001)) == pytest.approx([most + 0.001, np.nan], nan_ok=True)
+    assert turns((0.0, 3.1), (0.02, -3.1)) is None
+    assert turns((0.0, 0.0), (0.02, 1.2), (9.0, 1.2)) == pytest.approx([1.2, np.nan], nan_ok=True)
+    assert turns((0.0, 0.0), (0.02, 1.2), (0.04, 0.1)) is None
+    assert turns((0.0, 0.0), (0.02, np.nan), (0.04, 1.2)) == pytest.approx([1.2, np.nan], nan_ok=True)
+    assert turns((0.0, np.nan), (0.02, np.inf), (0.04, 1.2)) is None
+    assert turns((0.0, 0.0), (0.02, 1.2), kinds=[CRAZYFLIE] * 2) is None
+    assert turns((0.0, 0.0), (0.02, 1.2), watched=~watched) is None
 
 
 def believed(samples, kind=CRAZYFLIE, dt=0.01):
