@@ -192,6 +192,8 @@ class Detector:
             self._note_rays(state.rays)
         if some(unseeing := now.t - self._scanned > SCAN_S):
             found.append(self._silent_rays(now.t, unseeing & rows.cruising))
+        watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
+        self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
         if rows.climbing is not self._climbed:  # while no row climbs it is None
             self._climbed = rows.climbing
             climbing = self._none if rows.climbing is None else rows.climbing & self._flies
