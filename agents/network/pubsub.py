@@ -90,7 +90,7 @@ def publisher(
 
 
 def source_of(publisher: zenoh.Publisher) -> zenoh.SourceInfo:
-    """What tells the samples of a plain publisher from those of another one; `session_of` reads it."""
+    """Source that a plain publisher names in its samples; `session_of` reads it."""
     return zenoh.SourceInfo(publisher.id, 0)
 
 

@@ -133,7 +133,7 @@ class ExternalPositions:
         return yaw if abs(self._flipped[row]) < FLIP else nan
 
     def disbelieve(self, row: int) -> None:
-        """What a row is told about its position is wrong, for as long as it is in motion."""
+        """Reject external positions of a row while it is in motion."""
         if self._time[row] > -np.inf:
             self.deceived[row] = self.doubted = True
 

@@ -195,7 +195,7 @@ class CaseFigures(msgspec.Struct, frozen=True):
 
     @property
     def remark(self) -> str:
-        """What a reader of the figures must know; empty: nothing."""
+        """Warning beside the figures of the run; empty: none."""
         early = [f"{self.duration_s:.1f} s of {self.planned_s:g} s"] if self.interrupted else []
         return "; ".join([*early, *self.spoiled])
 

@@ -68,7 +68,7 @@ def spoiled(cases: Sequence[CaseMetrics]) -> list[Finding]:
 
 
 def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
-    """What conductor and recorder found."""
+    """Findings of conductor and recorder."""
     return [
         Finding("bad" if any(map(spoils, case.troubles)) else "fair", f"In {case.case}: {_first_few(case.troubles)}.")
         for case in cases

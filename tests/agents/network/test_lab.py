@@ -118,7 +118,7 @@ def test_an_id_belongs_to_one_certificate():
 @pytest.mark.mechanism("stolen Zenoh id")
 @pytest.mark.system
 def test_a_thief_of_an_id_keeps_nobody_out(tmp_path, eventually):
-    """It comes first, as at a restart of the router, and again and again."""
+    """The thief comes first, as at a restart of the router, and again and again."""
     folder = tmp_path / "lab"
     authority.create(folder, {"router": "router", "operator": "operator", "CF01": "robot"})
     (endpoint,) = secured([free_endpoint(preferred_port=0, protocol="tls")], folder)

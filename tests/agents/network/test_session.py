@@ -567,7 +567,7 @@ def test_a_connection_closes_without_lingering() -> None:
 @pytest.mark.mechanism("router that closes without lingering")
 @pytest.mark.system
 def test_a_router_closes_no_connection_slowly(eventually) -> None:
-    """It serves in this process, so that its ends of the connections can be looked at."""
+    """The router serves in this process, whose ends of the connections can be read."""
     endpoint, stop = free_endpoint(preferred_port=0), threading.Event()
     thread = threading.Thread(target=serve_router, args=([endpoint], stop))
     thread.start()
