@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Columns, Index, Mask
 from agents.body.kinds import Kind
 from agents.clock import Clock
 from agents.errors import ExplainedError
 from agents.network.keys import Keys
 from agents.network.messages import Inspection
+from agents.vectors import UNKNOWN, Setpoint, Vector
+
+Attitude = tuple[float, float, float, float]  # unit quaternion w, x, y, z from the robot to the room
+NO_ATTITUDE: Final[Attitude] = (nan, nan, nan, nan)
 
 
 class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,8 +59,8 @@ class BodyRequest:
     names: tuple[str, ...]
     kinds: tuple[Kind, ...]
     addresses: tuple[str, ...]  # the `body` of the experiment file: "twin", "radio://0/80/2M/E7E7E7E701", ...
-    start: Array  # (n, 3) [m]
-    yaw: Array  # (n,) [rad]
+    start: tuple[Vector, ...]  # [m]
+    yaw: tuple[float, ...]  # [rad]
     rate_hz: float  # [1/s] of readings and commands
     seeds: tuple[int, ...]
     disturbance: tuple[Disturbance, ...]
@@ -67,86 +70,69 @@ class BodyRequest:
     keys: Keys
     clock: Clock = field(default_factory=Clock)  # of stamps on the network
 
-    def select(self, rows: Index) -> BodyRequest:
-        per_row = ("names", "kinds", "addresses", "seeds", "disturbance", "external", "device")
+    def select(self, rows: Sequence[int]) -> BodyRequest:
+        per_row = ("names", "kinds", "addresses", "start", "yaw", "seeds", "disturbance", "external", "device")
         columns: dict[str, Any] = {name: tuple(getattr(self, name)[row] for row in rows) for name in per_row}
-        return replace(self, start=self.start[rows], yaw=self.yaw[rows], **columns)
+        return replace(self, **columns)
 
 
-@dataclass(frozen=True)
-class RangeScan:
-    """Sweep of a robot's range sensors."""
+class RangeScan(msgspec.Struct, frozen=True):
+    """Sweep of a robot's range sensors; all sequences have an entry for each ray."""
 
     time: float  # [s] of the measurement, on the clock of `Body.read`
-    bearing: Array  # (m,) from the robot's nose, to the left [rad]
-    elevation: Array  # (m,) up [rad]
-    distance: Array  # (m,) from the robot's centre [m]; NaN where nothing is in reach
+    bearing: Sequence[float]  # from the robot's nose, to the left [rad]
+    elevation: Sequence[float]  # up [rad]
+    distance: Sequence[float]  # from the robot's centre [m]; NaN where nothing is in reach
 
 
-class Rays(Columns, frozen=True):
-    """The newest readings of the range sensors of any rows, one entry per ray (R)."""
-
-    row: Index  # (R,) whose ray it is; rays of one row follow one another
-    time: Array  # (R,) when it was measured, on the clock of `Body.read` [s]
-    bearing: Array  # (R,) from the robot's nose, to the left [rad]
-    elevation: Array  # (R,) up [rad]
-    distance: Array  # (R,) from the robot's centre [m]; NaN where nothing is in reach
-
-    @classmethod
-    def gather(cls, scans: Sequence[RangeScan | None]) -> Rays | None:
-        there = [(row, scan) for row, scan in enumerate(scans) if scan is not None]
-        if not there:
-            return None
-        counts = [len(scan.distance) for _, scan in there]
-        return cls(
-            np.repeat(np.array([row for row, _ in there], dtype=np.intp), counts),
-            np.repeat(np.array([scan.time for _, scan in there]), counts),
-            np.concatenate([scan.bearing for _, scan in there]),
-            np.concatenate([scan.elevation for _, scan in there]),
-            np.concatenate([scan.distance for _, scan in there]),
-        )
-
-    @classmethod
-    def of_bodies(cls, parts: Sequence[tuple[Index, Rays | None]]) -> Rays | None:
-        """The rays of several bodies, whose rows are rows `group` of the whole; None without any."""
-        there = [msgspec.structs.replace(rays, row=group[rays.row]) for group, rays in parts if rays is not None]
-        return cls.joined(there) if there else None
-
-    def scan_of(self, row: int) -> RangeScan | None:
-        mine = self.row == row
-        if not mine.any():
-            return None
-        time = float(self.time[mine].max())
-        return RangeScan(time, self.bearing[mine], self.elevation[mine], self.distance[mine])
-
-
-@dataclass
 class BodyState:
-    """State of a body. Unknown numbers are NaN."""
+    """State of the body of one robot; unknown numbers are NaN."""
 
-    time: Array  # (n,) when the pose was measured, on the clock of `read` [s]
-    position: Array  # (n, 3) measured [m]
-    velocity: Array  # (n, 3) measured or estimated [m/s]
-    yaw: Array  # (n,) measured [rad]
-    true_position: Array  # (n, 3) the truth of a twin [m]
-    true_yaw: Array  # (n,) the truth of a twin [rad]
-    battery: Array  # (n,) charge, 0 to 1
-    flying: Mask  # (n,) motors on, off the ground or about to be
-    # report of the hardware of each row (supervisor, link), for people; empty if none
-    notes: tuple[str, ...] = ()
-    rays: Rays | None = None  # readings of range sensors; None without sensors
-    # (n, 4) unit quaternion w, x, y, z from the robot to the room, of bodies that measure more than yaw
-    attitude: Array | None = None
-    # (n, 3) of the twin that runs beside each row [m], NaN for rows without one; None if there is none at all (see
-    # `agents.body.shadow_twin`)
-    shadow_position: Array | None = None
-    shadow_yaw: Array | None = None  # (n,) of that twin [rad]
-    # (n,) [s] stamp of the last external position less the time of its arrival; None without external positions
-    ahead: Array | None = None
-    # why the device of each row would refuse to take off now; empty if it would not, or does not tell
-    refusals: tuple[str, ...] = ()
-    # (n,) when the device was heard last, on the clock of `read` [s]; NaN, or None, for bodies without a device
-    heard: Array | None = None
+    __slots__ = (
+        "ahead", "attitude", "battery", "flying", "heard", "note", "position", "refusal", "scan", "shadow_position",
+        "shadow_yaw", "time", "true_position", "true_yaw", "velocity", "yaw",
+    )  # fmt: skip
+
+    time: float  # when the pose was measured, on the clock of `Body.read` [s]
+    position: Vector  # measured [m]
+    velocity: Vector  # measured or estimated [m/s]
+    yaw: float  # measured [rad]
+    true_position: Vector  # the truth of a twin [m]
+    true_yaw: float  # the truth of a twin [rad]
+    battery: float  # charge, 0 to 1
+    flying: bool  # motors on, off the ground or about to be
+    attitude: Attitude  # of bodies that measure more than yaw
+    shadow_position: Vector  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
+    shadow_yaw: float  # of that twin [rad]
+    ahead: float  # stamp of the last external position less the time of its arrival [s]
+    heard: float  # when the device was heard last, on the clock of `Body.read` [s]
+    note: str  # report of the hardware (supervisor, link), for people
+    refusal: str  # why the device would refuse to take off now; empty if it would not, or does not tell
+    scan: RangeScan | None  # the newest sweep of its range sensors
+
+    def __init__(
+        self,
+        time: float = nan,
+        position: Vector = UNKNOWN,
+        velocity: Vector = UNKNOWN,
+        yaw: float = nan,
+        *,
+        true_position: Vector = UNKNOWN,
+        true_yaw: float = nan,
+        battery: float = nan,
+        flying: bool = False,
+        attitude: Attitude = NO_ATTITUDE,
+        ahead: float = nan,
+        heard: float = nan,
+        note: str = "",
+        refusal: str = "",
+        scan: RangeScan | None = None,
+    ) -> None:
+        self.time, self.position, self.velocity, self.yaw = time, position, velocity, yaw
+        self.true_position, self.true_yaw, self.battery, self.flying = true_position, true_yaw, battery, flying
+        self.attitude, self.ahead, self.heard = attitude, ahead, heard
+        self.shadow_position, self.shadow_yaw = UNKNOWN, nan
+        self.note, self.refusal, self.scan = note, refusal, scan
 
 
 class Body(Protocol):
@@ -161,23 +147,23 @@ class Body(Protocol):
         """Connects, and returns when poses arrive; raises BodyError, with the remedy, if that fails."""
         ...
 
-    def read(self, t: float) -> BodyState:
-        """The newest state at time `t` [s] of the process's clock. Never blocks; a twin advances itself to `t`."""
+    def read(self, t: float) -> Sequence[BodyState]:
+        """The newest state of each robot at time `t` [s] of the process's clock. Never blocks; a twin advances itself to `t`."""
         ...
 
-    def command(self, setpoint: Array) -> None:
-        """Command setpoints (n, 4): x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; rows of NaN are left alone."""
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        """Command a setpoint for each robot: x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; NaN leaves it alone."""
         ...
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        """Flying rows climb to `height` (len(rows),) [m] by themselves."""
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        """Flying robots climb to `heights` [m] by themselves."""
         ...
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         """Flying rows descend and switch their motors off, ground robots halt, by themselves."""
         ...
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         """Motors off, at once, wherever the rows are: the emergency stop.
 
         The order is repeated until the device confirms that its motors are off, or counts as gone; until then `flying`
@@ -185,8 +171,8 @@ class Body(Protocol):
         """
         ...
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        """An externally measured pose of a row: (3,) [m], yaw [rad] or NaN, taken at `t` on the clock of `read`."""
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
+        """An externally measured pose of a robot: [m], yaw [rad] or NaN, taken at `t` on the clock of `read`."""
         ...
 
     def close(self) -> None:

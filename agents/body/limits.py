@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, NotNegative, Positive, Share
+from agents.vectors import NotNegative, Positive, Share, Vector
 
 
 class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -63,13 +63,13 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Limits(Safety, frozen=True):
-    """Safety settings of N rows, and the box of the arena."""
+    """Safety settings of a robot, and the box of the arena."""
 
-    low: Array  # (3,) smallest x, y, z of the arena [m]
-    high: Array  # (3,) largest x, y, z of the arena [m]
-    hold_s: Array | None = None  # (N,) `blind_s` of each row [s], where rows differ
+    low: Vector  # smallest x, y, z of the arena [m]
+    high: Vector  # largest x, y, z of the arena [m]
+    hold_s: float | None = None  # `blind_s` of this robot, where it differs [s]
 
     @property
     def top_speed(self) -> float:
         """Speed that no setpoint exceeds [m/s]; infinity: the kind's own limit is the only one."""
-        return np.inf if self.speed is None else self.speed
+        return inf if self.speed is None else self.speed

@@ -1,169 +1,167 @@
-"""Poses received from neighbours, the links that enter the law, and extrapolated positions."""
+"""Neighbours of one robot: received poses, liveliness, and which links enter its law."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
+from math import inf, isfinite
 
-import numpy as np
+import msgspec
 
-from agents.arrays import Array, Index, Mask, PoseTable, every, some
-from agents.formation.graph import Links
-from agents.plugins.predictors import HOLD, Predictor
-
-
-class NeighbourPoses:
-    """Last pose received on each link (E), and liveliness of its sender."""
-
-    def __init__(self, links: int) -> None:
-        # (E, 3) [m], NaN before the first pose; that of a former process until its successor has sent one
-        self.position: Array = np.full((links, 3), np.nan)
-        self.velocity: Array = np.zeros((links, 3))  # (E, 3) [m/s]
-        # (E,) time of measurement, limited to plausible values [s]; −inf before the first pose
-        self.stamp: Array = np.full(links, -np.inf)
-        self.arrival: Array = np.full(links, -np.inf)  # (E,) time of reception [s]
-        # (E,) loss of the sender [s]; inf: alive; −inf: liveliness token never seen, a pose is no sign of life
-        self.lost_since: Array = np.full(links, -np.inf)
-
-    def receive(self, received: PoseTable) -> PoseTable:
-        """Store poses received on links (H), in order of arrival; returns those that are newer than the known ones."""
-        if len(received.link) > 1 and some(
-            received.stamp[1:] < received.stamp[:-1]
-        ):  # of several on one link the newest stays
-            received = received.take(np.argsort(received.stamp, kind="stable"))
-        newer = received.stamp > self.stamp[received.link]
-        if not every(newer):
-            received = received.take(newer)
-        at = received.link
-        self.position[at], self.velocity[at] = received.position, received.velocity
-        self.stamp[at], self.arrival[at] = received.stamp, received.arrival
-        return received
-
-    def mark_lost(self, at: Index, t: float) -> None:
-        """Liveliness tokens of the senders of links `at` lost at `t` [s]."""
-        self.lost_since[at] = np.minimum(self.lost_since[at], t)
-
-    def mark_alive(self, at: Index) -> None:
-        """Liveliness tokens of the senders of links `at` seen, whether or not poses follow."""
-        self.lost_since[at] = np.inf
-
-    def discard(self, at: Index) -> None:
-        """Discard the poses of the senders of links `at`, which were restarted: each stands where it was last."""
-        self.velocity[at] = 0.0
-        self.stamp[at] = self.arrival[at] = -np.inf
-
-    @property
-    def silent(self) -> Mask:
-        """(E,) senders of which only the last place is known: lost, or restarted and without a pose since."""
-        return np.asarray((self.lost_since < np.inf) | (self.stamp == -np.inf))
-
-    def extrapolate_position(self, predictor: Predictor, t: float, which: Index) -> Array:
-        """Positions (K, 3) [m] at `t` [s] of the senders of links `which` (K,), each received at least once."""
-        if predictor is HOLD:
-            return self.position if len(which) == len(self.position) else self.position[which]
-        position = self.position[which]
-        return predictor.position(position, self.velocity[which], t - self.stamp[which])
-
-    def extrapolate_velocity(self, predictor: Predictor, t: float, which: Index) -> Array:
-        """Velocities (K, 3) [m/s] of these extrapolations."""
-        return predictor.velocity(self.velocity[which], t - self.stamp[which])
+from agents.body.kinds import Kind
+from agents.formation.changes import Target
+from agents.formation.link import Link
+from agents.plugins.predictors import Predictor
+from agents.vectors import UNKNOWN, ZERO, Vector, difference
 
 
-class NeighbourStates:
-    """Neighbours of rows: received poses, and which links enter the law."""
+class Incoming(msgspec.Struct, frozen=True):
+    """A link on which a robot receives poses, as the experiment has it."""
 
-    def __init__(self, links: Links, avoidance_only: Mask | None, silence_s: float) -> None:
-        """Start without poses; `avoidance_only` (E,) links never enter the law, lost ones leave after `silence_s`."""
-        self.poses = NeighbourPoses(len(links))  # of all links (E)
-        self.incomplete = True  # a sender is missing or lost, so that time alone can change the active links
-        # (E,) age of poses on arrival [s] where the sender's clock lags, else 0; None: nowhere
-        self.clock_lag: Array | None = None
-        self.refused: dict[int, str] = {}  # links of which all poses are refused, and why
-        self.foreign: dict[int, int] = {}  # number of poses from another source than the sender, by link
-        self.foreign_at = -np.inf  # time of the last of them [s]
-        self._all, self._avoidance_only, self._silence_s = links, avoidance_only, silence_s
-        self._present: Mask = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
-        self._in_law = self._available = np.zeros(len(links), dtype=bool)
-        # (K,) links in the law: pose received, sender not lost for long, part of the formation now
-        self.active: Index = np.zeros(0, dtype=np.intp)
-        self.links = links.take(self.active)  # the active links with their current targets
+    sender: int  # number among all robots of the experiment
+    name: str  # of the sender
+    kind: Kind  # of the sender
+    distance: float  # target and gain, see `Link`
+    gain: float = 1.0
+    relative: Vector = UNKNOWN
+    bearing: Vector = UNKNOWN
+    wants: int = 0
+    in_law: bool = True  # else the poses are for avoidance alone
+    awaited: bool = True  # the robot is not ready without a pose of this sender
+    targets: tuple[Target, ...] = ()  # after each change of the formation
+    since: float = -inf  # time after the common start at which the link begins [s],
+    until: float = inf  # and at which it ends [s]
+    reach: float = inf  # distance below which it begins [m]; infinity: any
+    release: float = inf  # distance above which it ends [m]; the gap to `reach` prevents flicker
 
-    def receive(self, received: PoseTable) -> None:
-        self.poses.receive(received)
 
-    def mark_lost(self, at: Index, t: float) -> None:
-        self.poses.mark_lost(at, t)
-        self.incomplete = True
+class Neighbour:
+    """Sender of one link: its target, its last pose, and its liveliness."""
 
-    def mark_alive(self, at: Index) -> None:
-        self.poses.mark_alive(at)
-        self.incomplete = True
+    __slots__ = (
+        "active", "arrival", "available", "awaited", "behind", "doubt", "foreign", "height", "in_law", "lag", "link",
+        "lost_since", "name", "position", "present", "radius", "reach", "release", "sender", "since", "stamp",
+        "targets", "until", "velocity",
+    )  # fmt: skip
 
-    def discard_poses(self, at: Index) -> None:
-        self.poses.discard(at)
-        self.incomplete = True
+    link: Link  # its target now
+    position: Vector  # last received [m], NaN before; that of a former process until its successor has sent one
+    velocity: Vector  # [m/s]
+    stamp: float  # time of measurement, limited to plausible values [s]; −inf before the first pose
+    arrival: float  # time of reception [s]
+    lost_since: float  # loss of the sender [s]; inf: alive; −inf: token never seen, a pose is no sign of life
+    available: bool  # pose received, sender not lost for long
+    present: bool  # part of the formation now
+    active: bool  # enters the law
+    behind: float  # age of its poses on arrival where its clock lags [s], else 0
+    doubt: str  # why all its poses are refused; empty: they are not
+    foreign: int  # poses from another source than the sender
 
-    def mark_clock_lag(self, at: Index, lag: float) -> None:
-        """Clocks of the senders of links `at` lag: poses are `lag` [s] old on arrival; 0: no longer."""
-        age = np.zeros(len(self._all)) if self.clock_lag is None else self.clock_lag
-        age[at] = lag
-        self.clock_lag = age if age.any() else None
-
-    def mark_refused(self, at: Collection[int], reason: str) -> None:
-        """All poses on links `at` are refused for a `reason`; empty: they are not, or no longer."""
-        refused = {link: why for link, why in self.refused.items() if link not in at}
-        self.refused = refused | (dict.fromkeys(at, reason) if reason else {})
-
-    def mark_foreign(self, at: Collection[int], count: int, t: float) -> None:
-        """Poses on links `at` came from another source than the sender until `t` [s], `count` so far."""
-        self.foreign.update(dict.fromkeys(at, count))
-        self.foreign_at = t
+    def __init__(self, incoming: Incoming) -> None:
+        self.sender, self.name = incoming.sender, incoming.name
+        self.radius, self.height, self.lag = incoming.kind.radius, incoming.kind.height, incoming.kind.lag
+        self.in_law, self.awaited, self.targets = incoming.in_law, incoming.awaited, incoming.targets
+        self.since, self.until = incoming.since, incoming.until
+        self.reach, self.release = incoming.reach, incoming.release
+        self.link = Link(incoming.distance, incoming.gain, incoming.relative, incoming.bearing, incoming.wants)
+        self.position, self.velocity = UNKNOWN, ZERO
+        self.stamp = self.arrival = self.lost_since = -inf
+        self.available = self.active = False
+        self.present = incoming.in_law
+        self.behind, self.doubt, self.foreign = 0.0, "", 0
 
     @property
-    def stamp_once_alive(self) -> Array:
-        """(E,) time of the last sample [s] on links whose sender was alive once, minus infinity on the others."""
-        return np.where(self.poses.lost_since == -np.inf, -np.inf, self.poses.stamp)
+    def silent(self) -> bool:
+        """Whether only its last place is known: it is lost, or restarted and without a pose since."""
+        return self.lost_since < inf or self.stamp == -inf
 
-    def missing_senders(self, row: int) -> Index:
-        """Senders that a row has never received, or that are lost."""
-        lacks = ~np.isfinite(self.poses.stamp) | (self.poses.lost_since < np.inf)
-        return np.asarray(self._all.sender[(self._all.receiver == row) & lacks])
+    def apart(self, position: Vector, predictor: Predictor, t: float) -> Vector:
+        """p_i − p̂_j: a robot's `position` less the believed one of this sender at `t` [s]."""
+        return difference(position, predictor.position(self, t - self.stamp))
 
-    def update_active(self, t: float) -> Index:
-        """Update the active links at `t` [s]; returns the rows for which they changed."""
-        poses = self.poses
-        known, alive = np.isfinite(poses.stamp), poses.lost_since == np.inf
-        self.incomplete = not (known & alive).all()
-        self._available = known & (t - poses.lost_since <= self._silence_s)
-        return self._select()
+    def place(self, predictor: Predictor, t: float) -> Vector:
+        """Believed position at `t` [s], NaN before the first pose. A lost sender has stopped where it was at its loss."""
+        if self.stamp == -inf:
+            return predictor.position(self, 0.0)
+        if self.lost_since < inf:
+            return predictor.position(self, max(0.0, min(t, self.lost_since) - self.stamp))
+        return predictor.position(self, t - self.stamp)
 
-    def set_targets(self, links: Links, present: Mask) -> Index:
-        """Set the targets of all `links` and which are `present` (E,); returns the rows for which that is new."""
-        before = self._all
-        self._all = links
-        self._present = present if self._avoidance_only is None else present & ~self._avoidance_only
-        changed = np.zeros(len(links), dtype=bool)
-        for old, new in zip((before.distance, before.relative, before.bearing),
-                            (links.distance, links.relative, links.bearing), strict=True):  # fmt: skip
-            if old is not None and new is not None and old is not new:
-                same = (old == new) | (np.isnan(old) & np.isnan(new))
-                changed |= ~same.reshape(len(links), -1).all(axis=1)
-        return np.concatenate([self._select(), links.receiver[changed]])
 
-    def extrapolate_all(self, predictor: Predictor, t: float) -> Array:
-        """Positions (E, 3) [m] of the senders of all links at `t` [s], NaN before the first pose.
+class Neighbours:
+    """All senders of one robot."""
 
-        A lost sender has stopped where it was at its loss.
-        """
-        poses = self.poses
-        known = np.isfinite(poses.stamp)
-        stamp = np.where(known, poses.stamp, 0.0)
-        until = np.where(poses.lost_since < np.inf, np.maximum(stamp, np.minimum(t, poses.lost_since)), t)
-        age = np.where(known, until - stamp, 0.0)
-        return predictor.position(poses.position, poses.velocity, age)
+    __slots__ = ("all", "foreign_at", "incomplete", "lagging", "refused", "silence_s")
 
-    def _select(self) -> Index:
-        in_law = self._available & self._present
-        changed: Index = self._all.receiver[in_law != self._in_law]
-        self._in_law, self.active = in_law, np.flatnonzero(in_law)
-        self.links = self._all if in_law.all() else self._all.take(in_law)
+    all: list[Neighbour]  # in the order of the links
+    incomplete: bool  # a sender is missing or lost, so that time alone can change the active links
+    lagging: bool  # the clock of a sender lags
+    refused: bool  # all poses of a sender are refused
+    foreign_at: float  # time of the last pose from another source than its sender [s]
+
+    def __init__(self, incoming: Sequence[Incoming], silence_s: float) -> None:
+        """Start without poses; lost senders leave the law after `silence_s` [s]."""
+        self.all = [Neighbour(each) for each in incoming]
+        self.incomplete, self.lagging, self.refused = True, False, False
+        self.foreign_at, self.silence_s = -inf, silence_s
+
+    def receive(self, link: int, position: Vector, velocity: Vector, stamp: float, arrival: float) -> bool:
+        """Store a pose of the sender on a link, if it is newer than the known one; returns whether it is."""
+        sender = self.all[link]
+        if not stamp > sender.stamp:
+            return False
+        sender.position, sender.velocity, sender.stamp, sender.arrival = position, velocity, stamp, arrival
+        return True
+
+    def mark_lost(self, link: int, t: float) -> None:
+        """Liveliness token of the sender lost at `t` [s]."""
+        sender = self.all[link]
+        sender.lost_since = min(sender.lost_since, t)
+        self.incomplete = True
+
+    def mark_alive(self, link: int) -> None:
+        """Liveliness token of the sender seen, whether or not poses follow."""
+        self.all[link].lost_since = inf
+        self.incomplete = True
+
+    def discard_pose(self, link: int) -> None:
+        """Discard the pose of a sender that was restarted: it stands where it was last."""
+        sender = self.all[link]
+        sender.velocity, sender.stamp, sender.arrival = ZERO, -inf, -inf
+        self.incomplete = True
+
+    def mark_clock_lag(self, link: int, lag: float) -> None:
+        """The clock of the sender lags: its poses are `lag` [s] old on arrival; 0: no longer."""
+        self.all[link].behind = lag
+        self.lagging = any(sender.behind > 0.0 for sender in self.all)
+
+    def mark_refused(self, link: int, reason: str) -> None:
+        """All poses of the sender are refused for a `reason`; empty: they are not, or no longer."""
+        self.all[link].doubt = reason
+        self.refused = any(sender.doubt for sender in self.all)
+
+    def mark_foreign(self, link: int, count: int, t: float) -> None:
+        """Poses of the sender came from another source until `t` [s], `count` so far."""
+        self.all[link].foreign, self.foreign_at = count, t
+
+    def missing(self) -> list[str]:
+        """Senders that were never received, or are lost."""
+        return [sender.name for sender in self.all if not isfinite(sender.stamp) or sender.lost_since < inf]
+
+    def update_active(self, t: float) -> bool:
+        """Update the active links at `t` [s]; returns whether they changed."""
+        complete = True
+        for sender in self.all:
+            known = isfinite(sender.stamp)
+            complete = complete and known and sender.lost_since == inf
+            sender.available = known and t - sender.lost_since <= self.silence_s
+        self.incomplete = not complete
+        return self.select()
+
+    def select(self) -> bool:
+        """Let available links that are present enter the law; returns whether that changed anything."""
+        changed = False
+        for sender in self.all:
+            active = sender.available and sender.present
+            changed = changed or active != sender.active
+            sender.active = active
         return changed

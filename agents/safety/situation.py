@@ -1,18 +1,12 @@
-"""Situation of a tick: everything that the checks of safety judge."""
+"""Situation of a tick: everything that the checks of safety judge, and the process around the decision."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import expm1
+from math import expm1, inf, isfinite, nan
 from typing import Final
 
-import msgspec
-import numpy as np
-
-from agents.arrays import Array
 from agents.body.interface import BodyState
-from agents.decision.neighbours import NeighbourStates
-from agents.safety.setpoint_filter import PoseValidity
+from agents.vectors import Vector
 
 # a neighbour silent for this long after a suspension had nothing new: missed poses come with the next heartbeat of its
 # publisher, 0.5 s after its last pose, or with the history that is requested after a reconnection
@@ -21,16 +15,20 @@ LATE_WINDOW_S: Final = 1.0  # window in which missed ticks are counted
 LATE_SHARE: Final = 0.9  # with a larger share of missed ticks the control loop fails
 
 
-@dataclass
 class ProcessHealth:
     """State of the process around a decision, set by the process."""
 
-    offline_since: float = np.inf  # loss of the router [s]; infinity while connected
-    conductor_lost_since: float = np.inf  # loss of the conductor [s]; infinity while alive, or never seen
-    missed_share: float = 0.0  # of the last ticks, 0 to 1
-    resumed_at: float = -np.inf  # end of the last suspension [s]
-    suspended_s: float = 0.0  # its duration [s]
-    connected_since: float = -np.inf  # begin of the connection to a router after it [s]
+    __slots__ = (
+        "conductor_lost_since", "connected_since", "missed_share", "offline_since", "resumed_at", "suspended_s",
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        self.offline_since = inf  # loss of the router [s]; infinity while connected
+        self.conductor_lost_since = inf  # loss of the conductor [s]; infinity while alive, or never seen
+        self.missed_share = 0.0  # of the last ticks, 0 to 1
+        self.resumed_at = -inf  # end of the last suspension [s]
+        self.suspended_s = 0.0  # its duration [s]
+        self.connected_since = -inf  # begin of the connection to a router after it [s]
 
     def mark_resumed(self, t: float, slept: float) -> None:
         """The process resumed at `t` [s] after a suspension of `slept` [s]."""
@@ -39,7 +37,7 @@ class ProcessHealth:
     def just_resumed(self, t: float) -> bool:
         """Whether poses missed in a suspension may still be on their way at `t` [s]; call it on every tick."""
         recent = t < self.connected_since + SILENT_S
-        if recent and self.offline_since < np.inf:
+        if recent and self.offline_since < inf:
             self.connected_since = t
         return recent
 
@@ -51,7 +49,7 @@ class ProcessHealth:
     @property
     def troubled(self) -> bool:
         """Whether router, conductor or control loop fails."""
-        return self.offline_since < np.inf or self.conductor_lost_since < np.inf or self.loop_failing
+        return self.offline_since < inf or self.conductor_lost_since < inf or self.missed_share > LATE_SHARE
 
     def count_tick(self, missed: int, period: float) -> None:
         """Count a tick after `missed` ones that did not take place; they are `period` apart [s]."""
@@ -62,13 +60,40 @@ class ProcessHealth:
                 self.missed_share = 0.0
 
 
-class Situation(msgspec.Struct, frozen=True):
-    """Rows (N) on a tick."""
+class Situation:
+    """One robot on a tick; overwritten on each."""
+
+    __slots__ = (
+        "excess", "flyaway", "invalid", "jump", "outside", "outside_wall", "position", "sound",
+        "state", "t", "turned", "velocity", "yaw",
+    )  # fmt: skip
 
     t: float  # now [s]
-    state: BodyState  # of the bodies
-    where: PoseValidity  # validity of their poses
-    neighbours: NeighbourStates  # of the rows
-    health: ProcessHealth  # of the process around the decision
-    jump: Array | None = None  # (N,) [m] of rows whose position jumped: `state` has none of them; None: of no row
-    turned: Array | None = None  # (N,) [rad] of those of them whose yaw jumped, NaN of others; None: of no row
+    state: BodyState  # as the body gave it; the decision uses what follows
+    position: Vector  # measured [m]; NaN where it jumped
+    velocity: Vector  # measured or estimated [m/s]
+    yaw: float  # measured [rad]
+    jump: float  # length of the jump of its position [m]; NaN: it did not jump
+    turned: float  # of its yaw [rad]; NaN: it did not
+    sound: bool  # pose known, fresh and inside the arena: the five below are False and 0
+    invalid: bool  # own pose missing, stale or not finite: no closed loop is possible
+    outside_wall: bool  # outside a wall, or above the ceiling
+    outside: bool  # outside the arena beyond any doubt
+    flyaway: bool  # so far outside that a flying robot must be stopped there
+    excess: float  # distance from the arena along the worst axis [m]; 0 inside
+
+    def __init__(self) -> None:
+        self.t, self.state, self.jump, self.turned = 0.0, BodyState(), nan, nan
+        self.take(0.0, self.state)
+        self.sound = True
+        self.invalid = self.outside_wall = self.outside = self.flyaway = False
+        self.excess = 0.0
+
+    def take(self, t: float, state: BodyState) -> None:
+        """Begin a tick at `t` [s]."""
+        self.t, self.state = t, state
+        self.position, self.velocity, self.yaw = state.position, state.velocity, state.yaw
+
+    @property
+    def jumped(self) -> bool:
+        return isfinite(self.jump)
