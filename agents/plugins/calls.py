@@ -1,31 +1,47 @@
-"""Calls of plug-ins, with errors that name them."""
+"""Errors of plug-ins, in words that name them.
+
+Ticks call plug-ins directly. One `try` stands around the tick of a robot; `explain` finds the plug-in to blame for what
+it catches.
+"""
 
 from __future__ import annotations
 
+import linecache
+import re
 import sys
-from traceback import extract_tb
+from collections.abc import Iterable
+from traceback import extract_tb, walk_tb
+from typing import Final
 
-import numpy as np
+from agents.plugins.registry import PluginError
 
-from agents.arrays import Array
-from agents.plugins.registry import FAILURES, PluginError
+LONGEST: Final = 60  # characters of a result that is shown
 
 
-def call(what: str, plugin: object, method: str, *inputs: object, shape: tuple[int, ...], each: str) -> Array:
-    """Result, as numbers, of a `method` of a plug-in, a law for example, that has this `shape`: `each` in words.
+def explain(error: Exception, plugins: Iterable[tuple[str, object]]) -> Exception:
+    """Error that names the one of `plugins` that is to blame for an exception of a tick; else the exception itself.
 
-    Raises PluginError, which names the plug-in, if it fails or gives something else.
+    A plug-in, which comes with what it is, a law for example, is to blame if its method was at work, or if the line
+    that called it could not use its result.
     """
-    try:
-        result = getattr(plugin, method)(*inputs)
-        given = np.asarray(result, dtype=float)
-    except FAILURES as error:
-        raise failure(what, plugin, error) from error
-    if result is None or given.shape != shape:
-        got = "nothing: is a `return` missing?" if result is None else str(given.shape)
-        name, file = type(plugin).__name__, _file(plugin)
-        raise PluginError(f"`{method}` of the {what} {name} must give {each}, {shape}, not {got} ({file})")
-    return given
+    if isinstance(error, PluginError):
+        return error
+    frames = list(walk_tb(error.__traceback__))
+    known = list(plugins)
+    for frame, _ in reversed(frames):
+        first = frame.f_code.co_varnames[:1]
+        owner = frame.f_locals.get(first[0]) if first else None
+        for what, plugin in known:
+            if owner is plugin and plugin is not None:
+                return failure(what, plugin, error)
+    if frames and isinstance(error, TypeError | ValueError):
+        frame, number = frames[-1]
+        called = re.findall(r"\.(\w+)\(", linecache.getline(frame.f_code.co_filename, number))
+        for what, plugin in known:
+            for method in called:
+                if callable(getattr(plugin, method, None)):
+                    return _unusable(what, plugin, method, error)
+    return error
 
 
 def failure(what: str, plugin: object, error: Exception) -> PluginError:
@@ -34,6 +50,19 @@ def failure(what: str, plugin: object, error: Exception) -> PluginError:
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
     place = f"{file}:{lines[-1]}" if lines else file
     return PluginError(f"the {what} {type(plugin).__name__} failed: {type(error).__name__}: {error} ({place})")
+
+
+def wrong(what: str, plugin: object, method: str, result: object, wanted: str) -> PluginError:
+    """Error that names a plug-in whose `method` gave a `result` other than what is `wanted`, in words."""
+    got = "nothing: is a `return` missing?" if result is None else repr(result)[:LONGEST]
+    name, file = type(plugin).__name__, _file(plugin)
+    return PluginError(f"`{method}` of the {what} {name} must give {wanted}, not {got} ({file})")
+
+
+def _unusable(what: str, plugin: object, method: str, error: Exception) -> PluginError:
+    hint = ": is a `return` missing?" if "NoneType" in str(error) else ""
+    name, file = type(plugin).__name__, _file(plugin)
+    return PluginError(f"`{method}` of the {what} {name} gives what cannot be used: {error}{hint} ({file})")
 
 
 def _file(plugin: object) -> str:

@@ -1,184 +1,214 @@
-"""Setpoint filter, the last stage before a body: limits every setpoint, whatever was decided."""
+"""Setpoint filter, the last stage before a body: limits every setpoint, whatever was decided.
+
+All of it runs on quiet ticks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from math import cos, inf, isfinite, sin, sqrt
+from typing import Final
 
-import msgspec
-import numpy as np
-
-from agents.arrays import Array, Mask, Rows, clamp, every, norm, some, span
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.plugins.calls import call
+from agents.safety.situation import Situation
+from agents.vectors import NO_SETPOINT, Setpoint, Vector, clamp
 
-FLOOR_M = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
-OUTSIDE_M = 0.25  # [m] outside the arena: no longer under control
-ABSURD = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
-BEFORE_WALL = 0.6  # share of the way to a wall that a goal may be ahead: a drone overshoots a step by a tenth
-ROUNDING = 1e-9  # smaller differences are arithmetic, not interventions
-
-
-@dataclass(frozen=True)
-class PoseValidity:
-    """Validity of the measured poses of N rows: known, fresh, inside the arena."""
-
-    all_valid: bool  # every row knows its pose, and is inside the arena
-    invalid: Mask  # (N,) own pose missing, stale or not finite: no closed loop is possible
-    outside_wall: Mask  # (N,) outside a wall, or above the ceiling
-    outside: Mask  # (N,) outside the arena beyond any doubt
-    flyaway: Mask  # (N,) so far outside that a flying row must be stopped there
-    excess: Array  # (N,) distance from the arena along the worst axis [m]; 0 inside
-
-
-class FilteredSetpoint(msgspec.Struct, frozen=True):
-    """Safe setpoints, and what was changed."""
-
-    setpoint: Array  # (N, 4) safe
-    changed: Mask  # (N,) the setpoint differs from the decided one
-    invalid_pose: Mask  # (N,) own pose missing, stale or not finite: no closed loop is possible
-    not_finite: Mask  # (N,) decided setpoint not finite although the pose is valid; the row is kept in place instead
-    avoided: Mask  # (N,) changed by avoidance
+FLOOR_M: Final = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal
+OUTSIDE_M: Final = 0.25  # [m] outside the arena: no longer under control
+ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] larger than any place, speed or angle; NaN is not smaller either
+BEFORE_WALL: Final = 0.6  # share of the way to a wall that a goal may be ahead: a drone overshoots a step by a tenth
+ROUNDING: Final = 1e-9  # smaller differences are arithmetic, not interventions
+REST: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)  # of robots that take velocities or twists
 
 
 class SetpointFilter:
-    """Filter for setpoints of rows of any kinds."""
+    """Filter for the setpoints of a robot."""
 
-    def __init__(self, kinds: Sequence[Kind], limits: Limits) -> None:
-        takes = np.array([kind.takes for kind in kinds])
-        self.limits = limits
-        position, velocity, twist = (np.flatnonzero(takes == what) for what in ("position", "velocity", "twist"))
-        self._position, self._velocity, self._twist = span(position), span(velocity), span(twist)
-        self._any_position, self._any_velocity, self._any_twist = len(position), len(velocity), len(twist)
-        self._takes_position = takes == "position"
-        self._speed = np.minimum(np.array([kind.speed for kind in kinds]), limits.top_speed)
-        # a body that closes position errors by itself goes as fast as its goal is far
-        self._closes_s = 1.0 / np.array([kind.response for kind in kinds])
-        self._step = np.minimum(limits.goal_step, self._speed * self._closes_s)
-        self._turn_rate = np.array([kind.turn_rate for kind in kinds])
-        flies = np.array([kind.flies for kind in kinds])
-        inside = np.full((len(kinds), 3), limits.margin)
-        self._low, self._high = limits.low + inside, limits.high - inside
-        # a goal on the floor would be flown into it
-        height = np.array([kind.height for kind in kinds])
-        self._low[:, 2] = np.where(flies, limits.low[2] + np.maximum(height, FLOOR_M), -np.inf)
-        self._high[~flies, 2] = np.inf  # heights do not limit ground robots
-        self._centre = 0.5 * (limits.low + limits.high)
-        self._half = 0.5 * (limits.high - limits.low)
-        self._no_row: Mask = np.zeros(len(kinds), dtype=bool)
-        self._sure = PoseValidity(True, *(self._no_row,) * 4, np.zeros(len(kinds)))
+    __slots__ = (
+        "_closes_s", "_cut_outside", "_drives", "_far", "_flies_to", "_high", "_low", "_own_silence_s",
+        "_speed", "_step", "_turn_rate", "_walls_high", "_walls_low", "avoided", "changed", "not_finite",
+    )  # fmt: skip
 
-    def validate_poses(self, position: Array, yaw: Array, age: Array) -> PoseValidity:
-        """Validity of poses: `position` (N, 3) [m], `yaw` (N,) [rad], and their `age` (N,) [s].
+    changed: bool  # the last setpoint differs from the decided one
+    avoided: bool  # it was changed by avoidance
+    not_finite: bool  # the decided one was not finite although the pose is valid: the robot is kept in place instead
+    _flies_to: bool  # the body takes positions
+    _drives: bool  # the body takes twists; one that takes neither takes velocities
+    _low: Vector  # of goals, −inf and inf where heights do not matter [m]
+    _high: Vector  # likewise
+    _walls_low: Vector  # of the arena [m]
+    _walls_high: Vector  # likewise
+    _cut_outside: float  # [m] of the limits
+    _own_silence_s: float  # [s] of the limits
+    _speed: float  # [m/s]
+    _turn_rate: float  # [rad/s]
+    _closes_s: float  # time in which the body closes a position error [s]: it goes as fast as its goal is far
+    _far: float  # way that it can drive in that time, and as long as a pose is valid [m]
+    _step: float  # longest way to a goal [m]
+
+    def __init__(self, kind: Kind, limits: Limits) -> None:
+        self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
+        self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate
+        self._closes_s = 1.0 / kind.response
+        self._far = self._speed * (self._closes_s + limits.own_silence_s)
+        self._step = min(limits.goal_step, self._speed * self._closes_s)
+        low, high, margin = limits.low, limits.high, limits.margin
+        # a goal on the floor would be flown into it; heights do not limit ground robots
+        bottom, top = (low[2] + max(kind.height, FLOOR_M), high[2] - margin) if kind.flies else (-inf, inf)
+        self._low, self._high = (low[0] + margin, low[1] + margin, bottom), (high[0] - margin, high[1] - margin, top)
+        self._walls_low, self._walls_high = low, high
+        self._cut_outside, self._own_silence_s = limits.cut_outside, limits.own_silence_s
+        self.changed = self.avoided = self.not_finite = False
+
+    def judge(self, now: Situation) -> None:
+        """Judge the pose of a situation: known, fresh, inside the arena.
 
         A pose of the future would never become old: its time is wrong.
         """
-        off = np.abs(position - self._centre)
-        known, fresh = np.abs(yaw) < ABSURD, np.abs(age) <= self.limits.own_silence_s
-        if every(off <= self._half) and every(known) and every(fresh):
-            return self._sure
-        invalid = ~np.asarray(known & fresh & (np.abs(position) < ABSURD).all(axis=1))
-        off = np.where(invalid[:, None], 0.0, off)  # an unknown pose is not outside
-        excess = np.maximum((off - self._half).max(axis=1), 0.0)
-        walls = (off[:, :2] > self._half[:2]).any(axis=1) | (~invalid & (position[:, 2] > self.limits.high[2]))
-        outside = np.asarray((off > self._half + OUTSIDE_M).any(axis=1))
-        return PoseValidity(False, invalid, np.asarray(walls), outside, excess > self.limits.cut_outside, excess)
+        x, y, z = now.position
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = self._walls_low, self._walls_high
+        inside = low_x <= x <= high_x and low_y <= y <= high_y and low_z <= z <= high_z
+        known = -ABSURD < now.yaw < ABSURD and abs(now.t - now.state.time) <= self._own_silence_s
+        if inside and known:
+            if not now.sound:
+                now.sound, now.excess = True, 0.0
+                now.invalid = now.outside_wall = now.outside = now.flyaway = False
+            return
+        now.sound, now.excess = False, 0.0
+        now.invalid = not (known and abs(x) < ABSURD and abs(y) < ABSURD and abs(z) < ABSURD)
+        now.outside_wall = now.outside = now.flyaway = False
+        if not now.invalid:  # an unknown pose is not outside
+            beside = max(low_x - x, x - high_x, low_y - y, y - high_y)
+            now.excess = max(beside, low_z - z, z - high_z, 0.0)
+            now.outside_wall = beside > 0.0 or z > high_z
+            now.outside, now.flyaway = now.excess > OUTSIDE_M, now.excess > self._cut_outside
 
-    def check(
-        self,
-        setpoint: Array,  # (N, 4) as decided, in the meaning of each row's kind
-        position: Array,  # (N, 3) measured [m]
-        yaw: Array,  # (N,) measured [rad]
-        age: Array,  # (N,) of that measurement [s]
-        *,
-        where: PoseValidity | None = None,  # validity of the pose, if known already
-        avoidance: tuple[Avoidance, OwnState, Nearby] | None = None,  # applied after all limits, with its inputs
-    ) -> FilteredSetpoint:
-        where = self.validate_poses(position, yaw, age) if where is None else where
-        sane = np.abs(setpoint) < ABSURD
-        no_row = self._no_row
-        invalid, not_finite = where.invalid, no_row
-        safe, here = setpoint.copy(), position
-        troubled = not (where.all_valid and every(sane))
-        if troubled:
-            not_finite = ~np.asarray(sane.all(axis=1) | invalid)
-            here, yaw = np.where(invalid[:, None], self._centre, position), np.where(invalid, 0.0, yaw)
-            safe[invalid | not_finite] = 0.0
-            age = np.where(invalid, 0.0, age)
-            stay = not_finite & self._takes_position
-            safe[stay, :3] = here[stay]
-        self._limit(safe, here, yaw, age)
-        avoided = no_row
-        if avoidance is not None:
-            rule, own, near = avoidance
-            inputs, each = (safe.copy(), own, near), "a setpoint per row"
-            wished = call("avoidance", rule, "restrain", *inputs, shape=safe.shape, each=each)
-            other = np.asarray((wished != safe).any(axis=1) & np.isfinite(wished).all(axis=1))
-            other &= ~(invalid | not_finite)
-            if some(other):
-                again = np.where(other[:, None], wished, safe)
-                self._limit(again, here, yaw, age)
-                again = np.where(other[:, None], again, safe)  # limits twice over may differ in the last bit
-                avoided, safe = np.asarray((np.abs(again - safe) > ROUNDING).any(axis=1)), again
-        changed = no_row
-        if safe.tobytes() != setpoint.tobytes():
-            changed = np.asarray((np.abs(safe - setpoint) > ROUNDING).any(axis=1))
-        if troubled:
-            changed = (changed | not_finite) & ~invalid
-            # a body that controls its position on board keeps its last setpoint while the position is not known here
-            safe[invalid & self._takes_position] = np.nan
-        return FilteredSetpoint(safe, changed, invalid, not_finite, avoided)
+    def limit(self, setpoint: Setpoint, now: Situation) -> Setpoint:
+        """Safe setpoint in place of a decided one, of a robot without avoidance; `now` was judged.
 
-    def _limit(self, setpoint: Array, here: Array, yaw: Array, age: Array) -> None:
-        """Bring setpoints (N, 4) within all limits, in place; rows were `here` (N, 3) [m] `age` (N,) [s] ago."""
-        if self._any_position:
-            rows = self._position
-            setpoint[rows, :3] = self._clamp_target(setpoint[rows, :3], here[rows], rows)
-        if self._any_velocity:
-            rows = self._velocity
-            setpoint[rows] = self._slow(setpoint[rows], here[rows], age[rows], rows)
-        if self._any_twist:
-            rows = self._twist
-            setpoint[rows, :2] = self._drive(setpoint[rows, :2], here[rows, :2], yaw[rows], age[rows], rows)
-
-    def _clamp_target(self, target: Array, here: Array, rows: Rows) -> Array:
-        """Goals inside the arena, not too far ahead of the robot, and before a wall that it would overshoot to."""
-        low, high = self._low[rows], self._high[rows]
-        target = clamp(target, here + BEFORE_WALL * (low - here), here + BEFORE_WALL * (high - here))
-        step = target - here
-        length, longest = norm(step), self._step[rows]
-        far = length > longest
-        if some(far):
-            target[far] = here[far] + step[far] * (longest[far] / length[far])[:, None]
-        return target
-
-    def _slow(self, velocity: Array, here: Array, age: Array, rows: Rows) -> Array:
-        """Velocities within the limits, and not out of the arena.
-
-        Toward a wall as fast as a goal on it would be closed in on, less what was flown since `here` was measured; from
-        beyond a wall, back.
+        A body that controls its position on board keeps its last setpoint while the position is not known here.
         """
-        speed, turn = self._speed[rows, None], self._turn_rate[rows]
-        seconds = (self._closes_s[rows] + np.maximum(age, 0.0))[:, None]
-        inside = clamp(velocity[:, :3], (self._low[rows] - here) / seconds, (self._high[rows] - here) / seconds)
-        velocity[:, :3] = clamp(inside, -speed, speed)
-        velocity[:, 3] = clamp(velocity[:, 3], -turn, turn)
-        return velocity
+        self.changed = self.avoided = self.not_finite = False
+        if now.invalid:
+            return NO_SETPOINT if self._flies_to else REST
+        if self._lawful(setpoint, now):
+            return setpoint
+        if is_sane(setpoint):
+            safe = self._within(setpoint, now)
+            self.changed = differ(safe, setpoint)
+            return safe
+        self.changed = self.not_finite = True
+        x, y, z = now.position
+        return self._within((x, y, z, 0.0) if self._flies_to else REST, now)
 
-    def _drive(self, twist: Array, here: Array, yaw: Array, age: Array, rows: Rows) -> Array:
-        """Twists within the limits, and not out of the arena, as `_slow`: turning on the spot is always allowed."""
-        speed, turn = self._speed[rows], self._turn_rate[rows]
-        v = clamp(twist[:, 0], -speed, speed)
-        below, above = here - self._low[rows, :2], self._high[rows, :2] - here
-        seconds = self._closes_s[rows] + np.maximum(age, 0.0)
-        if some(np.minimum(below, above) < (speed * seconds)[:, None]):
-            moves = np.empty((len(v), 2))  # `stack` takes three times as long
-            moves[:, 0], moves[:, 1] = np.cos(yaw) * v, np.sin(yaw) * v
-            most = np.maximum(np.where(moves > 0.0, above, below), 0.0) / seconds[:, None]
-            amount = np.abs(moves)
-            if some(beyond := amount > most):
-                v = v * np.where(beyond, most / np.maximum(amount, ROUNDING), 1.0).min(axis=1)
-        twist[:, 0], twist[:, 1] = v, clamp(twist[:, 1], -turn, turn)
-        return twist
+    def check(self, setpoint: Setpoint, now: Situation, avoidance: Avoidance, own: OwnState, near: Nearby) -> Setpoint:
+        """Safe setpoint as `limit`, with an avoidance, applied after all limits, and its inputs."""
+        safe = self.limit(setpoint, now)
+        if now.invalid or self.not_finite:
+            return safe
+        a, b, c, d = avoidance.restrain(safe, own, near)
+        if (a, b, c, d) == safe or not (isfinite(a) and isfinite(b) and isfinite(c) and isfinite(d)):
+            return safe
+        again = self._within((a, b, c, d), now)
+        self.avoided, self.changed = differ(again, safe), differ(again, setpoint)
+        return again
+
+    def _lawful(self, setpoint: Setpoint, now: Situation) -> bool:
+        """Whether a setpoint is within all limits, as nearly every one is; False is no proof of the contrary."""
+        a, b, c, d = setpoint
+        x, y, z = now.position
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = self._low, self._high
+        if self._drives:
+            speed, turn, far = self._speed, self._turn_rate, self._far
+            return (
+                -speed <= a <= speed and -turn <= b <= turn and c == 0.0 and d == 0.0
+                and low_x + far < x < high_x - far and low_y + far < y < high_y - far
+            )  # fmt: skip
+        if self._flies_to:
+            step_x, step_y, step_z, longest = a - x, b - y, c - z, self._step
+            return (
+                step_x * step_x + step_y * step_y + step_z * step_z < longest * longest
+                and BEFORE_WALL * (low_x - x) < step_x < BEFORE_WALL * (high_x - x)
+                and BEFORE_WALL * (low_y - y) < step_y < BEFORE_WALL * (high_y - y)
+                and BEFORE_WALL * (low_z - z) < step_z < BEFORE_WALL * (high_z - z)
+                and -ABSURD < d < ABSURD
+            )
+        speed, turn = self._speed, self._turn_rate
+        seconds = self._closes_s + max(now.t - now.state.time, 0.0)
+        return (
+            -speed <= a <= speed and -speed <= b <= speed and -speed <= c <= speed and -turn <= d <= turn
+            and low_x - x < seconds * a < high_x - x
+            and low_y - y < seconds * b < high_y - y
+            and low_z - z < seconds * c < high_z - z
+        )  # fmt: skip
+
+    def _within(self, setpoint: Setpoint, now: Situation) -> Setpoint:
+        """Setpoint within all limits."""
+        if self._drives:
+            return self._drive(setpoint, now)
+        return self._clamp_target(setpoint, now) if self._flies_to else self._slow(setpoint, now)
+
+    def _clamp_target(self, target: Setpoint, now: Situation) -> Setpoint:
+        """Goal inside the arena, not too far ahead of the robot, and before a wall that it would overshoot to."""
+        here_x, here_y, here_z = now.position
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = self._low, self._high
+        x = clamp(target[0], here_x + BEFORE_WALL * (low_x - here_x), here_x + BEFORE_WALL * (high_x - here_x))
+        y = clamp(target[1], here_y + BEFORE_WALL * (low_y - here_y), here_y + BEFORE_WALL * (high_y - here_y))
+        z = clamp(target[2], here_z + BEFORE_WALL * (low_z - here_z), here_z + BEFORE_WALL * (high_z - here_z))
+        step_x, step_y, step_z = x - here_x, y - here_y, z - here_z
+        length, longest = sqrt(step_x * step_x + step_y * step_y + step_z * step_z), self._step
+        if length > longest:
+            share = longest / length
+            x, y, z = here_x + step_x * share, here_y + step_y * share, here_z + step_z * share
+        return x, y, z, target[3]
+
+    def _slow(self, velocity: Setpoint, now: Situation) -> Setpoint:
+        """Velocity within the limits, and not out of the arena.
+
+        Toward a wall as fast as a goal on it would be closed in on, less what was flown since the pose was measured;
+        from beyond a wall, back.
+        """
+        (x, y, z), low, high, speed, turn = now.position, self._low, self._high, self._speed, self._turn_rate
+        seconds = self._closes_s + max(now.t - now.state.time, 0.0)
+        return (
+            clamp(clamp(velocity[0], (low[0] - x) / seconds, (high[0] - x) / seconds), -speed, speed),
+            clamp(clamp(velocity[1], (low[1] - y) / seconds, (high[1] - y) / seconds), -speed, speed),
+            clamp(clamp(velocity[2], (low[2] - z) / seconds, (high[2] - z) / seconds), -speed, speed),
+            clamp(velocity[3], -turn, turn),
+        )
+
+    def _drive(self, twist: Setpoint, now: Situation) -> Setpoint:
+        """Twist within the limits, and not out of the arena, as `_slow`: turning on the spot is always allowed."""
+        speed, turn = self._speed, self._turn_rate
+        v, omega = clamp(twist[0], -speed, speed), clamp(twist[1], -turn, turn)
+        (x, y, _), (low_x, low_y, _), (high_x, high_y, _) = now.position, self._low, self._high
+        seconds = self._closes_s + max(now.t - now.state.time, 0.0)
+        reach = speed * seconds
+        if x - low_x < reach or high_x - x < reach or y - low_y < reach or high_y - y < reach:
+            move_x, move_y = cos(now.yaw) * v, sin(now.yaw) * v
+            most_x = max(high_x - x if move_x > 0.0 else x - low_x, 0.0) / seconds
+            most_y = max(high_y - y if move_y > 0.0 else y - low_y, 0.0) / seconds
+            share = 1.0
+            if abs(move_x) > most_x:
+                share = most_x / max(abs(move_x), ROUNDING)
+            if abs(move_y) > most_y:
+                share = min(share, most_y / max(abs(move_y), ROUNDING))
+            v *= share
+        return v, omega, twist[2], twist[3]
+
+
+def is_sane(setpoint: Setpoint) -> bool:
+    """Whether all numbers of a setpoint are finite and of a size that occurs."""
+    a, b, c, d = setpoint
+    return -ABSURD < a < ABSURD and -ABSURD < b < ABSURD and -ABSURD < c < ABSURD and -ABSURD < d < ABSURD
+
+
+def differ(a: Setpoint, b: Setpoint) -> bool:
+    """Whether two setpoints differ by more than rounding."""
+    return (
+        abs(a[0] - b[0]) > ROUNDING
+        or abs(a[1] - b[1]) > ROUNDING
+        or abs(a[2] - b[2]) > ROUNDING
+        or abs(a[3] - b[3]) > ROUNDING
+    )
