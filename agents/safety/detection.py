@@ -1,59 +1,27 @@
-"""Detection of hazards: the causes of `agents.safety.hazards` that are present on a tick. Pure and row-wise."""
+"""Detection of hazards: the causes of `agents.safety.hazards` that are present on a tick.
+
+Quiet: all but `Detector.words`, `nearest_robot`, `clock_text` and `tilt_angle`, which tell the extent of a cause.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from itertools import chain
-from math import asin, degrees, hypot, sin
+from collections.abc import Callable
+from math import asin, degrees, hypot, inf, isfinite, nan, sin, sqrt
 from typing import Final
 
-import msgspec
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, clamp, every, norm, some
-from agents.body.interface import BodyState, Rays
+from agents.body.interface import Attitude, BodyState, RangeScan
 from agents.body.kinds import Kind
+from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
-from agents.decision.neighbours import NeighbourStates
+from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.perception import SCAN_S
-from agents.safety.hazards import Cause, Observation
-from agents.safety.landing import LOW, SLOW, Landing
+from agents.plugins.predictors import Predictor
+from agents.safety.hazards import Cause
+from agents.safety.landing import LOW, SLOW
 from agents.safety.obedience import RUSH_S, Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M
-from agents.safety.situation import ProcessHealth, Situation
-
-
-class Separation:
-    """Distances on all links (E) of rows to the senders, whether used by the law or only by avoidance."""
-
-    def __init__(self, assignment: Assignment) -> None:
-        self._assignment, links = assignment, assignment.links
-        own = np.array([kind.radius for kind in assignment.kinds])
-        theirs = np.array([kind.radius for kind in assignment.robot_kinds])
-        # (E,) distance of the axes at which two upright robots side by side touch [m]
-        self.touching = own[links.receiver] + (theirs[links.sender] if len(theirs) else 0.0)
-
-    def distances(self, t: float, position: Array, neighbours: NeighbourStates) -> Array:
-        """Distances (E,) [m] from rows at `position` (N, 3) to the extrapolated senders at `t` [s].
-
-        Infinite where nothing was received, the own position is unknown, or the sender is lost for long, or restarted
-        and without a pose since.
-        """
-        assignment, poses = self._assignment, neighbours.poses
-        believed = neighbours.extrapolate_all(assignment.predictor, t)
-        apart = norm(position[assignment.links.receiver] - believed)
-        there = np.isfinite(apart) & np.isfinite(poses.stamp)
-        there &= t - poses.lost_since <= assignment.limits.link_silence_s
-        return np.where(there, apart, np.inf)
-
-    def nearest_robot(self, row: int, distances: Array) -> tuple[float, str]:
-        """Distance of the nearest robot from a row [m], and its name."""
-        links = self._assignment.links
-        mine: Index = np.flatnonzero(links.receiver == row)
-        at = int(mine[distances[mine].argmin()])
-        return float(distances[at]), self._assignment.robots[links.sender[at]]
-
+from agents.safety.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
+from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, distance, is_finite, norm, planar
 
 SUNK: Final = 0.15  # [m] below its goal
 SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
@@ -61,377 +29,471 @@ CREEPS: Final = 0.025  # [m/s] or more slowly than this for
 STEP: Final = 0.05  # [m]
 STALLS_S: Final = 4.0  # a climb without that much more height for this long does not follow; one of
 STALLS_VELOCITY_S: Final = 10.0  # a device that is told velocities, and may need a second order to take off
-SINKS: Final = 0.15  # [m/s] and downward: the row does not fly to its goal
+SINKS: Final = 0.15  # [m/s] and downward: the robot does not fly to its goal
 AHEAD_S: Final = 0.1  # no network here is later than this: stamps further ahead come from a clock that is ahead
 FOREIGN_S: Final = 0.5  # a gap in the poses from another source does not end their hazard before
 NOT_UNIT: Final = 0.1  # quaternions whose squared norm is further than this from 1 are no attitude
 BEHIND: Final = 0.5  # share of the age at which a position is invalid: stamps this far behind give a warning
 
 
-class RowStatus(msgspec.Struct, frozen=True):
-    """Status of rows (N,) in the experiment on a tick, for `Detector.detect`."""
+class Status:
+    """Status of a robot in its experiment, for `Detector`; the robot overwrites it on each tick."""
 
-    ordered: Mask  # hold by order
-    cruising: Mask  # at their height or running: their setpoints are followed
-    climbing: Mask | None  # on their way up; None: no row is
-    landing: Mask  # descending
-    without_neighbours: Mask | None  # the law has no input; None: nowhere
-    unguided: Mask | None  # running without guidance; None: no row is guided
-    goal_stamp: Array | None  # decision time of the goals of guided rows [s], −inf for others; None: no row is guided
-    unstarted: Mask  # on their way up, or in the air, without a start order
-    goal_height: Array  # [m]
-    setpoint: Array  # (N, 4) of the tick before, NaN for rows that their bodies drive by themselves
-    not_finite: Mask  # the last setpoint was not finite
-    landing_places: Landing  # of rows that land
+    __slots__ = (
+        "alone", "aside", "climbing", "cruising", "goal_height", "goal_stamp", "landing", "not_finite", "ordered",
+        "setpoint", "unguided", "unstarted",
+    )  # fmt: skip
+
+    ordered: bool  # holds by order
+    cruising: bool  # at its height or running: its setpoints are followed
+    climbing: bool  # on its way up
+    landing: bool  # descending
+    alone: bool  # the law has no input
+    unguided: bool  # running without the guidance that it needs
+    goal_stamp: float  # decision time of the goal of a guided robot [s]; −inf: it is not guided
+    unstarted: bool  # on its way up, or in the air, without a start order
+    goal_height: float  # [m]
+    setpoint: Setpoint  # of the tick before, NaN when the body drives by itself
+    not_finite: bool  # the last setpoint was not finite
+    aside: bool  # on its way to a landing place
+
+    def __init__(self) -> None:
+        self.ordered = self.cruising = self.climbing = self.landing = self.alone = False
+        self.unguided = self.unstarted = self.not_finite = self.aside = False
+        self.goal_stamp, self.goal_height, self.setpoint = -inf, nan, NO_SETPOINT
 
 
 class Ascent:
-    """Progress of N rows that climb: straight up, as their bodies do by themselves.
+    """Progress of a climb: straight up, as bodies do by themselves.
 
-    A row whose measured height does not follow flies by a wrong one, higher and higher: its markers lie on the floor.
+    A robot whose measured height does not follow flies by a wrong one, higher and higher: its markers lie on the floor.
     """
 
-    def __init__(self, kinds: Sequence[Kind], hover: Array) -> None:
-        """Of rows of these kinds that climb to `hover` (N,) [m]."""
-        self._climbing: Mask = np.zeros(len(kinds), dtype=bool)
-        self._begin = np.full((len(kinds), 2), np.nan)
-        self._free = RUSH_S * np.array([kind.speed for kind in kinds]) + np.array([kind.radius for kind in kinds])
-        self.aside = np.zeros(len(kinds))  # (N,) distance from there, seen from above [m]
-        self.carried: Mask = self._climbing  # (N,) rows that are carried aside
-        self._hover = hover
-        self._patience = np.where([kind.takes == "velocity" for kind in kinds], STALLS_VELOCITY_S, STALLS_S)
-        self._highest, self._risen_at = np.zeros(len(kinds)), np.zeros(len(kinds))  # [m], [s]
-        self.stalled: Mask = self._climbing  # (N,) rows that are measured to stay low
-        self.amiss = False  # whether a row is carried aside or stays low
+    __slots__ = (
+        "aside", "begin", "carried", "climbing", "free", "highest", "hover", "patience_s", "risen_at", "stalled",
+    )  # fmt: skip
 
-    def update(self, t: float, climbing: Mask, flying: Mask, position: Array) -> None:
-        """Look at rows that are `climbing` and `flying` (N,) at `t` [s], at `position` (N, 3) [m]."""
-        begins, self._climbing = climbing & ~self._climbing, climbing.copy()
-        self._begin = np.where(begins[:, None], position[:, :2], self._begin)
-        self.aside = norm(position[:, :2] - self._begin)
-        self.carried = climbing & (self.aside > self._free)
-        height = position[:, 2]
-        rises = begins | ~flying | ~(height <= self._highest + STEP)
-        self._highest = np.where(rises, height, self._highest)
-        self._risen_at = np.where(rises, t, self._risen_at)
-        self.stalled = climbing & (self._hover - height > SUNK) & (t - self._risen_at > self._patience)
-        self.amiss = some(self.carried) or some(self.stalled)
+    climbing: bool  # on the last tick
+    hover: float  # height at the end [m]
+    begin: Vector  # position at the begin [m]
+    free: float  # distance from there that is no matter [m]
+    aside: float  # distance from there, seen from above [m]
+    carried: bool  # it is carried aside
+    patience_s: float  # time for a step of height [s]
+    highest: float  # last step of height [m],
+    risen_at: float  # and its time [s]
+    stalled: bool  # it is measured to stay low
+
+    def __init__(self, kind: Kind, hover: float) -> None:
+        self.hover, self.free = hover, RUSH_S * kind.speed + kind.radius
+        self.patience_s = STALLS_VELOCITY_S if kind.takes == "velocity" else STALLS_S
+        self.climbing = self.carried = self.stalled = False
+        self.begin, self.aside = UNKNOWN, 0.0
+        self.highest = self.risen_at = 0.0
+
+    def update(self, t: float, climbing: bool, flying: bool, position: Vector) -> None:
+        """Follow a robot that may be `climbing` and `flying` at `t` [s], at a `position` [m]."""
+        begins, self.climbing = climbing and not self.climbing, climbing
+        if begins:
+            self.begin = position
+        height = position[2]
+        if begins or not flying or not height <= self.highest + STEP:
+            self.highest, self.risen_at = height, t
+        self.aside = planar(position, self.begin)
+        self.carried = climbing and self.aside > self.free
+        self.stalled = climbing and self.hover - height > SUNK and t - self.risen_at > self.patience_s
 
 
 class Descent:
-    """Progress of N rows that land."""
+    """Progress of a landing."""
 
-    def __init__(self, rows: int, highest: float) -> None:
-        """A row whose height is unknown is given the time for `highest` [m]."""
-        self._highest = highest
-        self._landing: Mask = np.zeros(rows, dtype=bool)
-        self._due = np.zeros(rows)  # when they are down, at the slowest [s]
-        self._lowest, self._lowered_at = np.zeros(rows), np.zeros(rows)  # [m], [s]
+    __slots__ = ("due", "hovers", "landing", "late", "lowered_at", "lowest", "room")
 
-    def update(self, t: float, landing: Mask, valid: Mask, state: BodyState) -> tuple[Mask, Mask]:
-        """Rows (N,) whose motors do no good, and rows that hover, of those that are `landing` with a `valid` pose.
+    room: float  # height from which a robot of unknown height descends [m]
+    landing: bool  # on the last tick
+    due: float  # when it is down, at the slowest [s]
+    lowest: float  # last step of height [m],
+    lowered_at: float  # and its time [s]
+    late: bool  # its motors do no good
+    hovers: bool  # it stays at a height; it is never cut: it would fall
 
-        A row that comes down is given its time, and one that hovers level is never cut: it would fall.
+    def __init__(self, room: float) -> None:
+        self.room = room
+        self.landing = self.late = self.hovers = False
+        self.due = self.lowest = self.lowered_at = 0.0
+
+    def update(self, t: float, landing: bool, valid: bool, height: float, velocity: Vector) -> None:
+        """Follow a robot that may be `landing` at `t` [s]; the `height` [m] of a `valid` pose is known.
+
+        One that comes down is given its time.
         """
-        height = state.position[:, 2]
-        begins, self._landing = landing & ~self._landing, landing
-        lower = begins | (valid & (height < self._lowest - STEP))
-        self._lowest = np.where(lower, height, self._lowest)
-        self._lowered_at = np.where(lower, t, self._lowered_at)
-        self._due = np.where(begins, t + np.where(valid, height, self._highest) / SLOWEST, self._due)
-        still = landing & (t - self._lowered_at > STEP / CREEPS)
-        level = valid & (height > LOW) & (norm(state.velocity) < SLOW)
-        return still & ~level & (t > self._due), still & level
+        begins, self.landing = landing and not self.landing, landing
+        if begins:
+            self.due = t + (height if valid else self.room) / SLOWEST
+        if begins or (valid and height < self.lowest - STEP):
+            self.lowest, self.lowered_at = height, t
+        still = landing and t - self.lowered_at > STEP / CREEPS
+        level = valid and height > LOW and norm(velocity) < SLOW
+        self.late = still and not level and t > self.due
+        self.hovers = still and level
 
 
 class Detector:
-    """Detects causes of hazards on N rows."""
+    """Detector of the causes of hazards of one robot."""
+
+    __slots__ = (
+        "ascent", "avoids", "battery_low", "behind_s", "descent", "fastest", "fastest_squared", "flies", "lean",
+        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "separation",
+        "silence_s", "slow_squared",
+    )  # fmt: skip
+
+    name: str  # of the robot
+    limits: Limits
+    predictor: Predictor  # of neighbours
+    flies: bool
+    radius: float  # of the robot [m]
+    fastest: float  # [m/s] a faster robot has lost control
+    fastest_squared: float  # [m²/s²]
+    slow_squared: float  # slower robots neither sink nor race [m²/s²]
+    lean: float  # largest x² + y² of an attitude
+    battery_low: float
+    silence_s: float  # of the device, and of the pose, that is too long [s]
+    behind_s: float  # stamps that are older have a wrong clock [s]
+    separation: float  # least distance of robots [m]; 0: any
+    avoids: bool  # needs range readings, once there were some
+    obedience: Obedience
+    ascent: Ascent
+    descent: Descent
+    leaned: bool  # on the tick before
+    leans_since: float  # time of the first sample of that [s]
+    scan: RangeScan | None  # on the tick before
+    scanned: float  # time of the newest range readings [s]; infinity before the first
 
     def __init__(self, assignment: Assignment) -> None:
-        self._assignment, self._limits = assignment, assignment.limits
-        self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self._every_row: Mask = np.ones(len(self._flies), dtype=bool)
-        speed = np.array([kind.speed for kind in assignment.kinds])
+        kind, limits = assignment.kind, assignment.limits
+        self.name, self.limits, self.predictor = assignment.name, limits, assignment.predictor
+        self.flies, self.radius = kind.flies, kind.radius
         # the speed of flying kinds is per axis
-        self._fastest = assignment.limits.overspeed * np.where(self._flies, np.sqrt(3.0), 1.0) * speed
-        self._fastest_squared = self._fastest**2
-        self._slow_squared = np.minimum(self._fastest_squared, SINKS**2)  # slower: neither sinks nor races
-        self._all_fly = self._flies.tobytes()
-        links, avoidance_only = assignment.links, assignment.avoidance_only
-        self._in_law = np.ones(len(links), dtype=bool) if avoidance_only is None else ~avoidance_only
-        avoids = self._every_row if assignment.avoids is None else assignment.avoids
-        self._avoids = avoids & (assignment.avoidance is not None)
-        self._rays: Rays | None = None
-        # (N,) time of the newest range readings [s]; infinity before the first, and of rows that do not avoid
-        self._scanned = np.full(len(self._flies), np.inf)
-        self._separation = Separation(assignment)
-        self._obedience = Obedience(assignment.kinds)
-        self._ascent = Ascent(assignment.kinds, assignment.hover)
-        self._climbed: Mask | None = None
-        self._none: Mask = ~self._every_row
-        self._descent = Descent(len(self._flies), float(self._limits.high[2]))
-        # (N,) rows that leaned on the tick before, and the time of the first sample of that [s]
-        self._leaned, self._leans_since = self._none, np.zeros(len(self._flies))
+        self.fastest = limits.overspeed * (sqrt(3.0) if kind.flies else 1.0) * kind.speed
+        self.fastest_squared = self.fastest * self.fastest
+        self.slow_squared = min(self.fastest_squared, SINKS * SINKS)
+        half = sin(0.5 * limits.tilt)
+        self.lean = half * half
+        self.battery_low, self.silence_s = limits.battery_low, limits.own_silence_s
+        self.behind_s = BEHIND * limits.own_silence_s
+        self.separation = 0.0 if limits.separation is None else limits.separation
+        self.avoids = assignment.avoidance is not None and assignment.avoids
+        self.obedience, self.ascent = Obedience(kind), Ascent(kind, assignment.hover)
+        self.descent = Descent(limits.high[2])
+        self.leaned, self.leans_since = False, 0.0
+        self.scan, self.scanned = None, inf
 
-    def detect(self, now: Situation, rows: RowStatus) -> list[Observation]:
-        """Causes that are present."""
-        state = now.state
-        found = self._in_surroundings(now, rows)
-        squared = np.vecdot(state.velocity, state.velocity)
-        if not every(squared < self._slow_squared):
-            found.append(self._moving(state, squared, rows))
-        if some(low := state.battery < self._limits.battery_low) or state.flying.tobytes() != self._all_fly:
-            found.append(self._spent(state, low, rows))
-        if state.ahead is not None or state.attitude is not None or some(rows.landing):
-            found.append(self._measured(now.t, state, rows, ~now.where.invalid))
-        if some(rows.ordered) or some(rows.not_finite) or rows.unguided is not None:
-            found.append(self._orders(rows))
-        if state.heard is not None:
-            found.append(self._silent_devices(now.t, state.heard))
-        if state.rays is not self._rays:
-            self._note_rays(state.rays)
-        if some(unseeing := now.t - self._scanned > SCAN_S):
-            found.append(self._silent_rays(now.t, unseeing & rows.cruising))
-        watched = rows.cruising if now.where.all_valid else rows.cruising & ~now.where.invalid
-        self._obedience.update(now.t, rows.setpoint, state.position, state.yaw, watched)
-        if rows.climbing is not self._climbed:  # while no row climbs it is None
-            self._climbed = rows.climbing
-            climbing = self._none if rows.climbing is None else rows.climbing & self._flies
-            self._ascent.update(now.t, climbing, state.flying, state.position)
-        if some(self._obedience.still) or some(self._obedience.strays) or self._ascent.amiss:
-            found.append(self._disobedient(self._obedience, self._ascent))
-        if not now.where.all_valid:
-            found.append(self._position_and_arena(now))
-        if not found:  # as on most ticks
-            return []
-        return [each for each in chain.from_iterable(found) if some(each.rows)]
+    def causes(self, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> int:
+        """Causes that are present, as a set of bits `1 << cause`; call it once on every tick."""
+        t, state, found = now.t, now.state, 0
+        if self.separation > 0.0:
+            found |= self.too_near(now, neighbours)
+        if neighbours.incomplete or neighbours.lagging or neighbours.refused or t - neighbours.foreign_at < FOREIGN_S:
+            found |= self.of_neighbours(t, status, neighbours)
+        if (
+            health.offline_since < inf
+            or health.conductor_lost_since < inf
+            or health.missed_share > LATE_SHARE
+            or t < health.connected_since + SILENT_S
+        ):
+            found |= self.of_process(t, status, neighbours, health)
+        v = now.velocity
+        squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        if not squared < self.slow_squared:
+            found |= self.of_motion(now, status, squared)
+        if (
+            state.battery < self.battery_low
+            or state.flying != self.flies
+            or t - state.heard > self.silence_s
+            or state.ahead > AHEAD_S
+            or state.ahead < -self.behind_s
+        ):
+            found |= self.of_device(t, state, status)
+        if self.flies:
+            x, y = state.attitude[1], state.attitude[2]
+            if (x * x + y * y > self.lean or self.leaned) and self.leans(state):
+                found |= 1 << Cause.TILT
+            if status.climbing or self.ascent.climbing:
+                self.ascent.update(t, status.climbing, state.flying, now.position)
+        if status.landing or status.ordered or status.not_finite or status.unguided:
+            found |= self.of_orders(now, status)
+        if self.avoids and self.sees_nothing(t, state) and status.cruising:
+            found |= 1 << Cause.UNSEEING
+        obedience, ascent = self.obedience, self.ascent
+        obedience.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)
+        if obedience.still or ascent.stalled:
+            found |= 1 << Cause.STILL
+        if obedience.strays or ascent.carried:
+            found |= 1 << Cause.STRAYING
+        return found if now.sound else found | self.of_place(now)
 
-    def _in_surroundings(self, now: Situation, rows: RowStatus) -> list[Iterator[Observation]]:
-        """Causes in other robots, the network and the process."""
-        neighbours, health = now.neighbours, now.health
-        found = []
-        if self._limits.separation is not None:
-            found.append(self._separation_of_robots(now, self._limits.separation))
-        if neighbours.incomplete:
-            found.append(self._lost_neighbours(now, rows))
-        if neighbours.clock_lag is not None:
-            found.append(self._lagging(neighbours, neighbours.clock_lag))
+    def too_near(self, now: Situation, neighbours: Neighbours) -> int:
+        """Other robots that are received."""
+        near = touches = False
+        for sender in neighbours.all:
+            apart = separation(now.position, sender, self.predictor, now.t, neighbours.silence_s)
+            near = near or apart < self.separation
+            touches = touches or apart < max(0.5 * self.separation, self.radius + sender.radius)
+        if not near:
+            return 0
+        return 1 << Cause.SEPARATION | (1 << Cause.TOUCHING if touches else 0)
+
+    def of_neighbours(self, t: float, status: Status, neighbours: Neighbours) -> int:
+        """Neighbours, and their poses."""
+        found = 0
+        for sender in neighbours.all:
+            if status.cruising and is_lost(sender, t, neighbours.silence_s):
+                found |= 1 << Cause.NEIGHBOUR
+            if lags(sender):
+                found |= 1 << Cause.BEHIND
+        if neighbours.incomplete and status.alone and status.cruising:
+            found |= 1 << Cause.ALONE
         if neighbours.refused:
-            found.append(self._refused_poses(neighbours.refused))
-        if now.t - neighbours.foreign_at < FOREIGN_S:
-            found.append(self._foreign_poses(neighbours.foreign))
-        if health.just_resumed(now.t):
-            found.append(self._not_refreshed(now, rows))
-        if health.troubled:
-            found.append(self._surroundings(now.t, health, rows))
+            found |= 1 << Cause.REFUSED
+        if t - neighbours.foreign_at < FOREIGN_S:
+            found |= 1 << Cause.FOREIGN
         return found
 
-    def _receivers(self, links: Mask) -> Mask:
-        """Rows (N,) that receive on `links` (E,)."""
-        rows = np.zeros(len(self._flies), dtype=bool)
-        rows[self._assignment.links.receiver[links]] = True
-        return rows
+    def of_process(self, t: float, status: Status, neighbours: Neighbours, health: ProcessHealth) -> int:
+        """Router, conductor, control loop and suspensions."""
+        found = 0
+        if health.just_resumed(t):
+            # no new pose of an alive neighbour yet, or no new goal
+            waits = -inf < status.goal_stamp < health.resumed_at
+            for sender in neighbours.all:
+                waits = waits or (-inf < sender.stamp < health.resumed_at and not isfinite(sender.lost_since))
+            if waits:
+                found |= 1 << Cause.STANDSTILL
+        if health.offline_since < inf:
+            found |= 1 << Cause.ROUTER
+        elif health.conductor_lost_since < inf:
+            found |= 1 << Cause.CONDUCTOR
+            if status.unstarted:
+                found |= 1 << Cause.UNSTARTED
+        if health.missed_share > LATE_SHARE:
+            found |= 1 << Cause.LATE
+        return found
 
-    def _orders(self, rows: RowStatus) -> Iterator[Observation]:
-        """Operator, decision and central controller."""
-        yield Observation(Cause.ORDERED, rows.ordered, lambda _: "by an operator")
-        yield Observation(Cause.SETPOINT, rows.not_finite & rows.cruising, lambda _: "not made of finite numbers")
-        if rows.unguided is not None:
-            yield Observation(Cause.CENTRE, rows.unguided, lambda _: "its centre is gone, or its goals are old")
+    def of_motion(self, now: Situation, status: Status, squared: float) -> int:
+        """Speed, of which the square is known [m²/s²], and sinking."""
+        found = 0
+        if squared > self.fastest_squared:
+            found |= 1 << Cause.OVERSPEED
+        if self.flies and status.cruising and now.velocity[2] < -SINKS and status.goal_height - now.position[2] > SUNK:
+            found |= 1 << Cause.SINKING
+        return found
 
-    def _not_refreshed(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
-        """Rows without a new pose of every alive neighbour, or a new goal, since the process was suspended."""
-        poses, health = now.neighbours.poses, now.health
-        silent = (poses.stamp < health.resumed_at) & np.isfinite(poses.stamp) & np.isinf(poses.lost_since)
-        waits = self._receivers(silent)
-        if rows.goal_stamp is not None:
-            waits |= (rows.goal_stamp < health.resumed_at) & np.isfinite(rows.goal_stamp)
-        text = f"for {health.suspended_s:.1f} s; it waits for its neighbours"
-        yield Observation(Cause.STANDSTILL, waits, lambda _: text)
+    def of_device(self, t: float, state: BodyState, status: Status) -> int:
+        """Battery, motors, link and clock."""
+        found = 0
+        if state.battery < self.battery_low:
+            found |= 1 << Cause.BATTERY
+        if self.flies and not state.flying and status.cruising:
+            found |= 1 << Cause.FALLEN
+        if t - state.heard > self.silence_s:
+            found |= 1 << Cause.UNREACHABLE
+        if clock_off(state.ahead, self.silence_s):
+            found |= 1 << Cause.CLOCK
+        return found
 
-    def _position_and_arena(self, now: Situation) -> Iterator[Observation]:
-        t, state, where, cut = now.t, now.state, now.where, self._limits.cut_outside
+    def of_orders(self, now: Situation, status: Status) -> int:
+        """Operator, decision, central controller and landing."""
+        found = 0
+        if status.ordered:
+            found |= 1 << Cause.ORDERED
+        if status.not_finite and status.cruising:
+            found |= 1 << Cause.SETPOINT
+        if status.unguided:
+            found |= 1 << Cause.CENTRE
+        if status.landing:
+            descent = self.descent
+            descent.update(now.t, self.flies and now.state.flying, not now.invalid, now.position[2], now.velocity)
+            if descent.late:
+                found |= 1 << Cause.LANDING
+            if descent.hovers:
+                found |= 1 << Cause.HOVERING
+            if status.aside:
+                found |= 1 << Cause.BELOW
+        return found
 
-        def lost(row: int) -> str:
-            if now.turned is not None and np.isfinite(now.turned[row]):
-                return f"its yaw jumped by {now.turned[row]:.2f} rad"
-            if now.jump is not None and np.isfinite(now.jump[row]):
-                return f"it jumped by {now.jump[row]:.2f} m"
-            if not np.isfinite(state.position[row]).all():
-                return "none"
-            age = t - state.time[row]
-            return f"the last is {age:.2f} s old" if age >= 0.0 else f"it is stamped {-age:.3g} s ahead"
+    def of_place(self, now: Situation) -> int:
+        """Position and arena."""
+        found = 0
+        if now.invalid:
+            found |= 1 << Cause.POSITION
+        if now.outside:
+            found |= 1 << Cause.OUTSIDE
+        elif now.outside_wall:
+            found |= 1 << Cause.MARGIN
+        if now.flyaway and self.flies:
+            found |= 1 << Cause.FAR_OUTSIDE
+        return found
 
-        def excess(limit: float, row: int) -> str:
-            return f"{where.excess[row]:.2f} m outside (limit {limit:g} m)"
+    def leans(self, state: BodyState) -> bool:
+        """Whether it leans, by a first sample or a newer one: the first one alone, repeated, proves nothing."""
+        before, self.leaned = self.leaned, state.flying and tilted(state.attitude, self.limits.tilt)
+        if self.leaned and not before:
+            self.leans_since = state.time
+            return True
+        return self.leaned and state.time > self.leans_since
 
-        yield Observation(Cause.POSITION, where.invalid, lost)
-        yield Observation(Cause.MARGIN, where.outside_wall & ~where.outside, partial(excess, 0.0))
-        yield Observation(Cause.OUTSIDE, where.outside, partial(excess, OUTSIDE_M))
-        yield Observation(Cause.FAR_OUTSIDE, where.flyaway & self._flies, partial(excess, cut))
+    def sees_nothing(self, t: float, state: BodyState) -> bool:
+        """Whether the range readings have stopped."""
+        scan = state.scan
+        if scan is not self.scan:
+            self.scan = scan
+            if scan is not None and len(scan.distance) > 0 and isfinite(scan.time):
+                self.scanned = scan.time
+        return t - self.scanned > SCAN_S
 
-    def _measured(self, t: float, state: BodyState, rows: RowStatus, valid: Mask) -> Iterator[Observation]:
-        """Clock, tilt and landing, as the body measures them."""
-        limits = self._limits
-        if state.ahead is not None:
-            off = clock_off(state.ahead, limits.own_silence_s)
-            yield Observation(Cause.CLOCK, off, partial(clock_text, self._assignment.names, state.ahead))
-        if state.attitude is not None:
-            attitude, leans = state.attitude, self._leaning(state, state.attitude)
-            lean = f"it leans {{:.0f}}° (limit {degrees(limits.tilt):.0f}°)"
-            yield Observation(Cause.TILT, leans, lambda row: lean.format(degrees(tilt_angle(attitude, row))))
-        if some(rows.landing):
-            late, hovers = self._descent.update(t, rows.landing & self._flies & state.flying, valid, state)
-            yield Observation(Cause.LANDING, late, lambda _: f"more than {limits.landing_s:g} s without a descent")
-            yield Observation(Cause.HOVERING, hovers, lambda row: f"at {state.position[row, 2]:.2f} m")
-            yield Observation(Cause.BELOW, rows.landing_places.aside, rows.landing_places.robot_below)
+    def words(  # noqa: PLR0917 - as `causes`
+        self,
+        cause: Cause,
+        now: Situation,
+        status: Status,
+        neighbours: Neighbours,
+        health: ProcessHealth,
+        below: Callable[[], str],
+    ) -> str:
+        """Extent of a cause that the last call of `causes` found; `below` names the robot that a landing avoids."""
+        t, state, limits = now.t, now.state, self.limits
+        obedience, ascent = self.obedience, self.ascent
 
-    def _leaning(self, state: BodyState, attitude: Array) -> Mask:
-        """Rows (N,) that lean, by a first sample or a newer one: the first one alone, repeated, proves nothing."""
-        leans = tilted(attitude, self._limits.tilt) & self._flies & state.flying
-        begins, self._leaned = leans & ~self._leaned, leans
-        self._leans_since = np.where(begins, state.time, self._leans_since)
-        return np.asarray(leans & (begins | (state.time > self._leans_since)))
+        def nearest() -> str:
+            apart, other = nearest_robot(now.position, neighbours, self.predictor, t)
+            return f"{apart:.2f} m from {other} (limit {self.separation:g} m)"
 
-    def _spent(self, state: BodyState, low: Mask, rows: RowStatus) -> Iterator[Observation]:
-        """Battery, which is `low` (N,), and motors."""
-        limit = self._limits.battery_low
-        yield Observation(Cause.BATTERY, low, lambda row: f"{state.battery[row]:.0%} (limit {limit:.0%})")
-        fallen = (self._flies > state.flying) & rows.cruising
-        yield Observation(Cause.FALLEN, fallen, lambda _: "its motors are off")
+        def names() -> str:
+            return ", ".join(sender.name for sender in neighbours.all if is_lost(sender, t, neighbours.silence_s))
 
-    def _moving(self, state: BodyState, squared: Array, rows: RowStatus) -> Iterator[Observation]:
-        """Speed and sinking, of rows that move."""
-        speed, short = np.sqrt(squared), rows.goal_height - state.position[:, 2]
-        yield Observation(
-            Cause.OVERSPEED,
-            squared > self._fastest_squared,
-            lambda row: f"{speed[row]:.2f} m/s (limit {self._fastest[row]:.2f} m/s)",
-        )
-        sinks = (state.velocity[:, 2] < -SINKS) & rows.cruising & self._flies & (short > SUNK)
-        text = "{:.2f} m below its goal, and sinks at {:.2f} m/s"
-        yield Observation(Cause.SINKING, sinks, lambda row: text.format(short[row], -state.velocity[row, 2]))
-
-    def _silent_devices(self, t: float, heard: Array) -> Iterator[Observation]:
-        silent = t - heard > self._limits.own_silence_s
-        yield Observation(Cause.UNREACHABLE, silent, lambda row: f"for {t - heard[row]:.1f} s")
-
-    def _note_rays(self, rays: Rays | None) -> None:
-        """Note the time of the newest readings of rows that avoid by them."""
-        self._rays = rays
-        if rays is not None:
-            newest = np.full(len(self._flies), -np.inf)
-            np.maximum.at(newest, rays.row, rays.time)
-            self._scanned = np.where(np.isfinite(newest) & self._avoids, newest, self._scanned)
-
-    def _silent_rays(self, t: float, rows: Mask) -> Iterator[Observation]:
-        yield Observation(Cause.UNSEEING, rows, lambda row: f"for {t - self._scanned[row]:.1f} s")
-
-    def _disobedient(self, obedience: Obedience, ascent: Ascent) -> Iterator[Observation]:
-        """Rows that do not move as they are told, or move otherwise."""
-
-        def astray(row: int) -> str:
-            if ascent.carried[row]:
-                return f"{ascent.aside[row]:.2f} m aside while it climbs"
-            return f"{obedience.strayed[row]:.2f} m lately"
-
-        def still(row: int) -> str:
-            return "it does not rise" if ascent.stalled[row] else f"told {obedience.told[row]:.2f} m in vain"
-
-        yield Observation(Cause.STILL, obedience.still | ascent.stalled, still)
-        yield Observation(Cause.STRAYING, obedience.strays | ascent.carried, astray)
-
-    def _separation_of_robots(self, now: Situation, limit: float) -> Iterator[Observation]:
-        apart = self._separation.distances(now.t, now.state.position, now.neighbours)
-        near = apart < limit
-        if not some(near):
-            return
-
-        def detail(row: int) -> str:
-            distance, other = self._separation.nearest_robot(row, apart)
-            return f"{distance:.2f} m from {other} (limit {limit:g} m)"
-
-        inner = apart < np.maximum(0.5 * limit, self._separation.touching)
-        yield Observation(Cause.SEPARATION, self._receivers(near), detail)
-        yield Observation(Cause.TOUCHING, self._receivers(inner), detail)
-
-    def _lost_neighbours(self, now: Situation, rows: RowStatus) -> Iterator[Observation]:
-        links, robots = self._assignment.links, self._assignment.robots
-        since = now.neighbours.poses.lost_since
-        lost = self._in_law & np.isfinite(since) & (now.t - since > self._limits.link_silence_s)
-
-        def names(row: int) -> str:
-            return ", ".join(robots[sender] for sender in links.sender[lost & (links.receiver == row)].tolist())
-
-        yield Observation(Cause.NEIGHBOUR, self._receivers(lost) & rows.cruising, names)
-        if rows.without_neighbours is not None:
-            alone = rows.without_neighbours & rows.cruising
-            yield Observation(Cause.ALONE, alone, lambda row: names(row) or "none was received")
-
-    def _lagging(self, neighbours: NeighbourStates, behind: Array) -> Iterator[Observation]:
-        links, robots = self._assignment.links, self._assignment.robots
-        late = (behind > 0.0) & (neighbours.poses.lost_since == np.inf)
-
-        def names(row: int) -> str:
+        def late() -> str:
             return ", ".join(
-                f"the poses of {robots[links.sender[link]]} are {behind[link]:.1f} s old when they arrive"
-                for link in np.flatnonzero(late & (links.receiver == row)).tolist()
+                f"the poses of {sender.name} are {sender.behind:.1f} s old when they arrive"
+                for sender in neighbours.all
+                if lags(sender)
             )
 
-        yield Observation(Cause.BEHIND, self._receivers(late), names)
+        def foreign() -> str:
+            text = "{} poses of {} came from another source, and were not used"
+            return ", ".join(text.format(sender.foreign, sender.name) for sender in neighbours.all if sender.foreign)
 
-    def _refused_poses(self, refused: Mapping[int, str]) -> Iterator[Observation]:
-        yield self._of_senders(Cause.REFUSED, {link: f"{{}}: {reason}" for link, reason in refused.items()})
+        def outside(limit: float) -> str:
+            return f"{now.excess:.2f} m outside (limit {limit:g} m)"
 
-    def _foreign_poses(self, foreign: Mapping[int, int]) -> Iterator[Observation]:
-        text = "{} poses of {{}} came from another source, and were not used"
-        yield self._of_senders(Cause.FOREIGN, {link: text.format(count) for link, count in foreign.items()})
+        def leaning() -> str:
+            return f"it leans {degrees(tilt_angle(state.attitude)):.0f}° (limit {degrees(limits.tilt):.0f}°)"
 
-    def _of_senders(self, cause: Cause, texts: Mapping[int, str]) -> Observation:
-        """A cause in the senders on some links, each with its text, in which the name is left open."""
-        links, robots = self._assignment.links, self._assignment.robots
-        there = np.zeros(len(links), dtype=bool)
-        there[list(texts)] = True
+        def sinking() -> str:
+            short = status.goal_height - now.position[2]
+            return f"{short:.2f} m below its goal, and sinks at {-now.velocity[2]:.2f} m/s"
 
-        def detail(row: int) -> str:
-            of_row = np.flatnonzero(there & (links.receiver == row)).tolist()
-            return ", ".join(texts[link].replace("{}", robots[links.sender[link]]) for link in of_row)
-
-        return Observation(cause, self._receivers(there), detail)
-
-    def _surroundings(self, t: float, health: ProcessHealth, rows: RowStatus) -> Iterator[Observation]:
-        """Router, conductor and control loop."""
-        if health.offline_since < np.inf:
-            yield Observation(Cause.ROUTER, self._every_row, lambda _: f"for {t - health.offline_since:.1f} s")
-        elif health.conductor_lost_since < np.inf:
-            since = t - health.conductor_lost_since
-            yield Observation(Cause.CONDUCTOR, self._every_row, lambda _: f"for {since:.1f} s")
-            yield Observation(Cause.UNSTARTED, rows.unstarted, lambda _: f"the conductor is gone for {since:.1f} s")
-        if health.loop_failing:
-            text = f"{health.missed_share:.0%} of the last second's"
-            yield Observation(Cause.LATE, self._every_row, lambda _: text)
-
-
-def clock_off(ahead: Array, silence_s: float) -> Mask:
-    """Rows whose positions come from a wrong clock; `ahead` (N,) as in `BodyState`, invalid after `silence_s`."""
-    return np.asarray((ahead > AHEAD_S) | (ahead < -BEHIND * silence_s))
-
-
-def clock_text(names: Sequence[str], ahead: Array, row: int) -> str:
-    """Clock error of the positions of a row, in words; `ahead` (N,) as in `BodyState`."""
-    seconds = float(ahead[row])
-    return f"positions of {names[row]} are stamped {abs(seconds):.3g} s {'ahead' if seconds > 0.0 else 'behind'}"
-
-
-def tilted(attitude: Array, limit: float) -> Mask:
-    """Rows that lean more than `limit` [rad]; `attitude` (N, 4) as in `BodyState`, unknown ones do not."""
-    squared = np.square(clamp(attitude, -2.0, 2.0))
-    unit = np.abs(squared.sum(axis=1) - 1.0) < NOT_UNIT  # else it is no attitude
-    # a turn about the vertical has neither of these; sin² of half the angle, else
-    return np.asarray(unit & (squared[:, 1] + squared[:, 2] > sin(0.5 * limit) ** 2))
+        extents: dict[Cause, Callable[[], str]] = {
+            Cause.ORDERED: lambda: "by an operator",
+            Cause.POSITION: lambda: lost_position(now),
+            Cause.MARGIN: lambda: outside(0.0),
+            Cause.OUTSIDE: lambda: outside(OUTSIDE_M),
+            Cause.FAR_OUTSIDE: lambda: outside(limits.cut_outside),
+            Cause.SEPARATION: nearest,
+            Cause.TOUCHING: nearest,
+            Cause.OVERSPEED: lambda: f"{norm(now.velocity):.2f} m/s (limit {self.fastest:.2f} m/s)",
+            Cause.TILT: leaning,
+            Cause.NEIGHBOUR: names,
+            Cause.ALONE: lambda: names() or "none was received",
+            Cause.CENTRE: lambda: "its centre is gone, or its goals are old",
+            Cause.BATTERY: lambda: f"{state.battery:.0%} (limit {self.battery_low:.0%})",
+            Cause.ROUTER: lambda: f"for {t - health.offline_since:.1f} s",
+            Cause.CONDUCTOR: lambda: f"for {t - health.conductor_lost_since:.1f} s",
+            Cause.FALLEN: lambda: "its motors are off",
+            Cause.SETPOINT: lambda: "not made of finite numbers",
+            Cause.LATE: lambda: f"{health.missed_share:.0%} of the last second's",
+            Cause.LANDING: lambda: f"more than {limits.landing_s:g} s without a descent",
+            Cause.BELOW: below,
+            Cause.SINKING: sinking,
+            Cause.CLOCK: lambda: clock_text(self.name, state.ahead),
+            Cause.BEHIND: late,
+            Cause.FOREIGN: foreign,
+            Cause.REFUSED: lambda: ", ".join(f"{each.name}: {each.doubt}" for each in neighbours.all if each.doubt),
+            Cause.STANDSTILL: lambda: f"for {health.suspended_s:.1f} s; it waits for its neighbours",
+            Cause.STILL: lambda: "it does not rise" if ascent.stalled else f"told {obedience.told:.2f} m in vain",
+            Cause.STRAYING: lambda: (
+                f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else f"{obedience.strayed:.2f} m lately"
+            ),
+            Cause.UNREACHABLE: lambda: f"for {t - state.heard:.1f} s",
+            Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",
+            Cause.UNSEEING: lambda: f"for {t - self.scanned:.1f} s",
+            Cause.UNSTARTED: lambda: f"the conductor is gone for {t - health.conductor_lost_since:.1f} s",
+        }
+        return extents[cause]()
 
 
-def tilt_angle(attitude: Array, row: int) -> float:
-    """Angle [rad] between the upward axis of a row and that of the room."""
-    _, x, y, _ = attitude[row].tolist()
-    return 2.0 * asin(min(1.0, hypot(x, y)))
+def separation(position: Vector, sender: Neighbour, predictor: Predictor, t: float, silence_s: float) -> float:
+    """Distance [m] from a robot at `position` [m] to the believed place of a sender at `t` [s].
+
+    Infinite before its first pose, without an own position, and where the sender is lost for longer than `silence_s`,
+    or restarted and without a pose since.
+    """
+    if not isfinite(sender.stamp) or not t - sender.lost_since <= silence_s:
+        return inf
+    apart = distance(position, sender.place(predictor, t))
+    return apart if isfinite(apart) else inf
+
+
+def nearest_robot(position: Vector, neighbours: Neighbours, predictor: Predictor, t: float) -> tuple[float, str]:
+    """Distance of the nearest robot from `position` [m] at `t` [s], and its name; infinity if there is none."""
+    nearest, name = inf, ""
+    for sender in neighbours.all:
+        apart = separation(position, sender, predictor, t, neighbours.silence_s)
+        if apart < nearest:
+            nearest, name = apart, sender.name
+    return nearest, name
+
+
+def is_lost(sender: Neighbour, t: float, silence_s: float) -> bool:
+    """Whether a neighbour of the law is lost for longer than `silence_s`."""
+    return sender.in_law and isfinite(sender.lost_since) and t - sender.lost_since > silence_s
+
+
+def lags(sender: Neighbour) -> bool:
+    """Whether the clock of an alive sender is behind."""
+    return sender.behind > 0.0 and sender.lost_since == inf
+
+
+def lost_position(now: Situation) -> str:
+    """Reason why the own pose is invalid."""
+    if isfinite(now.turned):
+        return f"its yaw jumped by {now.turned:.2f} rad"
+    if isfinite(now.jump):
+        return f"it jumped by {now.jump:.2f} m"
+    if not is_finite(now.position):
+        return "none"
+    age = now.t - now.state.time
+    return f"the last is {age:.2f} s old" if age >= 0.0 else f"it is stamped {-age:.3g} s ahead"
+
+
+def clock_off(ahead: float, silence_s: float) -> bool:
+    """Whether positions come from a wrong clock; `ahead` as in `BodyState`, invalid after `silence_s`."""
+    return ahead > AHEAD_S or ahead < -BEHIND * silence_s
+
+
+def clock_text(name: str, ahead: float) -> str:
+    """Clock error of the positions of a robot, in words; `ahead` as in `BodyState`."""
+    return f"positions of {name} are stamped {abs(ahead):.3g} s {'ahead' if ahead > 0.0 else 'behind'}"
+
+
+def tilted(attitude: Attitude, limit: float) -> bool:
+    """Whether a robot leans more than `limit` [rad]; one of unknown attitude does not."""
+    w, x, y, z = attitude
+    if not abs(w * w + x * x + y * y + z * z - 1.0) < NOT_UNIT:  # it is no attitude
+        return False
+    half = sin(0.5 * limit)
+    return x * x + y * y > half * half  # a turn about the vertical has neither of these; sin² of half the angle, else
+
+
+def tilt_angle(attitude: Attitude) -> float:
+    """Angle [rad] between the upward axis of a robot and that of the room."""
+    return 2.0 * asin(min(1.0, hypot(attitude[1], attitude[2])))

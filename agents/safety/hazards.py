@@ -1,27 +1,29 @@
 """Hazards of a robot: causes, outcomes, and the state machine between them.
 
-Pure and row-wise: the causes present on a tick go in (`agents.safety.detection`), and out come the rows that must
-hold, land or have their motors cut. `Cause` is the whole definition of each.
+Pure: the causes present on a tick go in (`agents.safety.detection`), and out comes whether the robot must hold, land or
+have its motors cut. `Cause` is the whole definition of each.
 
 An outcome only becomes harder while its cause lasts: warn -> hold -> land -> cut. A hold ends when its cause has
 ended; landing and cutting never end.
+
+Quiet: `Hazards.advance`. A robot without a cause and with nothing `under_way` leaves it out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from math import inf
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, some
+from agents.body.kinds import Kind
 from agents.body.limits import Limits
 
 QUIET_S: Final = 1.0  # absence of a cause that ends its hazard: a flickering one is reported once
 ROUNDING_S: Final = 1e-9
-NEVER: Final = np.inf
+NEVER: Final = inf
+ALL: Final = -1  # bits of all causes
 OVER, UNRESOLVED = "over", "unresolved at the end"  # first words of the last incident of a hazard
 
 
@@ -41,9 +43,9 @@ class Rule:
 
     words: str  # for people
     first: Outcome  # outcome when the cause lasted for `after_s` without a break
-    after_s: float | Array = 0.0  # [s]; one number, or one for each row
+    after_s: float = 0.0  # [s]
     then: Outcome = Outcome.NONE  # outcome after `then_s`
-    then_s: float | Array = NEVER  # [s] since the cause began; one number, or one for each row
+    then_s: float = NEVER  # [s] since the cause began
     clears_s: float = 0.0  # absence of the cause that ends a hold [s]
     repeats: bool = False  # a cause that returns within `QUIET_S` counts as lasting
     place: bool = True  # a hold keeps the place where it began; else only setpoints stop
@@ -53,7 +55,7 @@ class Rule:
 
 
 class Cause(IntEnum):
-    """Cause of a hazard with its rule; the numbers, in this order, are the rows of the state machine."""
+    """Cause of a hazard with its rule; the numbers, in this order, are places in its lists and bits."""
 
     rule: Rule
 
@@ -116,9 +118,7 @@ def rules(limits: Limits) -> list[Rule]:
     chosen = {
         Cause.POSITION: {"then_s": limits.blind_s if limits.hold_s is None else limits.hold_s},
         # robots of a world, which wait longer without a position, do not move while it is paused
-        Cause.STILL: {
-            "then_s": 0.0 if limits.hold_s is None else np.where(limits.hold_s == limits.blind_s, 0.0, NEVER)
-        },
+        Cause.STILL: {"then_s": 0.0 if limits.hold_s is None or limits.hold_s == limits.blind_s else NEVER},
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
         Cause.ROUTER: {"after_s": limits.link_silence_s, "then_s": limits.offline_s},
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},
@@ -145,117 +145,149 @@ def is_blind(text: str) -> bool:
     return text.partition(": ")[2].startswith(Cause.POSITION.rule.words)
 
 
-class Observation(NamedTuple):
-    """Cause present on this tick: its rows (N,), and its extent there, in words with numbers."""
-
-    cause: Cause
-    rows: Mask
-    detail: Callable[[int], str]
-
-
 class Incident(NamedTuple):
-    """Begin, change or end of a hazard: time [s], row, cause, outcome, and text."""
+    """Begin, change or end of a hazard: time [s], cause, outcome, and text."""
 
     time: float
-    row: int
     cause: Cause
     outcome: Outcome
     text: str
 
 
 class Hazards:
-    """State machine of N rows."""
+    """State machine of one robot; a set of causes is an int with the bits `1 << cause`."""
 
-    def __init__(self, flies: Mask, limits: Limits) -> None:
-        """Of rows that fly or not (N,)."""
-        table, shape = rules(limits), (len(Cause), len(flies))
+    __slots__ = (
+        "after_s", "begun", "clears_s", "first", "held", "incidents", "landing", "last", "lasted_s", "level", "place",
+        "present", "repeats", "since", "texts", "then", "then_s", "under_way", "unresolved",
+    )  # fmt: skip
 
-        def column(name: str) -> Array:
-            return np.stack([np.broadcast_to(np.asarray(getattr(rule, name), float), shape[1:]) for rule in table])
+    held: bool  # the robot must keep its place
+    under_way: bool  # a hazard exists, or its begin or end is pending: `update` must be called
+    incidents: list[Incident]  # since the reader emptied the list
+    # as in `Rule`, by the number of the cause, or as a set
+    first: list[int]
+    after_s: list[float]
+    then: list[int]
+    then_s: list[float]
+    clears_s: list[float]
+    repeats: int
+    place: int
+    landing: int
+    # by the number of the cause, or as a set
+    since: list[float]  # begin of its presence without a break [s]; infinity: absent
+    begun: list[float]  # begin of its hazard [s]; infinity: none
+    last: list[float]  # last presence [s]
+    lasted_s: list[float]  # duration of its last hazard that ended [s]
+    level: list[int]  # outcome
+    present: int  # on the last tick
+    unresolved: int  # present until the robot ended, on the last tick
+    texts: dict[Cause, str]  # of hazards
 
-        def mask(name: str) -> Mask:
-            return np.array([[getattr(rule, name)] for rule in table], dtype=bool)
+    def __init__(self, kind: Kind, limits: Limits) -> None:
+        table = rules(limits)
+        self.first, self.after_s = [int(rule.first) for rule in table], [rule.after_s for rule in table]
+        self.then = [int(rule.then if kind.flies or rule.grounded is None else rule.grounded) for rule in table]
+        self.then_s = [rule.then_s + (0.0 if kind.flies else rule.grounded_s) for rule in table]
+        self.clears_s = [rule.clears_s for rule in table]
+        self.repeats = sum(1 << cause for cause in Cause if table[cause].repeats)
+        self.place = sum(1 << cause for cause in Cause if table[cause].place)
+        self.landing = sum(1 << cause for cause in Cause if table[cause].landing)
+        self.since, self.begun = [NEVER] * len(table), [NEVER] * len(table)
+        self.last, self.lasted_s = [-NEVER] * len(table), [0.0] * len(table)
+        self.level = [0] * len(table)
+        self.present = self.unresolved = 0
+        self.held = self.under_way = False
+        self.incidents, self.texts = [], {}
 
-        self._after, self._then_s, self._clears = column("after_s"), column("then_s"), column("clears_s")
-        self._first, then = column("first").astype(np.intp), column("then").astype(np.intp)
-        for row, rule in enumerate(table):
-            if rule.grounded is not None:
-                then[row] = np.where(flies, then[row], rule.grounded)
-            self._then_s[row] += np.where(flies, 0.0, rule.grounded_s)
-        self._then = then
-        self._repeats, self._place, self._landing = mask("repeats"), mask("place"), mask("landing")
-        self._since, self._begun, self._last = np.full((3, *shape), NEVER)
-        self._last[:] = -NEVER
-        self._level: Index = np.zeros(shape, dtype=np.intp)
-        self._present: Mask = np.zeros(shape, dtype=bool)  # on the last tick
-        self._texts: list[dict[int, str]] = [{} for _ in flies]
-        self._quiet = True
-        self.held: Mask = np.zeros(len(flies), dtype=bool)  # (N,) rows that must keep their place
-        self._no_row = self.held
-        self.incidents: list[Incident] = []  # since the reader emptied the list
-
-    def update(self, t: float, found: Sequence[Observation], active: Mask, landing: Mask) -> list[Incident]:
-        """Update at `t` [s]; returns incidents of the rows that must land or be cut now, for the first time.
-
-        Hazards are for `active` rows (N,), which climb, wait aloft or run; those with `Rule.landing` for `landing`
-        rows (N,) as well. A cause that is not among those `found` is present on no row.
-        """
-        if self._quiet and not found:
-            return []
-        now = np.zeros(self._level.shape, dtype=bool)
-        for cause, rows, _ in found:
-            now[cause] = rows
-        watched = active | (self._landing & landing)
-        now &= watched
-        before = self._level
-        self._since = np.where(now, np.minimum(self._since, t), NEVER)
-        begins = now & np.isinf(self._begun) & (t - self._since >= self._after - ROUNDING_S)
-        self._begun = np.where(begins, self._since, self._begun)
-        self._last = np.where(now, t, self._last)
-        on = np.isfinite(self._begun)
-        level = np.where(on, np.maximum(before, self._first), 0)
-        from_when = np.where(self._repeats, self._begun, self._since)
-        worse = on & now & (t - from_when >= self._then_s - ROUNDING_S)
-        level = np.where(worse, np.maximum(level, self._then), level)
-        silence = t - self._last
-        over = on & ~now & (level < Outcome.LAND) & (silence >= np.maximum(self._clears, QUIET_S) - ROUNDING_S)
-        # the cause is still there, but the row has ended
-        unresolved = on & self._present & ~watched & (level < Outcome.LAND)
-        lasted = self._last - self._begun
-        self._begun = np.where(over | unresolved, NEVER, self._begun)
-        self._level = level = np.where(over | unresolved, 0, level)
-        self._present = now
-        holds = (level == Outcome.HOLD) & self._place & (now | (silence < self._clears - ROUNDING_S))
-        self.held = np.asarray(holds.any(axis=0))
-        self._quiet = not (some(on) or some(now))
-        if not some(level != before):
-            return []
-        return self._record(t, before, lasted, unresolved, {sighting.cause: sighting for sighting in found})
-
-    def _record(
-        self, t: float, before: Index, lasted: Array, unresolved: Mask, found: Mapping[int, Observation]
+    def update(
+        self, t: float, causes: int, words: Callable[[Cause], str], *, active: bool, landing: bool
     ) -> list[Incident]:
-        """Record changes in words; returns landings and cuts, the hardest of each row last."""
-        news, causes = [], list(Cause)
-        for number, row in np.argwhere(self._level != before).tolist():
-            cause, outcome = causes[number], Outcome(self._level[number, row])
-            words = cause.rule.words
+        """Update at `t` [s] with the `causes` of this tick; returns landings and cuts that begin now, the hardest last.
+
+        Hazards are for a robot that is `active`: it climbs, waits aloft or runs; those with `Rule.landing` for one that
+        is `landing` as well. `words` gives the extent of one of the causes.
+        """
+        changed = self.advance(t, causes, active, landing)
+        return self._record(t, changed, words) if changed else []
+
+    def advance(self, t: float, causes: int, active: bool, landing: bool) -> int:
+        """Advance to `t` [s], as `update`; returns the causes whose outcome changed, as a set."""
+        watched = 0
+        if active:
+            watched = ALL
+        elif landing:
+            watched = self.landing
+        causes &= watched
+        changed = unresolved = 0
+        held = under_way = False
+        for number in range(len(self.level)):
+            bit = 1 << number
+            before = self.level[number]
+            if causes & bit:
+                self._worsen(t, number)
+                under_way = True
+            elif self.begun[number] < NEVER or self.present & bit:
+                ended = self.present & ~watched & bit  # the cause is still there, but the robot has ended
+                unresolved |= ended
+                self._calm(t, number, ended != 0)
+                under_way = under_way or self.begun[number] < NEVER
+            level = self.level[number]
+            if level != before:
+                changed |= bit
+            if level == Outcome.HOLD and self.place & bit:
+                # present, or absent for less than its time
+                held = held or causes & bit != 0 or t - self.last[number] < self.clears_s[number] - ROUNDING_S
+        self.present, self.unresolved = causes, unresolved
+        self.held, self.under_way = held, under_way
+        return changed
+
+    def _worsen(self, t: float, number: int) -> None:
+        """A cause is present at `t` [s]."""
+        self.since[number] = since = min(self.since[number], t)
+        self.last[number] = t
+        if self.begun[number] == NEVER and t - since >= self.after_s[number] - ROUNDING_S:
+            self.begun[number] = since
+        begun = self.begun[number]
+        if begun == NEVER:
+            return
+        level = max(self.level[number], self.first[number])
+        if t - (begun if self.repeats >> number & 1 else since) >= self.then_s[number] - ROUNDING_S:
+            level = max(level, self.then[number])
+        self.level[number] = level
+
+    def _calm(self, t: float, number: int, ended: bool) -> None:
+        """A cause is absent at `t` [s], or the robot has `ended`."""
+        self.since[number] = NEVER
+        if self.begun[number] == NEVER or self.level[number] >= Outcome.LAND:
+            return
+        silence = t - self.last[number]
+        if ended or silence >= max(self.clears_s[number], QUIET_S) - ROUNDING_S:
+            self.lasted_s[number] = self.last[number] - self.begun[number]
+            self.begun[number], self.level[number] = NEVER, 0
+
+    def _record(self, t: float, changed: int, words: Callable[[Cause], str]) -> list[Incident]:
+        """Record changes in words; returns landings and cuts, the hardest last."""
+        news = []
+        for cause in Cause:
+            if not changed >> cause & 1:
+                continue
+            outcome, rule = Outcome(self.level[cause]), cause.rule.words
             if outcome == Outcome.NONE:
-                end = f"{UNRESOLVED}: {words}, for" if unresolved[cause, row] else f"{OVER}: {words}, after"
-                text = f"{end} {lasted[cause, row]:.2f} s"
-                self._texts[row].pop(cause, None)
+                end = f"{UNRESOLVED}: {rule}, for" if self.unresolved >> cause & 1 else f"{OVER}: {rule}, after"
+                text = f"{end} {self.lasted_s[cause]:.2f} s"
+                self.texts.pop(cause, None)
             else:
-                text = f"{outcome.name.lower()}: {words}: {found[cause].detail(row)}"
-                self._texts[row][cause] = text
-            news.append(Incident(t, row, cause, outcome, text))
+                text = f"{outcome.name.lower()}: {rule}: {words(cause)}"
+                self.texts[cause] = text
+            news.append(Incident(t, cause, outcome, text))
         news.sort(key=lambda incident: incident.outcome)
         self.incidents += news
         return [incident for incident in news if incident.outcome >= Outcome.LAND]
 
-    def worst(self, row: int) -> str:
-        """Text of the worst hazard of a row, the outcome first; empty if it has none."""
-        texts = self._texts[row]
-        return texts[max(texts, key=lambda cause: int(self._level[cause, row]))] if texts else ""
+    def worst(self) -> str:
+        """Text of the worst hazard, the outcome first; empty without one."""
+        return self.texts[max(self.texts, key=lambda cause: self.level[cause])] if self.texts else ""
 
-    def outcome(self, row: int) -> Outcome:
-        return Outcome(self._level[:, row].max())
+    def outcome(self) -> Outcome:
+        return Outcome(max(self.level))

@@ -1,165 +1,216 @@
-"""Obedience of bodies: rows that are told to move and do not, and rows that move and are not told to. Row-wise.
+"""Obedience of a body: a robot that is told to move and does not, or that moves and is not told to.
 
 The told motion is that of the setpoint: the speed at which a body closes a position error, a velocity, or a twist along
 the nose, added up on every tick, as one that follows slow decisions is large after each and small before the next. Told
 and measured motion are compared over pieces of half a second, so that neither the rate of the measured positions nor
 their resolution matters.
+
+Quiet: all of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from math import cos, inf, isfinite, nan, sin, sqrt
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Mask, every, norm, some, span
 from agents.body.kinds import Kind
+from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector, clamp, difference, distance, dot, is_finite, norm, wrap
 
 SAMPLE_S: Final = 0.1  # in which the setpoints of all ticks are added up
+MISSED_S: Final = 2.0 * SAMPLE_S  # without a tick: what was told meanwhile is not known
 PIECE: Final = 5  # samples of which told and measured motion are compared
+PIECE_S: Final = PIECE * SAMPLE_S
 SLOW_FLIES, SLOW_WHEELS = 0.25, 0.1  # shares of a kind's speed: slower setpoints are not told to move
 MOVES: Final = 0.2  # share of the told way that a robot moves at least
 WITHOUT_S: Final = 1.5  # at a kind's top speed: so much way told and not moved is disobedience,
 LEAST_WITHOUT_S: Final = 2.0  # and at least so long
 FORGET_S: Final = 5.0  # after which motion that was not told is forgotten
+KEPT: Final = 1.0 - PIECE_S / FORGET_S  # share of it that a piece keeps of those before
 RUSH_S: Final = 0.5  # at a kind's top speed, and its size, is what it may move without being told
 ROUNDING_S: Final = 1e-6
 TURN: Final = 1.5  # [rad] what it may turn without being told, on wheels
 
 
 class Obedience:
-    """Told and measured motion of N rows."""
+    """Told and measured motion of one robot."""
 
-    def __init__(self, kinds: Sequence[Kind]) -> None:
-        takes = np.array([kind.takes for kind in kinds])
-        self._turns = takes == "twist"
-        twist, position = np.flatnonzero(self._turns), np.flatnonzero(takes == "position")
-        self._twist, self._position = span(twist), span(position)
-        self._any_twist, self._any_position = len(twist), len(position)
-        self._flies = np.array([kind.flies for kind in kinds])
-        self._speed = np.array([kind.speed for kind in kinds])
-        self._response = np.array([[kind.response] for kind in kinds if kind.takes == "position"])
-        self._top = self._speed[position]
-        self._rim = np.where(self._flies, 0.0, [kind.radius for kind in kinds])  # [m] turning moves wheels by it
-        self._slow = np.where(self._flies, SLOW_FLIES, SLOW_WHEELS) * self._speed
-        self._without = WITHOUT_S * self._speed * np.where(self._flies, 1.0, 0.5)
-        self._free = RUSH_S * self._speed + np.array([kind.radius for kind in kinds])
-        self._due = self._last = -np.inf  # next sample, last tick [s]
-        rows = len(kinds)
-        # (N,) rows that are told to move and do not, and rows that move and are not told to
-        self.still, self.strays = np.zeros((2, rows), dtype=bool)
-        # (N,) way that a row was told and has not moved [m], and that it moved and was not told
-        self.told, self.strayed = np.zeros((2, rows))
-        self._samples = 0
-        self._sample = np.zeros((rows, 4))  # told in this sample [m], [rad]
-        # told in this piece and in the one before, for a body is late: it moves when it is told no more
-        self._way, self._way_before, self._drift = np.zeros((3, rows, 3))
-        self._turn, self._turn_before, self._spin = np.zeros((3, rows))
-        self._begin, self._anchor = np.full((2, rows, 4), np.nan)  # positions [m] and yaw [rad]
-        self._told_s, self._vain_turn = np.zeros((2, rows))
-        self._vain = np.zeros((rows, 3))
+    __slots__ = (
+        "anchor", "anchor_yaw", "begin", "begin_yaw", "by_position", "by_twist", "drift", "due", "flies", "free",
+        "last", "response", "rim", "samples", "slow", "speed", "spin", "still", "strayed", "strays", "told", "told_s",
+        "turn", "turn_before", "turned", "vain", "vain_turn", "way", "way_before", "without", "x", "y", "z",
+    )  # fmt: skip
 
-    def update(self, t: float, setpoint: Array, position: Array, yaw: Array, watched: Mask) -> None:
+    still: bool  # it is told to move and does not
+    strays: bool  # it moves and is not told to
+    told: float  # way that it was told and has not moved [m]
+    strayed: float  # way that it moved and was not told [m]
+    # of its kind
+    flies: bool
+    by_position: bool  # takes positions as setpoints
+    by_twist: bool  # takes twists
+    speed: float  # [m/s]
+    response: float  # [1/s]
+    rim: float  # [m] turning moves wheels by it
+    slow: float  # slower setpoints are not told to move [m/s]
+    without: float  # least way of disobedience [m]
+    free: float  # what it may move without being told [m]
+    # told in this sample
+    last: float  # time of the last tick [s]
+    due: float  # end of the sample [s]
+    x: float  # [m]
+    y: float
+    z: float
+    turned: float  # [rad]
+    # told in this piece and in the one before, for a body is late: it moves when it is told no more
+    samples: int  # of this piece
+    way: Vector  # [m]
+    way_before: Vector
+    turn: float  # [rad]
+    turn_before: float
+    begin: Vector  # position at the begin of the piece [m]; NaN: there is none
+    begin_yaw: float  # [rad]
+    drift: Vector  # moved and not told, of late [m]
+    spin: float  # turned and not told, of late [rad]
+    # told since it moved last
+    anchor: Vector  # position then [m]
+    anchor_yaw: float  # [rad]
+    told_s: float  # [s], less the pauses
+    vain: Vector  # way [m]
+    vain_turn: float  # [rad]
+
+    def __init__(self, kind: Kind) -> None:
+        self.flies, self.speed, self.response = kind.flies, kind.speed, kind.response
+        self.by_position, self.by_twist = kind.takes == "position", kind.takes == "twist"
+        self.rim = 0.0 if kind.flies else kind.radius
+        self.slow = (SLOW_FLIES if kind.flies else SLOW_WHEELS) * kind.speed
+        self.without = WITHOUT_S * kind.speed * (1.0 if kind.flies else 0.5)
+        self.free = RUSH_S * kind.speed + kind.radius
+        self.last = self.due = -inf
+        self.x = self.y = self.z = self.turned = 0.0
+        self.samples = 0
+        self.forget(UNKNOWN, nan)
+
+    def update(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
         """Add up what was told, and compare at the end of each sample; call it on every tick, at `t` [s].
 
-        `setpoint` (N, 4) is that of the tick before, NaN without one; `position` (N, 3) [m] and `yaw` (N,) [rad] are
-        measured; `watched` rows (N,) follow their setpoints and have a valid pose.
+        `setpoint` is that of the tick before, NaN without one; `position` [m] and `yaw` [rad] are measured; a `watched`
+        robot follows its setpoints and has a valid pose.
         """
-        since, self._last = t - self._last, t
-        missed = since >= 2.0 * SAMPLE_S  # too many ticks, or it is the first one
-        if not missed:
-            told = self._told_motion(setpoint, position, yaw)
-            told *= since
-            np.copyto(told, 0.0, where=~np.isfinite(told))  # no setpoint, or no pose
-            self._sample += told
-            if t < self._due:
-                return
-        self._due = t + SAMPLE_S - ROUNDING_S
-        way, turn = self._sample[:, :3], self._sample[:, 3]
-        self._sample = np.zeros_like(self._sample)
-        here = np.concatenate([position, yaw[:, None]], axis=1)
-        watched = watched & np.isfinite(setpoint).all(axis=1) & np.isfinite(here).all(axis=1)
-        anew = np.isnan(self._begin[:, 0]) | ~watched
-        if missed or every(anew):
-            self._forget(np.ones(len(watched), dtype=bool), here)
+        since = t - self.last
+        self.last = t
+        if since >= MISSED_S:  # too many ticks, or it is the first one
+            self.end_sample(t)
+            self.forget(position, yaw)
             return
-        if some(anew):
-            self._forget(anew, here)
-        self._way += way
-        self._turn += turn
-        self._count_still(here, way, turn, watched)
-        self._samples += 1
-        if self._samples >= PIECE:
-            self._samples = 0
-            self._count_strays(here, watched)
+        if self.by_position:
+            x = self.response * (setpoint[0] - position[0])
+            y = self.response * (setpoint[1] - position[1])
+            z = self.response * (setpoint[2] - position[2])
+            speed = sqrt(x * x + y * y + z * z)
+            if speed <= self.speed:
+                self.x += x * since
+                self.y += y * since
+                self.z += z * since
+            elif speed < inf:  # with a setpoint and a pose
+                share = self.speed / speed
+                self.x += x * share * since
+                self.y += y * share * since
+                self.z += z * share * since
+        else:
+            self.add(since, setpoint, yaw)
+        if t >= self.due:
+            self.compare(t, setpoint, position, yaw, watched)
 
-    def _told_motion(self, setpoint: Array, position: Array, yaw: Array) -> Array:
-        """Told velocity and, on wheels, yaw rate (N, 4) [m/s], [rad/s]; NaN without a setpoint or a pose."""
-        told = setpoint.copy()
-        if self._any_position:
-            rows = self._position
-            toward = self._response * (setpoint[rows, :3] - position[rows])
-            told[rows, :3] = toward * np.minimum(1.0, self._top / np.maximum(norm(toward), 1e-9))[:, None]
-        told[self._flies, 3] = 0.0
-        if self._any_twist:
-            rows = self._twist
-            v, turn = setpoint[rows, 0], setpoint[rows, 1]
-            told[rows, 0], told[rows, 1], told[rows, 2] = np.cos(yaw[rows]) * v, np.sin(yaw[rows]) * v, 0.0
-            told[rows, 3] = turn
-        return told
+    def add(self, since: float, setpoint: Setpoint, yaw: float) -> None:
+        """Add the motion that a velocity or a twist tells in `since` [s]; none without a setpoint or a pose."""
+        if self.by_twist:
+            v, turn = setpoint[0], setpoint[1]
+            if v != 0.0 and isfinite(v) and isfinite(yaw):
+                self.x += cos(yaw) * v * since
+                self.y += sin(yaw) * v * since
+        else:
+            turn = 0.0 if self.flies else setpoint[3]
+            if isfinite(setpoint[0]):
+                self.x += setpoint[0] * since
+            if isfinite(setpoint[1]):
+                self.y += setpoint[1] * since
+            if isfinite(setpoint[2]):
+                self.z += setpoint[2] * since
+        if isfinite(turn):
+            self.turned += turn * since
 
-    def _count_still(self, here: Array, way: Array, turn: Array, watched: Mask) -> None:
-        """Add the `way` (N, 3) [m] and `turn` (N,) [rad] of rows that are told to move; moved rows count anew."""
-        told = norm(way) + self._rim * np.abs(turn) >= self._slow * SAMPLE_S
-        self._vain += np.where(told[:, None], way, 0.0)
-        self._vain_turn += np.where(told, turn, 0.0)
-        self._told_s += np.where(told, SAMPLE_S, -SAMPLE_S)  # a pause that was as long lets it be forgotten
-        # to and fro is no way
-        self.told = norm(self._vain) + self._rim * np.abs(self._vain_turn)
-        moved = norm(here[:, :3] - self._anchor[:, :3]) + self._rim * np.abs(_wrapped(here[:, 3] - self._anchor[:, 3]))
-        again = (moved > MOVES * np.maximum(self.told, self._without)) | (self._told_s < 0.0) | ~watched
-        if some(again):
-            for each in (self.told, self._told_s, self._vain, self._vain_turn):
-                each[again] = 0.0
-            self._anchor[again] = here[again]
-        self.still = (self.told >= self._without) & (self._told_s >= LEAST_WITHOUT_S)
+    def compare(self, t: float, setpoint: Setpoint, position: Vector, yaw: float, watched: bool) -> None:
+        """Compare told and measured motion at the end of a sample; a robot without one of them begins anew."""
+        way, turn = (self.x, self.y, self.z), self.turned
+        self.end_sample(t)
+        told = isfinite(setpoint[0]) and isfinite(setpoint[1]) and isfinite(setpoint[2]) and isfinite(setpoint[3])
+        known = is_finite(position) and isfinite(yaw)
+        if not (watched and told and known) or self.begin[0] != self.begin[0]:
+            self.forget(position, yaw)
+            return
+        before = self.way
+        self.way = before[0] + way[0], before[1] + way[1], before[2] + way[2]
+        self.turn += turn
+        self.count_still(position, yaw, way, turn)
+        self.samples += 1
+        if self.samples >= PIECE:
+            self.samples = 0
+            self.count_strays(position, yaw)
 
-    def _count_strays(self, here: Array, watched: Mask) -> None:
-        """Add what rows moved beyond the told way, against it, or aside of it, in the piece that ends."""
-        piece_s = PIECE * SAMPLE_S
-        moved, told, told_turn = (
-            here[:, :3] - self._begin[:, :3],
-            self._way + self._way_before,
-            self._turn + self._turn_before,
-        )
-        length = norm(told)
-        toward = told / np.maximum(length, 1e-9)[:, None]
-        obeyed = np.clip(np.vecdot(moved, toward), 0.0, length)
-        turned = _wrapped(here[:, 3] - self._begin[:, 3])
-        turned_free = turned - np.clip(turned, np.minimum(told_turn, 0.0), np.maximum(told_turn, 0.0))
-        # no robot is so fast: it was moved in the world, or its position comes from something else now
-        jumped = (norm(moved) > 4.0 * self._speed * piece_s) | ~watched
-        keep = 1.0 - piece_s / FORGET_S
-        self._drift = np.where(jumped[:, None], 0.0, keep * self._drift + moved - obeyed[:, None] * toward)
-        self._spin = np.where(jumped | ~self._turns, 0.0, keep * self._spin + turned_free)
-        self.strayed = norm(self._drift)
-        self.strays = (self.strayed > self._free) | (np.abs(self._spin) > TURN)
-        self._way_before, self._turn_before = self._way, self._turn
-        self._way, self._turn = np.zeros_like(self._way), np.zeros_like(self._turn)
-        self._begin = here
+    def end_sample(self, t: float) -> None:
+        self.due = t + SAMPLE_S - ROUNDING_S
+        self.x = self.y = self.z = self.turned = 0.0
 
-    def _forget(self, rows: Mask, here: Array) -> None:
-        """Rows begin anew where they are."""
-        self.still, self.strays = self.still & ~rows, self.strays & ~rows
-        for each in (
-            self.told, self._told_s, self._vain, self._vain_turn,
-            self.strayed, self._drift, self._spin, self._way, self._way_before, self._turn, self._turn_before,
-        ):  # fmt: skip
-            each[rows] = 0.0
-        self._begin, self._anchor = self._begin.copy(), self._anchor.copy()
-        self._begin[rows], self._anchor[rows] = here[rows], here[rows]
+    def count_still(self, position: Vector, yaw: float, way: Vector, turn: float) -> None:
+        """Add a `way` [m] and a `turn` [rad] that are told to move; a robot that moved counts anew."""
+        rim = self.rim
+        if norm(way) + rim * abs(turn) >= self.slow * SAMPLE_S:
+            vain = self.vain
+            self.vain = vain[0] + way[0], vain[1] + way[1], vain[2] + way[2]
+            self.vain_turn += turn
+            self.told_s += SAMPLE_S
+        else:
+            self.told_s -= SAMPLE_S  # a pause that was as long lets it be forgotten
+        told = norm(self.vain) + rim * abs(self.vain_turn)  # to and fro is no way
+        moved = distance(position, self.anchor) + rim * abs(wrap(yaw - self.anchor_yaw))
+        if moved > MOVES * max(told, self.without) or self.told_s < 0.0:
+            told = self.told_s = self.vain_turn = 0.0
+            self.vain = ZERO
+            self.anchor, self.anchor_yaw = position, yaw
+        self.told = told
+        self.still = told >= self.without and self.told_s >= LEAST_WITHOUT_S
 
+    def count_strays(self, position: Vector, yaw: float) -> None:
+        """Add what it moved beyond the told way, against it, or aside of it, in the piece that ends."""
+        moved = difference(position, self.begin)
+        x, y, z = self.way[0] + self.way_before[0], self.way[1] + self.way_before[1], self.way[2] + self.way_before[2]
+        length = sqrt(x * x + y * y + z * z)
+        least = max(length, 1e-9)
+        toward = x / least, y / least, z / least
+        obeyed = clamp(dot(moved, toward), 0.0, length)
+        if norm(moved) > 4.0 * self.speed * PIECE_S:
+            # no robot is so fast: it was moved in the world, or its position comes from something else now
+            self.drift, self.spin = ZERO, 0.0
+        else:
+            drift = self.drift
+            self.drift = (
+                KEPT * drift[0] + moved[0] - obeyed * toward[0],
+                KEPT * drift[1] + moved[1] - obeyed * toward[1],
+                KEPT * drift[2] + moved[2] - obeyed * toward[2],
+            )
+            if self.by_twist:
+                turned, told = wrap(yaw - self.begin_yaw), self.turn + self.turn_before
+                self.spin = KEPT * self.spin + (turned - clamp(turned, min(told, 0.0), max(told, 0.0)))
+        self.strayed = norm(self.drift)
+        self.strays = self.strayed > self.free or abs(self.spin) > TURN
+        self.way_before, self.turn_before = self.way, self.turn
+        self.way, self.turn = ZERO, 0.0
+        self.begin, self.begin_yaw = position, yaw
 
-def _wrapped(angle: Array) -> Array:
-    return np.asarray(np.mod(angle + np.pi, 2.0 * np.pi) - np.pi)
+    def forget(self, position: Vector, yaw: float) -> None:
+        """Begin anew at a `position` [m] and `yaw` [rad]."""
+        self.still = self.strays = False
+        self.told = self.told_s = self.strayed = self.vain_turn = self.spin = self.turn = self.turn_before = 0.0
+        self.vain = self.drift = self.way = self.way_before = ZERO
+        self.begin = self.anchor = position
+        self.begin_yaw = self.anchor_yaw = yaw
