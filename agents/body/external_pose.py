@@ -1,81 +1,94 @@
-"""External poses (motion capture), and the estimate of velocity from positions, where nothing measures it."""
+"""External poses (motion capture), and the estimate of velocity from positions, where nothing measures it.
+
+All of it runs on quiet ticks.
+"""
 
 from __future__ import annotations
 
-from typing import Final, TypeVar
+from math import inf, isfinite, isnan, nan
+from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index
 from agents.body.interface import BodyState
+from agents.vectors import UNKNOWN, ZERO, Vector
 
 SMOOTHING_S: Final = 0.1  # time constant of the velocity estimate
 FASTEST: Final = 5.0  # [m/s] a faster jump results from a mistaken marker
 FARTHEST: Final = 1e6  # [m] largest coordinate
 PATIENCE_S: Final = 0.5  # after this silence any position is accepted
 
-Number = TypeVar("Number", float, Array)
 
+def velocity_along(velocity: float, moved: float, since: float) -> float:
+    """The velocity estimate of one axis after one more measured position.
 
-def velocity_after(velocity: Number, moved: Number, since: float) -> Number:
-    """The velocity estimate after one more measured position: a low-pass with `SMOOTHING_S` on the difference quotient.
-
-    Used for motion capture and odometry. White noise σ of the positions makes σ / `SMOOTHING_S` of noise, at any rate.
-    The position `moved` [m] in `since` [s], above 0; velocities [m/s] of any shape.
+    A low-pass with `SMOOTHING_S` on the difference quotient, used for motion capture and odometry. White noise σ of the
+    positions makes σ / `SMOOTHING_S` of noise, at any rate. The position `moved` [m] in `since` [s], above 0;
+    velocities [m/s].
     """
-    share = since / (SMOOTHING_S + since)
-    return velocity + share * (moved / since - velocity)
+    return velocity + since / (SMOOTHING_S + since) * (moved / since - velocity)
+
+
+def velocity_after(velocity: Vector, moved: Vector, since: float) -> Vector:
+    """The velocity estimate after one more measured position, each axis as `velocity_along`."""
+    return (
+        velocity_along(velocity[0], moved[0], since),
+        velocity_along(velocity[1], moved[1], since),
+        velocity_along(velocity[2], moved[2], since),
+    )
 
 
 class External:
-    """The last external pose of each row, and a filtered derivative of it."""
+    """The last external pose of a robot, and a filtered derivative of it."""
 
-    def __init__(self, rows: int) -> None:
-        self.time: Array = np.full(rows, -np.inf)  # (n,) [s], minus infinity before the first pose
-        self.position: Array = np.full((rows, 3), np.nan)  # (n, 3) [m], NaN before the first pose
-        self.velocity: Array = np.zeros((rows, 3))  # (n, 3) [m/s]
-        self.yaw: Array = np.full(rows, np.nan)  # (n,) [rad], NaN while the newest pose has none
-        # (n,) last measured yaw less the body's own at that time [rad], NaN before the first; and that time [s]
-        self._turned, self._turned_at = np.full((2, rows), np.nan)
-        self.refused = 0  # poses that jumped farther than a robot can move
+    __slots__ = ("_turned", "_turned_at", "position", "refused", "time", "velocity", "yaw")
 
-    def update(self, row: int, t: float, position: Array, yaw: float) -> bool:
-        """Stores a pose; returns False if it is old, or jumps farther than a robot can move."""
-        since = t - self.time[row]
-        if not (since > 0.0 and (np.abs(position) <= FARTHEST).all()):  # NaN fails as well
+    time: float  # of the pose [s], minus infinity before the first
+    position: Vector  # [m], NaN before the first pose
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad], NaN while the newest pose has none
+    refused: int  # poses that jumped farther than a robot can move
+    _turned: float  # last measured yaw less the body's own at that time [rad], NaN before the first
+    _turned_at: float  # and that time [s]
+
+    def __init__(self) -> None:
+        self.time, self.position, self.velocity, self.yaw, self.refused = -inf, UNKNOWN, ZERO, nan, 0
+        self._turned = self._turned_at = nan
+
+    def update(self, t: float, position: Vector, yaw: float) -> bool:
+        """Store a pose; returns False if it is old, or jumps farther than a robot can move."""
+        (x, y, z), since = position, t - self.time
+        known = abs(x) <= FARTHEST and abs(y) <= FARTHEST and abs(z) <= FARTHEST
+        if not (since > 0.0 and known):  # NaN fails as well
             return False
         if since < PATIENCE_S:
-            moved = position - self.position[row]
-            if float(moved @ moved) > (FASTEST * since + 0.02) ** 2:
+            last_x, last_y, last_z = self.position
+            x, y, z = x - last_x, y - last_y, z - last_z
+            most = FASTEST * since + 0.02
+            if x * x + y * y + z * z > most * most:
                 self.refused += 1
                 return False
-            self.velocity[row] = velocity_after(self.velocity[row], moved, since)
+            self.velocity = velocity_after(self.velocity, (x, y, z), since)
         else:
-            self.velocity[row] = 0.0
-        self.time[row], self.position[row] = t, position
-        self.yaw[row] = yaw if np.isfinite(yaw) else np.nan
+            self.velocity = ZERO
+        self.time, self.position, self.yaw = t, position, yaw if isfinite(yaw) else nan
         return True
 
     def estimate(self, t: float, state: BodyState) -> None:
-        """Estimates, at `t` [s], the velocity of rows whose bodies measure none, from their positions."""
-        rows = np.flatnonzero(np.isnan(state.velocity).any(axis=1))
-        for row in rows.tolist():
-            self.update(row, float(state.time[row]), state.position[row], float(state.yaw[row]))
-        fresh = t - self.time[rows] < PATIENCE_S
-        state.velocity = state.velocity.copy()  # may be another field as well: a body has one array of unknowns
-        state.velocity[rows] = np.where(fresh[:, None], self.velocity[rows], np.nan)
+        """Estimate, at `t` [s], the velocity of a robot whose body measures none, from its positions."""
+        velocity = state.velocity
+        if isnan(velocity[0]) or isnan(velocity[1]) or isnan(velocity[2]):
+            self.update(state.time, state.position, state.yaw)
+            state.velocity = self.velocity if t - self.time < PATIENCE_S else UNKNOWN
 
-    def fill(self, state: BodyState, rows: Index) -> None:
-        """Replaces the poses of `rows` in a state of their bodies.
+    def fill(self, state: BodyState) -> None:
+        """Replace the pose in a state of the robot's body.
 
         While poses come without a yaw, it is the body's own, turned to agree with the last measured one.
         """
-        state.time[rows], state.position[rows] = self.time[rows], self.position[rows]
-        state.velocity[rows] = self.velocity[rows]
-        yaw, own = self.yaw[rows], state.yaw[rows]
-        known = np.isfinite(yaw)
-        new = known & np.isfinite(own) & (self.time[rows] != self._turned_at[rows])
-        self._turned[rows] = np.where(new, yaw - own, self._turned[rows])
-        self._turned_at[rows] = np.where(new, self.time[rows], self._turned_at[rows])
-        turned = self._turned[rows]
-        state.yaw[rows] = np.where(known, yaw, np.where(np.isnan(turned), own, own + turned))
+        state.time, state.position, state.velocity = self.time, self.position, self.velocity
+        yaw, own = self.yaw, state.yaw
+        if isfinite(yaw):
+            if isfinite(own) and self.time != self._turned_at:
+                self._turned, self._turned_at = yaw - own, self.time
+            state.yaw = yaw
+        elif not isnan(self._turned):
+            state.yaw = own + self._turned

@@ -1,19 +1,17 @@
-"""Belief in measured positions: a robot does not jump. Row-wise.
+"""Belief in measured positions: a robot does not jump.
 
 A position that jumps comes from something else now (swapped markers, another origin), or the robot was put somewhere by
 hand. One that is not believed reaches neither the decision nor, where it is measured from outside, the robot itself.
+All of it runs on quiet ticks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import isfinite, nan, pi, remainder, tau
+from math import inf, isfinite, isnan, nan, pi, remainder, sqrt, tau
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Mask, every, some
 from agents.body.kinds import Kind
+from agents.vectors import UNKNOWN, Vector, clamp
 
 JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements: it is not where its position says
 GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
@@ -23,125 +21,136 @@ MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the tim
 
 
 class Continuity:
-    """Jumps of the measured positions of N rows, and, on wheels, of their yaw, by which they drive.
+    """Jumps of the measured position of a robot, and, on wheels, of its yaw, by which it drives.
 
-    A row has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
+    It has jumped until its position is back, or until it is forgotten: an outlier lasts a sample.
     """
 
-    def __init__(self, kinds: Sequence[Kind], jump_m: Array | float = JUMP_M) -> None:
-        """A jump is longer than `jump_m`, one number or one for each row [m]."""
-        self._fastest, self._jump = REACH * np.array([kind.speed for kind in kinds]), jump_m
-        self._place, self._time = np.full((len(kinds), 3), np.nan), np.zeros(len(kinds))  # last plausible ones
-        self._wheels: Mask = np.array([kind.takes == "twist" for kind in kinds], dtype=bool)
-        self._any_wheels = some(self._wheels)
-        self._turn_rate = REACH * np.array([kind.turn_rate for kind in kinds])
-        self._yaw, self._none = np.full(len(kinds), np.nan), np.zeros(len(kinds))  # last plausible ones, no turns
-        self._out: Mask = np.zeros(len(kinds), dtype=bool)
-        self.turned: Array | None = None  # (N,) [rad] of rows whose yaw jumped, NaN of others; None: of no row
+    __slots__ = (
+        "_fastest", "_jump_m", "_place", "_squared", "_time", "_turn_rate", "_wheels", "_yaw", "jumped", "turned",
+    )  # fmt: skip
 
-    def jumps(self, time: Array, position: Array, watched: Mask, yaw: Array | None = None) -> Array | None:
-        """Lengths (N,) [m] of the jumps of rows, NaN of those that have not; None if no row has.
+    jumped: bool  # it has jumped
+    turned: float  # by what its yaw jumped [rad]; NaN: it did not
+    _jump_m: float  # a jump is longer [m]
+    _squared: float  # and that squared [m²]
+    _fastest: float  # speed that it can have [m/s]
+    _turn_rate: float  # and turn rate [rad/s]
+    _wheels: bool
+    _place: Vector  # last plausible position [m], NaN: none
+    _time: float  # and its time [s]
+    _yaw: float  # last plausible yaw [rad], NaN: none
 
-        The `position` (N, 3) [m] and `yaw` (N,) [rad] were measured at `time` (N,) [s]. A row whose yaw jumped is one
-        of them; `turned` tells by how much. Rows that are not `watched` (N,), not in motion, may be carried, and begin
-        anew unless they have jumped.
+    def __init__(self, kind: Kind, jump_m: float = JUMP_M) -> None:
+        """A jump is longer than `jump_m` [m]."""
+        self._jump_m, self._squared, self._fastest = jump_m, jump_m * jump_m, REACH * kind.speed
+        self._wheels, self._turn_rate = kind.takes == "twist", REACH * kind.turn_rate
+        self._place, self._time, self._yaw, self.jumped, self.turned = UNKNOWN, 0.0, nan, False, nan
+
+    def jump(self, time: float, position: Vector, yaw: float, watched: bool) -> float:
+        """Length [m] of the jump of the robot, or NaN.
+
+        The `position` [m] and `yaw` [rad] were measured at `time` [s]. A robot whose yaw jumped has jumped, too. One
+        that is not `watched`, not in motion, may be carried, and begins anew unless it has jumped.
         """
-        moved = position - self._place
-        squared = np.vecdot(moved, moved)
-        yaw = yaw if self._any_wheels else None
-        turns = self._none if yaw is None else self._turns(yaw)
-        if every(watched) and every(squared < self._jump**2) and every(turns < FLIP):
-            self._place, self._time, self.turned = position.copy(), time.copy(), None
-            if yaw is not None:
-                self._yaw = np.where(np.isfinite(yaw), yaw, self._yaw)
-            if some(self._out):
-                self._out = np.zeros(len(time), dtype=bool)
-            return None
-        watched = watched | self._out
-        gap, unknown = np.sqrt(squared), watched & np.isnan(position).any(axis=1)
-        known = np.isfinite(time) & np.isfinite(self._time)
-        since = np.clip(np.subtract(time, self._time, out=np.zeros_like(time), where=known), 0.0, GAP_S)
-        plausible = self._jump + np.where(self._out, 0.0, self._fastest * since)
-        turned = watched & (turns > FLIP + np.where(self._out, 0.0, self._turn_rate * since))
-        self.turned = np.where(turned, turns, np.nan) if some(turned) else None
-        self._out = (watched & ((gap > plausible) | (unknown & self._out))) | turned
-        if yaw is not None:
-            self._yaw = np.where(self._out | (watched & ~np.isfinite(yaw)), self._yaw, yaw)
-        kept = self._out | unknown
-        self._place = np.where(kept[:, None], self._place, position)
-        self._time = np.where(kept, self._time, time)
-        return np.where(self._out, gap, np.nan) if some(self._out) else None
+        (x, y, z), (last_x, last_y, last_z) = position, self._place
+        x, y, z = x - last_x, y - last_y, z - last_z
+        squared = x * x + y * y + z * z
+        if watched and squared < self._squared and (not self._wheels or abs(yaw - self._yaw) < FLIP):
+            self._place, self._time = position, time
+            if self._wheels:
+                self._yaw = yaw
+            if self.jumped:
+                self.jumped, self.turned = False, nan
+            return nan
+        return self._weigh(time, position, yaw, watched or self.jumped, sqrt(squared))
 
-    def _turns(self, yaw: Array) -> Array:
-        """Angles (N,) [rad] from the last plausible `yaw` (N,); 0 of rows without wheels, or without a yaw."""
-        known = self._wheels & np.isfinite(yaw) & np.isfinite(self._yaw)
-        angle = np.subtract(yaw, self._yaw, out=np.zeros_like(yaw), where=known)
-        return np.asarray(np.abs(np.mod(angle + pi, tau) - pi))
+    def _weigh(self, time: float, position: Vector, yaw: float, watched: bool, gap: float) -> float:
+        """`jump` of a position that is `gap` [m] from the last one, at length."""
+        elapsed = time - self._time
+        since = clamp(elapsed, 0.0, GAP_S) if isfinite(elapsed) else 0.0
+        plausible, plausible_turn = self._jump_m, FLIP
+        if not self.jumped:
+            plausible += self._fastest * since
+            plausible_turn += self._turn_rate * since
+        turn = abs((yaw - self._yaw + pi) % tau - pi) if self._wheels and isfinite(yaw) else nan  # NaN: none before
+        turned = watched and turn > plausible_turn
+        unknown = watched and (isnan(position[0]) or isnan(position[1]) or isnan(position[2]))
+        self.turned = turn if turned else nan
+        self.jumped = turned or (watched and (gap > plausible or (unknown and self.jumped)))
+        if self._wheels and not self.jumped and (isfinite(yaw) or not watched):
+            self._yaw = yaw
+        if not (self.jumped or unknown):
+            self._place, self._time = position, time
+        return gap if self.jumped else nan
 
-    def forget(self, row: int) -> None:
-        """A row is where its position says, wherever that is, and its yaw is right."""
-        self._place, self._yaw, self._out = self._place.copy(), self._yaw.copy(), self._out.copy()
-        self._place[row], self._yaw[row], self._out[row] = np.nan, np.nan, False
+    def forget(self) -> None:
+        """The robot is where its position says, wherever that is, and its yaw is right."""
+        self._place, self._yaw, self.jumped = UNKNOWN, nan, False
 
 
 class ExternalPositions:
-    """Belief in positions that are measured from outside, sample by sample, of N rows.
+    """Belief in the positions of a robot that are measured from outside, sample by sample.
 
-    In motion a row has jumped if it moved by more than its own size beyond what it can: two robots that are mistaken
-    for each other are at least that far apart. Smaller errors show as disobedience.
+    In motion it has jumped if it moved by more than its own size beyond what it can: two robots that are mistaken for
+    each other are at least that far apart. Smaller errors show as disobedience.
     """
 
-    def __init__(self, kinds: Sequence[Kind]) -> None:
-        self._rows = [Continuity([kind], 2.0 * kind.radius) for kind in kinds]
-        self._time = np.full(len(kinds), -np.inf)
-        self.jump: Array = np.full(len(kinds), np.nan)  # (N,) lengths of the jumps of rows [m], NaN of other rows
-        self.deceived: Mask = np.zeros(len(kinds), dtype=bool)  # (N,) rows whose positions are wrong for good
-        self._turn_rate = [REACH * kind.turn_rate for kind in kinds]
-        # (N,) last measured yaw [rad], its time [s], and the sum of its jumps [rad]
-        self._yaw, self._yaw_time = np.full((2, len(kinds)), np.nan)
-        self._flipped = np.zeros(len(kinds))
-        self.doubted = False  # whether a row has a position that is not believed
+    __slots__ = (
+        "_continuity", "_flipped", "_time", "_turn_rate", "_yaw", "_yaw_time", "deceived", "doubted", "jump",
+    )  # fmt: skip
 
-    def believes(self, row: int, time: float, position: Array, *, watched: bool) -> bool:
-        """Whether a row is at `position` (3,) [m], measured at `time` [s]; older ones than before are left out.
+    jump: float  # length of its jump [m]; NaN: it did not jump
+    deceived: bool  # its positions are wrong for good
+    doubted: bool  # its position is not believed
+    _continuity: Continuity
+    _time: float  # of the last position [s]
+    _turn_rate: float  # that it can have [rad/s]
+    _yaw: float  # last measured [rad]
+    _yaw_time: float  # and when [s]
+    _flipped: float  # sum of the jumps of the yaw [rad]
 
-        `watched`: the row is in motion. At rest it may be carried.
+    def __init__(self, kind: Kind) -> None:
+        self._continuity, self._turn_rate = Continuity(kind, 2.0 * kind.radius), REACH * kind.turn_rate
+        self._time, self._yaw, self._yaw_time, self._flipped = -inf, nan, nan, 0.0
+        self.jump, self.deceived, self.doubted = nan, False, False
+
+    def believes(self, time: float, position: Vector, *, watched: bool) -> bool:
+        """Whether the robot is at `position` [m], measured at `time` [s]; older ones than before are left out.
+
+        `watched`: it is in motion. At rest it may be carried.
         """
-        if time <= self._time[row]:
+        if time <= self._time:
             return False
-        self._time[row] = time
+        self._time = time
         if not watched:
-            self.deceived[row] = False
-            self._rows[row].forget(0)
-        jump = self._rows[row].jumps(np.array([time]), position[None], np.array([watched]))
-        self._note(row, np.nan if jump is None else float(jump[0]))
-        return jump is None and not self.deceived[row]
+            self.deceived = False
+            self._continuity.forget()
+        self.jump = self._continuity.jump(time, position, 0.0, watched)
+        self.doubted = self.deceived or not isnan(self.jump)
+        return not (self.deceived or self._continuity.jumped)
 
-    def believed_yaw(self, row: int, time: float, yaw: float, *, watched: bool) -> float:
-        """The `yaw` [rad] of a row that is measured at `time` [s]; NaN while it is known to be wrong.
+    def believed_yaw(self, time: float, yaw: float, *, watched: bool) -> float:
+        """The `yaw` [rad] that is measured at `time` [s]; NaN while it is known to be wrong.
 
         Markers that look the same when turned make it flip; it is wrong until it has flipped back.
         """
         if not isfinite(yaw):
             return nan
-        jump, since = remainder(yaw - self._yaw[row], tau), time - self._yaw_time[row]
+        jump, since = remainder(yaw - self._yaw, tau), time - self._yaw_time
         if not watched:
-            self._flipped[row] = 0.0
-        elif abs(jump) > min(FLIP + self._turn_rate[row] * since, MOST_TURNED):  # not of the first one, which is NaN
-            self._flipped[row] = remainder(self._flipped[row] + jump, tau)
-        self._yaw[row], self._yaw_time[row] = yaw, time
-        return yaw if abs(self._flipped[row]) < FLIP else nan
+            self._flipped = 0.0
+        elif abs(jump) > min(FLIP + self._turn_rate * since, MOST_TURNED):  # not of the first one, which is NaN
+            self._flipped = remainder(self._flipped + jump, tau)
+        self._yaw, self._yaw_time = yaw, time
+        return yaw if abs(self._flipped) < FLIP else nan
 
-    def disbelieve(self, row: int) -> None:
-        """Reject external positions of a row while it is in motion."""
-        if self._time[row] > -np.inf:
-            self.deceived[row] = self.doubted = True
+    def disbelieve(self) -> None:
+        """Reject external positions while the robot is in motion."""
+        if self._time > -inf:
+            self.deceived = self.doubted = True
 
-    def forget(self, row: int) -> None:
-        """A row is where its position says, wherever that is."""
-        self._rows[row].forget(0)
-        self._note(row, np.nan)
-
-    def _note(self, row: int, jump: float) -> None:
-        self.jump[row] = jump
-        self.doubted = some(self.deceived) or not every(np.isnan(self.jump))
+    def forget(self) -> None:
+        """The robot is where its position says, wherever that is."""
+        self._continuity.forget()
+        self.jump, self.doubted = nan, self.deceived
