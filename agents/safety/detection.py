@@ -21,7 +21,7 @@ from agents.safety.landing import LOW, SLOW
 from agents.safety.obedience import RUSH_S, Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M
 from agents.safety.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
-from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, distance, is_finite, norm, planar
+from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
 SUNK: Final = 0.15  # [m] below its goal
 SLOWEST: Final = 0.2  # [m/s] no device lands more slowly,
@@ -234,14 +234,18 @@ class Detector:
 
     def too_near(self, now: Situation, neighbours: Neighbours) -> int:
         """Other robots that are received."""
-        near = touches = False
+        t, position, predictor, silence_s = now.t, now.position, self.predictor, neighbours.silence_s
+        near = False
         for sender in neighbours.all:
-            apart = separation(now.position, sender, self.predictor, now.t, neighbours.silence_s)
-            near = near or apart < self.separation
-            touches = touches or apart < max(0.5 * self.separation, self.radius + sender.radius)
+            if separation(position, sender, predictor, t, silence_s) < self.separation:
+                near = True
         if not near:
             return 0
-        return 1 << Cause.SEPARATION | (1 << Cause.TOUCHING if touches else 0)
+        for sender in neighbours.all:
+            apart = separation(position, sender, predictor, t, silence_s)
+            if apart < max(0.5 * self.separation, self.radius + sender.radius):
+                return 1 << Cause.SEPARATION | 1 << Cause.TOUCHING
+        return 1 << Cause.SEPARATION
 
     def of_neighbours(self, t: float, status: Status, neighbours: Neighbours) -> int:
         """Neighbours, and their poses."""
@@ -437,10 +441,12 @@ def separation(position: Vector, sender: Neighbour, predictor: Predictor, t: flo
     Infinite before its first pose, without an own position, and where the sender is lost for longer than `silence_s`,
     or restarted and without a pose since.
     """
-    if not isfinite(sender.stamp) or not t - sender.lost_since <= silence_s:
+    if sender.stamp == -inf or not t - sender.lost_since <= silence_s:
         return inf
-    apart = distance(position, sender.place(predictor, t))
-    return apart if isfinite(apart) else inf
+    place = sender.place(predictor, t)
+    x, y, z = position[0] - place[0], position[1] - place[1], position[2] - place[2]
+    apart = sqrt(x * x + y * y + z * z)
+    return apart if apart < inf else inf  # not NaN
 
 
 def nearest_robot(position: Vector, neighbours: Neighbours, predictor: Predictor, t: float) -> tuple[float, str]:

@@ -158,8 +158,8 @@ class Hazards:
     """State machine of one robot; a set of causes is an int with the bits `1 << cause`."""
 
     __slots__ = (
-        "after_s", "begun", "clears_s", "first", "held", "incidents", "landing", "last", "lasted_s", "level", "place",
-        "present", "repeats", "since", "texts", "then", "then_s", "under_way", "unresolved",
+        "after_s", "begun", "clears_s", "first", "held", "incidents", "landing", "last", "lasted_s", "level", "open",
+        "place", "present", "repeats", "since", "texts", "then", "then_s", "under_way", "unresolved",
     )  # fmt: skip
 
     held: bool  # the robot must keep its place
@@ -181,6 +181,7 @@ class Hazards:
     lasted_s: list[float]  # duration of its last hazard that ended [s]
     level: list[int]  # outcome
     present: int  # on the last tick
+    open: int  # present on the last tick, or with a hazard
     unresolved: int  # present until the robot ended, on the last tick
     texts: dict[Cause, str]  # of hazards
 
@@ -196,7 +197,7 @@ class Hazards:
         self.since, self.begun = [NEVER] * len(table), [NEVER] * len(table)
         self.last, self.lasted_s = [-NEVER] * len(table), [0.0] * len(table)
         self.level = [0] * len(table)
-        self.present = self.unresolved = 0
+        self.present = self.open = self.unresolved = 0
         self.held = self.under_way = False
         self.incidents, self.texts = [], {}
 
@@ -219,27 +220,30 @@ class Hazards:
         elif landing:
             watched = self.landing
         causes &= watched
-        changed = unresolved = 0
-        held = under_way = False
-        for number in range(len(self.level)):
+        changed = unresolved = number = 0
+        held = False
+        left, self.open = causes | self.open, causes
+        while left >> number:
             bit = 1 << number
-            before = self.level[number]
-            if causes & bit:
-                self._worsen(t, number)
-                under_way = True
-            elif self.begun[number] < NEVER or self.present & bit:
-                ended = self.present & ~watched & bit  # the cause is still there, but the robot has ended
-                unresolved |= ended
-                self._calm(t, number, ended != 0)
-                under_way = under_way or self.begun[number] < NEVER
-            level = self.level[number]
-            if level != before:
-                changed |= bit
-            if level == Outcome.HOLD and self.place & bit:
-                # present, or absent for less than its time
-                held = held or causes & bit != 0 or t - self.last[number] < self.clears_s[number] - ROUNDING_S
+            if left & bit:
+                before = self.level[number]
+                if causes & bit:
+                    self._worsen(t, number)
+                else:
+                    ended = self.present & ~watched & bit  # the cause is still there, but the robot has ended
+                    unresolved |= ended
+                    self._calm(t, number, ended != 0)
+                    if self.begun[number] < NEVER:
+                        self.open |= bit
+                level = self.level[number]
+                if level != before:
+                    changed |= bit
+                if level == Outcome.HOLD and self.place & bit:
+                    # present, or absent for less than its time
+                    held = held or causes & bit != 0 or t - self.last[number] < self.clears_s[number] - ROUNDING_S
+            number += 1
         self.present, self.unresolved = causes, unresolved
-        self.held, self.under_way = held, under_way
+        self.held, self.under_way = held, self.open != 0
         return changed
 
     def _worsen(self, t: float, number: int) -> None:
