@@ -1,141 +1,136 @@
-"""Landing places of flying robots: not on a robot known to be below. Pure and row-wise.
+"""Landing places of flying robots: not on a robot known to be below.
 
-A body lands straight down. A row that must land above another robot first moves aside at its height to the nearest free
-place; then it lands.
+A body lands straight down. A robot that must land above another one first moves aside at its height to the nearest free
+place; then it lands. None of it runs on quiet ticks.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Final
+from math import cos, hypot, inf, pi, sin
+from typing import Final, NamedTuple
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, norm, some
-from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
-from agents.decision.lifecycle import LANDING, BodyCommands
-from agents.safety.situation import Situation
+from agents.decision.neighbours import Neighbours
+from agents.safety.situation import ProcessHealth, Situation
+from agents.vectors import UNKNOWN, Vector, clamp, is_finite, norm, planar
 
-NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a row does not land in place
+NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a robot does not land in place
 ROOM: Final = 0.12  # [m] the same at the place aside
 LOW: Final = 0.2  # [m] above the floor: from lower it lands in place
 BESIDE: Final = 0.1  # [m] robots whose heights differ by less are in each other's way
-SLOW: Final = 0.15  # [m/s] a row that moved aside lands when slower
+SLOW: Final = 0.15  # [m/s] a robot that moved aside lands when slower
 PATIENCE_S: Final = 3.0  # [s] longest time to move aside
 ROUNDING: Final = 1e-9
-RINGS: Final = np.arange(0.05, 1.51, 0.05)  # [m] distances of tried places
-WAYS: Final = np.arange(16) * (2.0 * np.pi / 16)  # [rad] and their directions
+RINGS: Final = tuple(0.05 * k for k in range(1, 31))  # [m] distances of tried places
+WAYS: Final = tuple((cos(k * pi / 8), sin(k * pi / 8)) for k in range(16))  # and their directions
+
+
+class Occupied(NamedTuple):
+    """Place of another robot."""
+
+    x: float  # [m]
+    y: float  # [m]
+    touching: float  # distance of the axes at which both touch [m]
+    gap: float  # between surfaces, seen from above [m]
+    lower: bool  # it may be flown over
 
 
 class Landing:
-    """Rows on their way to a place where they can land."""
+    """Robot on its way to a place where it can land."""
+
+    __slots__ = ("_assignment", "_nearest", "_until", "aside", "place")
+
+    aside: bool  # it must land and is not at its place yet
+    place: Vector  # its landing place [m], NaN: none
+    _until: float  # when it lands in place [s]
+    _nearest: str  # robot below it
 
     def __init__(self, assignment: Assignment) -> None:
-        """Of the rows of an assignment; the senders on their links, for the law or for avoidance, are considered."""
-        rows, links = len(assignment.names), assignment.links
-        self._assignment, self._receiver = assignment, links.receiver
-        kinds = assignment.robot_kinds
-        senders = [kinds[sender] for sender in links.sender.tolist()] if kinds else ()
-        self._radius = np.array([kind.radius for kind in assignment.kinds])
-        self._height = np.array([kind.height for kind in assignment.kinds])
-        self._their_radius = np.array([kind.radius for kind in senders])
-        self._their_height = np.array([kind.height for kind in senders])
-        self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self._no_row: Mask = np.zeros(rows, dtype=bool)
-        self.aside, self.any_aside = self._no_row, False  # (N,) rows that must land and are not at their place yet
-        self.place: Array = np.full((rows, 3), np.nan)  # (N, 3) their landing place [m]
-        self._until = np.full(rows, -np.inf)
-        self._apart = np.full(len(links), np.inf)
+        """Of a robot; the senders on its links, for the law or for avoidance, are considered."""
+        self._assignment = assignment
+        self.aside, self.place, self._until, self._nearest = False, UNKNOWN, -inf, ""
 
-    def filter_commands(self, now: Situation, commands: BodyCommands | None, phase: Index) -> BodyCommands | None:
-        """Commands of the lifecycle without the landings that must wait, and with those that need not any more.
+    def filter_land(
+        self, now: Situation, neighbours: Neighbours, health: ProcessHealth, *, ordered: bool, landing: bool
+    ) -> bool:
+        """Whether the body is to land now.
 
-        A row whose `phase` (N,) is not landing any more stops moving aside. A row without a valid pose, or of a control
-        loop that misses its ticks, lands in place.
+        `ordered`: the lifecycle would have it land on this tick. A robot that is not `landing` any more stops moving
+        aside. One without a valid pose, or of a control loop that misses its ticks, lands in place.
         """
-        t, state, where, neighbours = now.t, now.state, now.where, now.neighbours
-        ordered = commands is not None and len(commands.land) > 0
-        if not (ordered or self.any_aside):
-            return commands
-        self.place[~self.aside] = np.nan
-        due = self.aside & (phase == LANDING)
-        if commands is not None and ordered:
-            due[commands.land] = True
-            self._until[commands.land] = t + PATIENCE_S
-        lost = neighbours.poses.silent
-        place = neighbours.extrapolate_all(self._assignment.predictor, t)
-        able = due & self._flies & state.flying & ~where.invalid & ~where.outside_wall & (t <= self._until)
-        able &= (state.position[:, 2] > LOW) & (not now.health.loop_failing)
-        self.aside = able & self._must_wait(state, place, lost)
-        self.any_aside = some(self.aside)
-        for row in np.flatnonzero(self.aside).tolist():
-            self._choose(row, state.position[row], place, lost)
-        lands = np.flatnonzero(due & ~self.aside)
-        if commands is None:
-            no_row = lands[:0]
-            return BodyCommands(no_row, lands, no_row) if len(lands) else None
-        return replace(commands, land=lands)
+        due = ordered or (self.aside and landing)
+        if not self.aside:
+            self.place = UNKNOWN
+        if ordered:
+            self._until = now.t + PATIENCE_S
+        able = due and self._assignment.kind.flies and now.state.flying and now.t <= self._until
+        able = able and now.position[2] > LOW and not (now.invalid or now.outside_wall or health.loop_failing)
+        self.aside = able and self._must_wait(now, neighbours)
+        if self.aside:
+            self._choose(now, neighbours)
+        return due and not self.aside
 
     def land_in_place(self) -> None:
-        """Rows on their way aside land in place."""
-        self.aside, self.any_aside = self._no_row, False
+        """A robot on its way aside lands in place."""
+        self.aside = False
 
-    def robot_below(self, row: int) -> str:
-        """Robot below a row that moves aside, in words."""
-        links = self._assignment.links
-        mine: Index = np.flatnonzero(self._receiver == row)
-        nearest = int(mine[self._apart[mine].argmin()])
-        return f"{self._assignment.robots[links.sender[nearest]]}; it goes aside first"
+    def robot_below(self) -> str:
+        """Robot below one that moves aside, in words."""
+        return f"{self._nearest}; it goes aside first"
 
-    def _must_wait(self, state: BodyState, place: Array, lost: Mask) -> Mask:
-        """Rows (N,) that would land on a robot, or still move."""
-        row = self._receiver
-        gap = norm(state.position[row, :2] - place[:, :2]) - self._radius[row] - self._their_radius
-        under = (place[:, 2] <= state.position[row, 2] + self._height[row]) | lost  # lost ones may have come down
-        self._apart = np.where(under & np.isfinite(gap), gap, np.inf)
-        moving = self.aside & (norm(state.velocity) > SLOW)
-        # a row on its way aside goes on until it has more room than would have sent it
-        occupied = np.zeros(len(moving), dtype=bool)
-        occupied[row[self._apart < np.where(self.aside[row], 0.5 * (NEAR + ROOM), NEAR)]] = True
-        return np.asarray(occupied | moving)
+    def _must_wait(self, now: Situation, neighbours: Neighbours) -> bool:
+        """Whether it would land on a robot, or still moves."""
+        kind, least = self._assignment.kind, inf
+        for sender in neighbours.all:
+            place = sender.place(self._assignment.predictor, now.t)
+            gap = planar(now.position, place) - kind.radius - sender.radius
+            # lost ones may have come down
+            if gap < least and (place[2] <= now.position[2] + kind.height or sender.silent):
+                least, self._nearest = gap, sender.name
+        # on its way aside it goes on until it has more room than would have sent it
+        occupied = least < (0.5 * (NEAR + ROOM) if self.aside else NEAR)
+        return occupied or (self.aside and norm(now.velocity) > SLOW)
 
-    def _choose(self, row: int, here: Array, place: Array, lost: Mask) -> None:
-        """Choose a place for a row, or keep its place while it is free."""
-        mine = (self._receiver == row) & np.isfinite(place).all(axis=1)
-        touching = self._radius[row] + self._their_radius[mine]
-        others = place[mine]
-        # it may fly over lower robots; those at its height are in the way, and higher ones may be landing
-        lower = (others[:, 2] + self._their_height[mine] + BESIDE < here[2]) | lost[mine]
-        gap = norm(others[:, :2] - here[:2]) - touching
-
-        def room(tried: Array) -> Array:
-            """Of places (C, 2): the least gap there (C,) [m], none where the way there is barred."""
-            passing = _passing(here[:2], tried, others[~lower, :2]) - touching[~lower]
-            open_way = (passing >= np.minimum(gap[~lower], NEAR) - ROUNDING).all(axis=1)
-            apart = (norm(tried[:, None] - others[None, :, :2]) - touching).min(axis=1, initial=np.inf)
-            return np.where(open_way, apart, -np.inf)
-
-        if np.isfinite(self.place[row]).all() and room(self.place[row : row + 1, :2])[0] > NEAR:
+    def _choose(self, now: Situation, neighbours: Neighbours) -> None:
+        """Choose a place, or keep the place while it is free."""
+        kind, limits, (x, y, z) = self._assignment.kind, self._assignment.limits, now.position
+        others = []
+        for sender in neighbours.all:
+            place = sender.place(self._assignment.predictor, now.t)
+            if is_finite(place):
+                touching = kind.radius + sender.radius
+                # it may fly over lower robots; those at its height are in the way, and higher ones may be landing
+                lower = place[2] + sender.height + BESIDE < z or sender.silent
+                gap = hypot(place[0] - x, place[1] - y) - touching
+                others.append(Occupied(place[0], place[1], touching, gap, lower))
+        if is_finite(self.place) and _room(x, y, self.place[0], self.place[1], others) > NEAR:
             return
-        ways = RINGS[:, None, None] * np.stack([np.cos(WAYS), np.sin(WAYS)], axis=1)
-        tried = here[:2] + ways.reshape(-1, 2)
-        limits = self._assignment.limits
-        wall = limits.margin + self._radius[row]
-        inside = ((tried > limits.low[:2] + wall) & (tried < limits.high[:2] - wall)).all(axis=1)
-        there = np.where(inside, room(tried), -np.inf)
-        free = np.flatnonzero(there > ROOM)
-        if not len(free):  # no free place: land here
-            self.place[row], self._until[row] = here, -np.inf
-            return
-        ring = free // len(WAYS)
-        nearest = free[ring == ring[0]]
-        self.place[row] = *tried[nearest[there[nearest].argmax()]], here[2]
+        wall = limits.margin + kind.radius
+        for ring in RINGS:
+            best = ROOM
+            for cosine, sine in WAYS:
+                there_x, there_y = x + ring * cosine, y + ring * sine
+                inside = limits.low[0] + wall < there_x < limits.high[0] - wall
+                if not (inside and limits.low[1] + wall < there_y < limits.high[1] - wall):
+                    continue
+                room = _room(x, y, there_x, there_y, others)
+                if room > best:
+                    best, self.place = room, (there_x, there_y, z)
+            if best > ROOM:
+                return
+        self.place, self._until = now.position, -inf  # no free place: land here
 
 
-def _passing(here: Array, there: Array, place: Array) -> Array:
-    """Distances (C, K) of places (K, 2) from the straight ways from `here` (2,) to each of `there` (C, 2) [m]."""
-    way = there - here
-    off = place - here
-    along = np.clip(way @ off.T / np.vecdot(way, way)[:, None], 0.0, 1.0)
-    return norm(off[None] - along[..., None] * way[:, None])
+def _room(x: float, y: float, there_x: float, there_y: float, others: list[Occupied]) -> float:
+    """Least gap at a place to fly to from x, y [m]; −inf where the way there is barred."""
+    least, way_x, way_y = inf, there_x - x, there_y - y
+    squared = way_x * way_x + way_y * way_y
+    for other in others:
+        if not other.lower:
+            off_x, off_y = other.x - x, other.y - y
+            along = clamp((way_x * off_x + way_y * off_y) / squared, 0.0, 1.0) if squared > 0.0 else 0.0
+            passing = hypot(off_x - along * way_x, off_y - along * way_y) - other.touching
+            if not passing >= min(other.gap, NEAR) - ROUNDING:
+                return -inf
+        least = min(least, hypot(there_x - other.x, there_y - other.y) - other.touching)
+    return least
