@@ -1,21 +1,27 @@
-"""Simulated bodies behind the same interface as the hardware, in the robot's process or together in a world."""
+"""Simulated bodies behind the same interface as the hardware, in the robot's process or together in a world.
+
+The methods of `Twin` but `place` and `refill` are quiet.
+"""
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from collections.abc import Sequence
+from math import inf, isfinite, nan
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, span
 from agents.body.external_pose import PATIENCE_S, External, velocity_after
-from agents.body.interface import BodyRequest, BodyState
+from agents.body.interface import BodyRequest, BodyState, Disturbance
+from agents.body.kinds import Kind
 from agents.plugins import registry
-from twins.engines.engine import Engine, EngineFactory, Stage, Touch
-from twins.engines.point_mass import PointMass, PointMassEngine
+from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
+from twins.engines.engine import Engine, EngineFactory, Motion, Stage, Touch
+from twins.engines.point_mass import PointMassEngine, model, require_models
+from twins.models import noise
 from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
-from twins.models.noise import Noise
-from twins.scene import World
-from twins.sensing.range_sensors import RangeSensors
+
+if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
+    from twins.scene import World
+    from twins.sensing.range_sensors import RangeSensors
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
 
@@ -28,93 +34,218 @@ def instants(since: float, until: float, step: float) -> list[float]:
     return [until - left * step for left in range(steps - 1, -1, -1)]
 
 
+class Twin:
+    """One simulated robot: its motion, what disturbs it, and what it measures of itself."""
+
+    __slots__ = (
+        "_before", "_command", "_delays", "_drift", "_drifts", "_drives", "_endurance", "_jitter", "_jitters",
+        "_latency", "_measured", "_measured_at", "_measurement", "_measures", "_t", "_used", "_velocity", "motion",
+    )  # fmt: skip
+
+    motion: Motion  # of an engine
+
+    def __init__(
+        self, motion: Motion, kind: Kind, disturbance: Disturbance, *, name: str, seed: int, dt: float
+    ) -> None:
+        """`dt`: step of `advance` [s]."""
+        self.motion = motion
+        self._jitter = HoverJitter(disturbance if kind.flies else Disturbance(), name, seed, dt)
+        self._measurement = Measurement(disturbance, name, seed, spatial=kind.flies)
+        self._drift, self._latency = Drift(disturbance, name, seed), Latency(disturbance, dt)
+        self._jitters, self._measures = self._jitter.present, self._measurement.present
+        self._drifts, self._delays = self._drift.present, self._latency.present
+        self._drives, self._endurance = not kind.flies, kind.endurance_s
+        self._command, self._before = NO_SETPOINT, motion.position
+        self._t, self._used = 0.0, 0.0  # time, and time with motors on [s]
+        self._measured_at, self._measured, self._velocity = -inf, ZERO, ZERO
+
+    def command(self, setpoint: Setpoint) -> None:
+        """Set the setpoint, see `Body.command`; it takes effect after the latency."""
+        if not self._delays:
+            self.motion.command(setpoint)
+        elif setpoint[0] == setpoint[0]:
+            self._command = setpoint
+
+    def advance(self, t: float, dt: float) -> bool:
+        """One step of `dt` to `t` [s], of a motion that moves by itself; returns whether `refill` is due."""
+        self.begin_step()
+        self.motion.move(dt)
+        return self.end_step(t, dt)
+
+    def begin_step(self) -> None:
+        """Give the motion its delayed command and the hover jitter of this step."""
+        motion = self.motion
+        if self._delays:
+            motion.command(self._latency.delay(self._command))
+            self._command = NO_SETPOINT  # a command acts once, so that silence has its effect
+        if self._jitters:
+            motion.wobble = self._jitter.advance(motion.position[2])
+        if self._drifts:
+            self._before = motion.position
+
+    def end_step(self, t: float, dt: float) -> bool:
+        """Account for the step of `dt` to `t` [s] that the motion made; returns whether `refill` is due."""
+        self._t = t
+        motion = self.motion
+        if self._drives or motion.flying:
+            self._used += dt
+        due = False
+        if self._jitters:
+            jitter = self._jitter.noise
+            due = jitter.next == jitter.end
+        if self._drifts:
+            drift, before, now = self._drift, self._before, motion.position
+            drift.advance(now[0] - before[0], now[1] - before[1])
+            due = due or drift.noise.next == drift.noise.end
+        return due
+
+    def measure(self, state: BodyState) -> bool:
+        """Measure into a state: its newest pose, velocity and battery; returns whether `refill` is due.
+
+        Velocities are estimated from measured positions, hover jitter and noise included. Motion capture measures
+        positions (`External`), and so does a Khepera's odometry. A Crazyflie with a positioning system on board also
+        uses its accelerometer (Mueller, Hamer and D'Andrea, ICRA 2015), hence has less noise; it also measures its own
+        hover jitter.
+        """
+        motion, t = self.motion, self._t
+        position, yaw = motion.position, motion.yaw
+        state.true_position, state.true_yaw = position, yaw
+        due = False
+        if self._measures:
+            measurement = self._measurement
+            dx, dy, dz, turn = measurement.draw()
+            position, yaw = (position[0] + dx, position[1] + dy, position[2] + dz), yaw + turn
+            due = measurement.noise.next == measurement.noise.end
+        if self._drifts:
+            drift = self._drift
+            position = (position[0] + drift.x, position[1] + drift.y, position[2])
+        since = t - self._measured_at
+        if since >= PATIENCE_S:
+            self._velocity = ZERO
+        elif since > 0.0:
+            x, y, z = self._measured
+            velocity = velocity_after(self._velocity, (position[0] - x, position[1] - y, position[2] - z), since)
+            self._velocity = velocity if velocity[0] == velocity[0] else ZERO
+        self._measured_at, self._measured = t, position
+        state.time, state.position, state.velocity, state.yaw = t, position, self._velocity, yaw
+        charge = 1.0 - self._used / self._endurance
+        state.battery = charge if charge > 0.0 else 0.0
+        state.flying, state.attitude = motion.flying, motion.attitude
+        return due
+
+    def settle(self, velocity: Vector) -> None:
+        """Take a jump to another place for no motion: the robot moves with `velocity` [m/s]."""
+        self._velocity = velocity
+
+    def refill(self) -> None:
+        """Draw noise for more steps; due when `advance` or `measure` say so."""
+        noise.refill(self._jitter.noise, self._measurement.noise, self._drift.noise)
+
+
 class TwinBody:
     """Simulated robots of any kinds; implements `agents.body.interface.Body`. Advances to the time of each `read`."""
 
-    def __init__(self, request: BodyRequest, world: World | None = None) -> None:
-        """Without a world every row is alone; raises BodyError or PluginError for an unknown kind or engine."""
-        kinds = request.kinds
-        rows = len(kinds)
-        self._dt = 1.0 / request.rate_hz
+    begun_at: float  # common start on the clock of `read` [s], NaN while unknown; obstacles' plans start then
+    engine: Engine
+    twins: list[Twin]
+
+    def __init__(self, request: BodyRequest, world: World | None = None, substeps: int = 1) -> None:
+        """Without a world every robot is alone; raises BodyError or PluginError for an unknown kind or engine.
+
+        `substeps`: steps of the models in a tick.
+        """
+        self._dt = dt = 1.0 / (request.rate_hz * substeps)
         self._t = 0.0
-        self.begun_at = (
-            np.nan
-        )  # common start on the clock of `read` [s], NaN while unknown; obstacles' plans start then
-        self._world = world if world is not None else World.alone(rows)
-        stage = Stage(
-            kinds, request.start, request.yaw, self._dt, self._world.copy, self._world.mirrored, self._world.scene
-        )
-        factory: EngineFactory = PointMass() if world is None else registry.build(registry.ENGINES, self._world.engine)
-        self.engine: Engine = factory.build(stage)
-        flies = np.array([k.flies for k in kinds])
-        names, seeds, nature = request.names, request.seeds, request.disturbance
-        air = np.flatnonzero(flies)
-        self._in_air, self._all_fly, self._drives = span(air), len(air) == rows, ~flies
-        aloft = [nature[i] for i in air]
-        air_names, air_seeds = [names[i] for i in air], [seeds[i] for i in air]
-        self._jitter = HoverJitter(aloft, Noise(air_names, air_seeds, "hover jitter", 2), self._dt)
-        self._wobble = np.zeros((rows, 2))
-        axes = np.where(flies[:, None], 1.0, [1.0, 1.0, 0.0])
-        self._measurement = Measurement(nature, axes, Noise(names, seeds, "measurement", 4))
-        self._drift = Drift(nature, Noise(names, seeds, "odometry", 2))
-        self._latency = Latency(nature, self._dt)
-        self._command = np.full((rows, 4), np.nan)
-        self._sensors = RangeSensors(request, self._world) if any(self._world.sensors) else None
-        self._endurance = np.array([k.endurance_s for k in kinds])
-        self._used, self._uses, self._flew = np.zeros(rows), np.zeros(rows), b""
-        self._absent = bool(self._world.mirrored.any())  # mirrored robots may be absent: their positions are NaN
-        self._no_time = np.zeros(rows)
-        self._external_rows = np.flatnonzero(request.external)
-        self._external = External(rows)
-        self._measured_at, self._measured, self._velocity = -inf, np.zeros((rows, 3)), np.zeros((rows, 3))
-        self._state = self._measure()
+        self.begun_at = nan
+        rows = len(request.names)
+        mirrored: Sequence[bool] = (False,) * rows
+        self._alone: PointMassEngine | None = None
+        if world is None:
+            require_models(request.kinds)
+            models = map(model, request.kinds, request.start, request.yaw)
+            self.engine = self._alone = PointMassEngine(list(models), dt)
+        else:
+            mirrored = world.mirrored
+            stage = Stage(request.kinds, request.start, request.yaw, dt, world.copy, mirrored, world.scene)
+            factory: EngineFactory = registry.build(registry.ENGINES, world.engine)
+            self.engine = factory.build(stage)
+            if type(self.engine) is PointMassEngine:
+                self._alone = self.engine
+        self.twins = [
+            Twin(motion, kind, Disturbance() if away else disturbance, name=name, seed=seed, dt=dt)
+            for motion, kind, disturbance, name, seed, away in zip(
+                self.engine.motions, request.kinds, request.disturbance, request.names, request.seeds, mirrored,
+                strict=True,
+            )
+        ]  # fmt: skip
+        self._states = [BodyState() for _ in self.twins]
+        self._measured = list(zip(self.twins, self._states, strict=True))
+        self._external = {row: External() for row, outside in enumerate(request.external) if outside}
+        self._sensors: RangeSensors | None = None
+        if world is not None and any(world.sensors):
+            from twins.sensing.range_sensors import RangeSensors  # noqa: PLC0415 - needs numpy
+
+            self._sensors = RangeSensors(request, world)
+        self._measure()
 
     def open(self) -> None:
         """See `Body.open`."""
 
-    def read(self, t: float) -> BodyState:
-        steps = instants(self._t, t, self._dt)
-        for now in steps:
-            self._advance(now)
+    def read(self, t: float) -> Sequence[BodyState]:
+        """See `Body.read`; the states are the same objects at every call."""
+        steps = round((t - self._t) / self._dt)
+        if steps == 1:  # as a rule
+            self._advance(t)
+        elif steps > 1:
+            for now in instants(self._t, t, self._dt):
+                self._advance(now)
         self._t = t
-        if steps:
-            self._state = self._measure()
-        return self._state
+        if steps > 0:
+            self._measure()
+        return self._states
 
-    def command(self, setpoint: Array) -> None:
-        if self._latency.present:
-            self._command = np.where(np.isnan(setpoint), self._command, setpoint)
-        else:
-            self.engine.command(setpoint)
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        for twin, setpoint in zip(self.twins, setpoints, strict=True):
+            twin.command(setpoint)
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        self.engine.takeoff(rows, height)
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        self.engine.takeoff(rows, heights)
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         self.engine.land(rows)
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         self.engine.stop(rows)
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        self._external.update(row, t, position, yaw)
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
+        self._external[row].update(t, position, yaw)
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
-        """Set positions (len(rows), 3) [m] and yaws (len(rows),) [rad]; flying rows hold them.
+    def place(
+        self,
+        rows: Sequence[int],
+        positions: Sequence[Vector],
+        yaws: Sequence[float],
+        flying: Sequence[bool],
+        velocities: Sequence[Vector] | None = None,
+    ) -> None:
+        """Set positions [m] and yaws [rad]; flying robots hold them.
 
-        The rows are at rest, or move with `velocity` (len(rows), 3) [m/s] in the point-mass engine.
+        The robots are at rest, or move with `velocities` [m/s] in the point-mass engine.
         """
-        self.engine.place(rows, position, yaw, flying)
-        if velocity is not None and isinstance(self.engine, PointMassEngine):
-            self.engine.push(rows, velocity)
-        self._state = self._measure()
-        self._velocity = self._velocity.copy()
-        self._velocity[rows] = 0.0 if velocity is None else velocity  # the jump to the place is no motion
-        self._state.velocity = self._velocity
+        self.engine.place(rows, positions, yaws, flying)
+        moving = (ZERO,) * len(rows) if velocities is None else velocities
+        self._measure()
+        for row, velocity in zip(rows, moving, strict=True):
+            if velocities is not None and self._alone is not None:
+                self._alone.push(row, velocity)
+            self.twins[row].settle(velocity)
+            self._states[row].velocity = velocity
 
-    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """Set the state of mirrored rows: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: absent."""
-        self.engine.mirror(rows, position, yaw, velocity)
+    def mirror(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], velocities: Sequence[Vector]
+    ) -> None:
+        """Set the state of mirrored robots: [m], [rad], [m/s]; NaN: absent."""
+        self.engine.mirror(rows, positions, yaws, velocities)
 
     def touches(self) -> list[Touch]:
         """Contacts that began since the last call."""
@@ -124,64 +255,33 @@ class TwinBody:
         """See `Body.close`."""
 
     def _advance(self, t: float) -> None:
-        engine = self.engine
-        if self._latency.present:
-            engine.command(self._latency.delay(self._command))
-            self._command = np.full_like(self._command, np.nan)  # a command acts once, so that silence has its effect
-        before = engine.position[:, :2].copy() if self._drift.present else None
-        if self._jitter.present:
-            displacement = self._wobble = self._jitter.advance(engine.position[self._in_air, 2])
-            if not self._all_fly:
-                self._wobble = np.zeros((len(self._used), 2))  # a new array: engines may keep the last one
-                self._wobble[self._in_air] = displacement
-        engine.advance(t - self.begun_at if isfinite(self.begun_at) else -inf, self._wobble)
-        if (flying := engine.flying.tobytes()) != self._flew:
-            self._flew, self._uses = flying, self._dt * (engine.flying | self._drives)
-        self._used = self._used + self._uses
-        if before is not None:
-            self._drift.advance(engine.position[:, :2] - before)
-        if self._sensors is not None:
-            self._sensors.sweep(t, engine)
+        if self._alone is None:
+            self._advance_together(t)
+        else:
+            for twin in self.twins:
+                if twin.advance(t, self._dt):
+                    twin.refill()
+            if self._alone.moves_obstacles:
+                self._alone.move_obstacles(self._since_start(t))
+        if self._sensors is not None and self._sensors.sweep(t, self.engine):
+            for state, scan in zip(self._states, self._sensors.scans, strict=True):
+                state.scan = scan
 
-    def _measure(self) -> BodyState:
-        engine = self.engine
-        truth, yaw = engine.position.copy(), engine.yaw.copy()
-        measured, heading = truth, yaw
-        if self._measurement.present:
-            noise = self._measurement.draw()
-            measured, heading = truth + noise[:, :3], yaw + noise[:, 3]
-        if self._drift.present:
-            measured = measured.copy()
-            measured[:, :2] += self._drift.error
-        self._estimate(measured)
-        state = BodyState(
-            time=self._no_time + self._t,
-            position=measured,
-            velocity=self._velocity,
-            yaw=heading,
-            true_position=truth,
-            true_yaw=yaw,
-            battery=np.maximum(1.0 - self._used / self._endurance, 0.0),
-            flying=engine.flying.copy(),
-            rays=None if self._sensors is None else self._sensors.rays,
-            attitude=engine.attitude,
-        )
-        if len(self._external_rows):
-            state.position, state.velocity, state.yaw = measured.copy(), self._velocity.copy(), heading.copy()
-            self._external.fill(state, self._external_rows)
-        return state
+    def _advance_together(self, t: float) -> None:
+        for twin in self.twins:
+            twin.begin_step()
+        self.engine.advance(self._since_start(t), [motion.wobble for motion in self.engine.motions])
+        for twin in self.twins:
+            if twin.end_step(t, self._dt):
+                twin.refill()
 
-    def _estimate(self, measured: Array) -> None:
-        """Estimate velocities from measured positions, hover jitter and noise included.
+    def _since_start(self, t: float) -> float:
+        """Time since the common start [s], −inf while that is unknown."""
+        return t - self.begun_at if isfinite(self.begun_at) else -inf
 
-        Motion capture measures positions (`External`), and so does a Khepera's odometry. A Crazyflie with a positioning
-        system on board also uses its accelerometer (Mueller, Hamer and D'Andrea, ICRA 2015), hence has less noise; it
-        also measures its own hover jitter.
-        """
-        since = self._t - self._measured_at
-        if since >= PATIENCE_S:
-            self._velocity = np.zeros_like(self._velocity)
-        elif since > 0.0:
-            velocity = velocity_after(self._velocity, measured - self._measured, since)
-            self._velocity = np.where(np.isfinite(velocity), velocity, 0.0) if self._absent else velocity
-        self._measured_at, self._measured = self._t, measured
+    def _measure(self) -> None:
+        for twin, state in self._measured:
+            if twin.measure(state):
+                twin.refill()
+        for row, external in self._external.items():
+            external.fill(self._states[row])

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from math import isfinite
 from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, NotNegative, Positive, norm
+from agents.arrays import Array, Index, Mask, norm
 from agents.plugins.planners import Planner
+from agents.vectors import NotNegative, Positive
 
 Planar = tuple[float, float]
+Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 Points = Annotated[list[Planar], Meta(min_length=2)]
 
 
@@ -96,21 +100,29 @@ class Scene:
         """Obstacles that have a plan."""
         return np.array([k for k, plan in enumerate(self.plans) if plan is not None], dtype=np.intp)
 
-    def along(self, time: Array) -> Array:
-        """Planned poses (T, M, 3) at times (T,) after the common start [s]; obstacles without a plan stay in place."""
-        pose = np.tile(self.pose, (len(time), 1, 1))
-        elapsed = np.maximum(time, 0.0)
+    @cached_property
+    def start(self) -> list[Pose]:
+        """Poses of the obstacles at the common start: x, y [m], yaw [rad]."""
+        return [(x, y, yaw) for x, y, yaw in self.pose.tolist()]
+
+    def poses(self, t: float) -> list[Pose]:
+        """Planned poses at `t` [s] after the common start; obstacles without a plan stay in place."""
+        poses = list(self.start)
+        elapsed = max(t, 0.0)
         for k, plan in enumerate(self.plans):
             if plan is not None:
-                anchor = np.tile([*self.pose[k, :2], 0.0], (len(time), 1))
-                place, yaw = plan.target(elapsed, anchor, np.full(len(time), self.pose[k, 2]))
-                pose[:, k, :2] = place[:, :2]
-                pose[:, k, 2] = np.where(np.isfinite(yaw), yaw, self.pose[k, 2])
-        return pose
+                x0, y0, yaw0 = poses[k]
+                x, y, _, yaw = plan.target(elapsed, (x0, y0, 0.0), yaw0)
+                poses[k] = (x, y, yaw if isfinite(yaw) else yaw0)
+        return poses
 
     def at(self, t: float) -> Array:
-        """Poses (M, 3) at `t` [s], see `along`."""
-        return np.asarray(self.along(np.array([t]))[0])
+        """Poses (M, 3) at `t` [s], see `poses`."""
+        return np.array(self.poses(t)).reshape(-1, 3)
+
+    def along(self, time: Array) -> Array:
+        """Poses (T, M, 3) at times (T,) [s], see `poses`."""
+        return np.array([self.poses(t) for t in time.tolist()]).reshape(len(time), -1, 3)
 
     def edges(self) -> tuple[Array, Index]:
         """Straight edges (S, 2, 2), each in the frame of its obstacle, and that obstacle's number (S,).
@@ -205,16 +217,11 @@ def _disjoint(polygon: Array, low: Array, high: Array) -> bool:
 
 @dataclass(frozen=True)
 class World:
-    """World shared by twins."""
+    """World shared by n twins; sequences have an entry for each."""
 
-    copy: Index  # (n,) copy of the scene of each row; one copy per repetition of an experiment
+    copy: Sequence[int]  # copy of the scene of each robot; one copy per repetition of an experiment
     scene: Scene
     engine: str | Mapping[str, object]  # registered engine: name, or table with `kind` and parameters
-    sensors: tuple[tuple[str, ...], ...]  # range sensors of each row, by name (`twins.sensing.range_sensors.SENSORS`)
+    sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.SENSORS`)
     sensor_noise: float  # of the range sensors, as a multiple of the real noise
-    mirrored: Mask  # (n,) robots that really are elsewhere, shown here at their received poses
-
-    @classmethod
-    def alone(cls, rows: int) -> World:
-        """Every row alone in an unlimited empty scene."""
-        return cls(np.arange(rows), Scene.empty(), "point-mass", ((),) * rows, 1.0, np.zeros(rows, dtype=bool))
+    mirrored: Sequence[bool]  # robots that really are elsewhere, shown here at their received poses

@@ -24,7 +24,7 @@ from experiments.definition.experiment import Experiment, World
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
-from twins.models.quadrotor import RESPONSES, Response, linear_step
+from twins.models.quadrotor import RESPONSES, Response
 
 FAR: Final = 1e6  # [m] walls that no robot meets
 TICK_COST: Final = 200.0  # robots whose arithmetic takes as long as what a tick costs in any case
@@ -65,6 +65,16 @@ def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
     for name in drones:
         factor[[kind.name == name for kind in kinds]] = _bearable_factor(RESPONSES[name], hz)
     return factor
+
+
+def linear_step(response: Response, axis: int, dt: float) -> Array:
+    """Step (4, 4) of a `Quadrotor` within its limits: of position [m], velocity [m/s], its change in a step, and goal."""
+    tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
+    pull = tilt * gain * response.position[axis]
+    place, speed, _, goal = np.eye(4)
+    change = np.array([-pull, -tilt * gain, 1.0 - tilt, pull])
+    velocity = speed + change
+    return np.stack([place + dt * velocity, velocity, change, goal])
 
 
 @cache

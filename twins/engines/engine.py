@@ -5,24 +5,31 @@ Engines are found by the entry-point group `zenpark.engines`: a frozen struct of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from agents.arrays import Array, Index, Mask
+from agents.body.interface import NO_ATTITUDE, Attitude
 from agents.body.kinds import Kind
-from twins.scene import Scene
+from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
+
+if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
+    from twins.scene import Scene
+
+Planar = tuple[float, float]  # x, y
+Pose = tuple[float, float, float]  # x, y [m], yaw [rad]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Input of an engine: n rows and the scene."""
+    """Input of an engine: n robots and the scene."""
 
-    kinds: tuple[Kind, ...]  # of the rows
-    start: Array  # (n, 3) [m]
-    yaw: Array  # (n,) [rad]
+    kinds: tuple[Kind, ...]  # of the robots
+    start: Sequence[Vector]  # [m]
+    yaw: Sequence[float]  # [rad]
     dt: float  # step of `Engine.advance` [s]
-    copy: Index  # (n,) copy of the scene of each row; only rows of one copy can touch each other
-    mirrored: Mask  # (n,) robots that really are elsewhere: moved by `Engine.mirror` only
+    copy: Sequence[int]  # copy of the scene of each robot; only robots of one copy can touch each other
+    mirrored: Sequence[bool]  # robots that really are elsewhere: moved by `Engine.mirror` only
     scene: Scene  # every copy has its own obstacles
 
 
@@ -37,53 +44,126 @@ class Touch:
     overlap: float  # [m]
 
 
+class Motion(Protocol):
+    """Motion of one robot."""
+
+    position: Vector  # the truth, hover jitter included [m]
+    velocity: Vector  # as known by the robot's controller: without hover jitter [m/s]
+    yaw: float  # [rad]
+    flying: bool  # motors on, in the air or about to be
+    attitude: Attitude  # unit quaternion from robot to world; NaN: upright
+    wobble: Planar  # hover jitter of the next step [m]
+
+    def move(self, dt: float) -> None:
+        """One step of `dt` [s] by itself; of no effect where the engine moves robots together."""
+        ...
+
+    def command(self, setpoint: Setpoint) -> None:
+        """Set the setpoint as in `agents.body.interface.Body.command`; NaN keeps the last one."""
+        ...
+
+    def takeoff(self, height: float) -> None:
+        """Climb to `height` [m], if the robot flies."""
+        ...
+
+    def land(self) -> None:
+        """Descend and switch off; on wheels, halt."""
+        ...
+
+    def stop(self) -> None:
+        """Switch motors off at once."""
+        ...
+
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        """Set position [m] and yaw [rad], at rest; a flying robot holds them."""
+        ...
+
+
+class Mirrored:
+    """Motion of a robot that really is elsewhere: as `shown`, absent (NaN) before. Orders have no effect."""
+
+    __slots__ = ("_position", "_velocity", "_yaw", "attitude", "flying", "position", "velocity", "wobble", "yaw")
+
+    position: Vector  # [m]
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad]
+    flying: bool
+    attitude: Attitude
+    wobble: Planar
+
+    def __init__(self, yaw: float) -> None:
+        self.position = self._position = UNKNOWN
+        self.velocity = self._velocity = ZERO
+        self.yaw = self._yaw = yaw
+        self.flying, self.attitude, self.wobble = False, NO_ATTITUDE, (0.0, 0.0)
+
+    def show(self, position: Vector, yaw: float, velocity: Vector) -> None:
+        """Set the state from the next step on: [m], [rad], [m/s]; NaN: absent."""
+        self._position, self._yaw, self._velocity = position, yaw, velocity
+
+    def move(self, dt: float) -> None:
+        """One step of `dt` [s]."""
+        self.position, self.yaw, self.velocity = self._position, self._yaw, self._velocity
+
+    def command(self, setpoint: Setpoint) -> None:
+        """Of no effect."""
+
+    def takeoff(self, height: float) -> None:
+        """Of no effect."""
+
+    def land(self) -> None:
+        """Of no effect."""
+
+    def stop(self) -> None:
+        """Of no effect."""
+
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        """Of no effect."""
+
+
 class Engine(Protocol):
     """Motion of n robots and of the obstacles."""
 
     @property
-    def position(self) -> Array: ...  # (n, 3) true position, hover jitter included [m]
+    def motions(self) -> Sequence[Motion]: ...  # of the robots; the same objects for ever
     @property
-    def velocity(self) -> Array: ...  # (n, 3) as known by the robot's controller: without hover jitter [m/s]
-    @property
-    def yaw(self) -> Array: ...  # (n,) [rad]
-    @property
-    def flying(self) -> Mask: ...  # (n,) motors on, in the air or about to be
-    @property
-    def attitude(self) -> Array | None: ...  # (n, 4) unit quaternion w, x, y, z from robot to world; None: upright
-    @property
-    def obstacles(self) -> Array: ...  # (copies, M, 3) current poses: x, y [m], yaw [rad]
+    def obstacles(self) -> Sequence[Sequence[Pose]]: ...  # current poses of the obstacles of each copy
 
-    def command(self, setpoint: Array) -> None:
-        """Set setpoints (n, 4) as in `agents.body.interface.Body.command`; rows of NaN keep theirs."""
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        """Set a setpoint for each robot, see `Motion.command`."""
         ...
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        """Make flying rows climb to `height` (len(rows),) [m]."""
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        """Make flying robots climb to `heights` [m]."""
         ...
 
-    def land(self, rows: Index) -> None:
-        """Make flying rows descend and switch off, and ground robots halt."""
+    def land(self, rows: Sequence[int]) -> None:
+        """Make flying robots descend and switch off, and ground robots halt."""
         ...
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         """Switch motors off at once."""
         ...
 
-    def advance(self, t: float, wobble: Array) -> None:
+    def advance(self, t: float, wobble: Sequence[Planar]) -> None:
         """Advance one step of dt, to `t` [s] after the common start (negative before).
 
         Args:
             t: Time for obstacles with a plan.
-            wobble: (n, 2) hover jitter: horizontal displacement added to each row at the end of the step [m].
+            wobble: Hover jitter: horizontal displacement added to each flying robot at the end of the step [m].
         """
         ...
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Set positions (len(rows), 3) [m] and yaws (len(rows),) [rad], at rest; flying rows hold them."""
+    def place(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
+    ) -> None:
+        """Set positions [m] and yaws [rad], at rest; flying robots hold them."""
         ...
 
-    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        """Set state of mirrored rows: (len(rows), 3) [m], (len(rows),) [rad], (len(rows), 3) [m/s]; NaN: absent."""
+    def mirror(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], velocities: Sequence[Vector]
+    ) -> None:
+        """Set the state of mirrored robots from the next step on: [m], [rad], [m/s]; NaN: absent."""
         ...
 
     def touches(self) -> list[Touch]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Annotated, ClassVar, Final
 
 import msgspec
@@ -18,12 +17,14 @@ import numpy as np
 from msgspec import Meta
 
 from agents.arrays import Array, Index, Mask, clamp, norm, some
-from agents.body.interface import BodyError
+from agents.body.interface import Attitude, BodyError
 from agents.body.kinds import Kind
+from agents.vectors import ZERO, Vector
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
-from twins.engines.engine import Stage
+from twins.engines.engine import Mirrored, Planar, Pose, Stage, Touch
 from twins.engines.mujoco_model import AIRFRAMES, mjcf
-from twins.engines.point_mass import PointMassEngine
+from twins.engines.point_mass import Orders, require_models
+from twins.models.differential import Differential
 from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
@@ -49,45 +50,101 @@ class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
-class RigidBodyEngine(PointMassEngine):
+class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
     """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
-
-    quadrotor: Drones
 
     def __init__(self, stage: Stage, motor_lag: float) -> None:
         """`motor_lag`: of a thrust [s]; raises BodyError for a kind without a twin, or without MuJoCo."""
-        super().__init__(stage, partial(Drones, scene=stage.scene, motor_lag=motor_lag))
-        self._update_attitude()
+        require_models(stage.kinds)
+        self._dt, self._scene, self._copies = stage.dt, stage.scene, max(stage.copy, default=0) + 1
+        self._air = [row for row, kind in enumerate(stage.kinds) if kind.flies and not stage.mirrored[row]]
+        self.drones = Drones([stage.kinds[row] for row in self._air], stage.dt, scene=stage.scene, motor_lag=motor_lag)
+        self.motions: list[Drone | Differential | Mirrored] = []
+        for row, kind in enumerate(stage.kinds):
+            start, yaw = stage.start[row], stage.yaw[row]
+            if stage.mirrored[row]:
+                self.motions.append(Mirrored(yaw))
+            elif kind.flies:
+                self.motions.append(self.drones.add(kind, start, yaw))
+            else:
+                self.motions.append(Differential(kind, start, yaw))
+        self.obstacles: Sequence[Sequence[Pose]] = [stage.scene.start] * self._copies
+        self._update_attitudes()
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        super().place(rows, position, yaw, flying)
-        self._update_attitude()
+    def place(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
+    ) -> None:
+        super().place(rows, positions, yaws, flying)
+        self._update_attitudes()
 
-    def advance(self, t: float, wobble: Array) -> None:
-        super().advance(t, wobble)
-        self._update_attitude()
+    def advance(self, t: float, wobble: Sequence[Planar]) -> None:
+        for motion in self.motions:
+            motion.move(self._dt)
+        for row in self._air:
+            # an error of the drones' own estimate, which they follow
+            self.motions[row].wobble = wobble[row]
+        self.drones.advance()
+        self._update_attitudes()
+        if any(self._scene.plans):
+            self.obstacles = [self._scene.poses(t)] * self._copies
 
-    def _fly(self, wobble: Array) -> None:
-        """Advance flying rows by one step; hover jitter is an error of the drones' own estimate, which they follow."""
-        self.quadrotor.set_position_error(wobble[self.air])
-        self.quadrotor.advance()
-        self._copy_flight_state()
+    def touches(self) -> list[Touch]:
+        """See `Engine.touches`: always empty."""
+        return []
 
-    def _update_attitude(self) -> None:
-        self.attitude = _upright_quaternions(self.yaw)
-        self.attitude[self.air] = self.quadrotor.attitude
-        self.attitude[self._mirrored] = _upright_quaternions(self.yaw[self._mirrored])
+    def _update_attitudes(self) -> None:
+        """Update the attitude of what stays upright."""
+        for motion in self.motions:
+            if not isinstance(motion, Drone):
+                motion.attitude = _upright_quaternion(motion.yaw)
 
 
-class Drones(OnboardFlight):
-    """N rigid quadrotors.
+class Drone(OnboardFlight):
+    """Setpoints and state of one of the drones that `Drones` moves.
 
     Heights are those of the centre of mass relative to standing on the floor [m]; yaw has no jumps.
     """
 
-    def __init__(
-        self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float, *, scene: Scene, motor_lag: float
-    ) -> None:
+    __slots__ = ("_drones", "row")
+
+    def __init__(self, drones: Drones, row: int, kind: Kind, start: Vector, yaw: float) -> None:
+        self._drones, self.row = drones, row
+        super().__init__(kind, start, yaw)
+
+    def move(self, dt: float) -> None:
+        """Of no effect: `Drones.advance` moves all."""
+
+    def takeoff(self, height: float) -> None:
+        """See `Motion.takeoff`; no effect on a drone that lies on its side or back."""
+        if self._drones.start_motors(self):
+            super().takeoff(height)
+
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        super().place(position, yaw, flying=flying)
+        self._drones.place(self)
+
+    def hold_yaw(self) -> None:
+        """Keep the present yaw."""
+        self._yaw_setpoint = self.yaw
+
+    def setpoint(self, dt: float) -> tuple[Vector, Vector, float, float, bool]:
+        """Advance a climb by `dt` [s]; returns position, velocity, yaw and yaw rate, and whether velocity counts."""
+        if self._climbing:
+            self._advance_climb(dt)
+        by_velocity = self._by_velocity and not self._climbing
+        return self._target, self._velocity_setpoint, self._yaw_setpoint, self._yaw_rate, by_velocity
+
+    def take(self, position: Vector, velocity: Vector, yaw: float, attitude: Attitude) -> None:
+        """Set the state, and end a completed landing."""
+        self.position = self.held = position
+        self.velocity, self.yaw, self.attitude = velocity, yaw, attitude
+        self._touches_down(position[2])
+
+
+class Drones:
+    """N rigid quadrotors: motion of all, in arrays."""
+
+    def __init__(self, kinds: Sequence[Kind], dt: float, *, scene: Scene, motor_lag: float) -> None:
         """Steps of `dt` [s] are divided for the firmware's rate; raises BodyError without MuJoCo or an airframe."""
         try:
             import mujoco  # noqa: PLC0415 - an extra
@@ -96,9 +153,8 @@ class Drones(OnboardFlight):
             raise BodyError(
                 "the engine mujoco needs an extra library: ./zenpark install mujoco-core, or pip install -e '.[mujoco]'"
             ) from None
-        super().__init__(kinds, start, yaw, dt)
         rows = len(kinds)
-        self._ticks = max(1, math.ceil(dt * RATE_HZ - 1e-6))
+        self._dt, self._ticks = dt, max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._period = dt / self._ticks
         if unknown := sorted({kind.name for kind in kinds} - AIRFRAMES.keys()):
             remedy = "add it to AIRFRAMES in twins/engines/mujoco_model.py (docs/plugins.md), or choose another engine"
@@ -114,61 +170,72 @@ class Drones(OnboardFlight):
         self._speed = np.array([kind.speed for kind in kinds])[:, None]
         self._control = int(mujoco.mjtState.mjSTATE_CTRL.value)
         self._firmware = Firmware(rows, self._period)
-        self._state = np.zeros((rows, FULL_STATE))
+        self.state = np.zeros((rows, FULL_STATE))
         self._quiet = np.zeros(rows)  # for how long each has been still [s]
-        self._wobble, self._drift = np.zeros((rows, 2)), np.zeros((rows, 2))
+        self._wobble = np.zeros((rows, 2))
         self._angles = np.zeros((rows, 3))
-        self._heading = np.array(yaw, dtype=float)
-        self._set_state(np.arange(rows), start, yaw, self.flying)
+        self._yaw, self._heading = np.zeros(rows), np.zeros(rows)  # yaw, and its setpoint [rad]
+        self._drones: list[Drone] = []
 
-    @property
-    def attitude(self) -> Array:
-        """(n, 4) unit quaternion w, x, y, z from robot to world."""
-        return self._state[:, TURN]
+    def add(self, kind: Kind, start: Vector, yaw: float) -> Drone:
+        """The next drone, at rest at `start` [m], `yaw` [rad]."""
+        drone = Drone(self, len(self._drones), kind, start, yaw)
+        self._drones.append(drone)
+        return drone
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        """See `Engine.takeoff`; no effect on a drone that lies on its side or back."""
-        upright = self._tilt_cosine(rows) > TIPPED
-        rows, height = rows[upright], height[upright]
-        fresh = rows[~self.flying[rows]]
-        self._firmware.reset(fresh)
-        self._heading[fresh] = self.yaw[fresh]
-        self._yaw_setpoint[fresh] = self.yaw[fresh]
-        self._quiet[rows] = 0.0
-        super().takeoff(rows, height)
+    def start_motors(self, drone: Drone) -> bool:
+        """Prepare a take-off; returns whether the drone stands upright."""
+        row = drone.row
+        if not self._tilt_cosine(slice(row, row + 1))[0] > TIPPED:
+            return False
+        if not drone.flying:
+            self._firmware.reset(np.array([row]))
+            self._heading[row] = drone.yaw
+            drone.hold_yaw()
+        self._quiet[row] = 0.0
+        return True
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        super().place(rows, position, yaw, flying)
+    def place(self, drone: Drone) -> None:
+        """Set the state of a drone to its position and yaw, at rest."""
+        row = drone.row
+        rows = np.array([row])
         self._firmware.reset(rows)
-        aloft = rows[flying]
-        self._firmware.preset_hover(aloft, self._hover[aloft] / self._full[aloft, 0])
-        self._set_state(rows, position, yaw, flying)
-
-    def set_position_error(self, wobble: Array) -> None:
-        """Set the error of the drones' position estimates until the next step: (n, 2) [m]."""
-        self._drift = (wobble - self._wobble) / (self._period * self._ticks)
-        self._wobble = wobble
+        if drone.flying:
+            self._firmware.preset_hover(rows, self._hover[rows] / self._full[rows, 0])
+        drone.attitude = _upright_quaternion(drone.yaw)
+        state = self.state[row]
+        state[:] = 0.0
+        state[PLACE], state[TURN] = drone.position, drone.attitude
+        state[LIFT] = self._hover[row] if drone.flying else 0.0
+        self._quiet[row] = 0.0
+        self._yaw[row] = self._heading[row] = drone.yaw
+        self._update_angles()
 
     def advance(self) -> None:
-        state, climbing = self._state, self._climbing()
-        if some(climbing):
-            self._advance_climb(climbing)
-        awake = np.flatnonzero(self.flying | (self._quiet < QUIET_S))
+        """One step of dt; `wobble` of each drone is the error of its position estimate."""
+        if not self._drones:
+            return
+        state, drones = self.state, self._drones
+        target, velocity, yaw, yaw_rate, by_velocity = map(
+            np.array, zip(*(drone.setpoint(self._dt) for drone in drones), strict=True)
+        )
+        flying = np.array([drone.flying for drone in drones])
+        wobble = np.array([drone.wobble for drone in drones])
+        drift, self._wobble = (wobble - self._wobble) / (self._period * self._ticks), wobble
+        awake = np.flatnonzero(flying | (self._quiet < QUIET_S))
         if not len(awake):
             return
         alone = len(awake) < len(state)
         models = [self._models[row] for row in awake] if alone else self._models
-        any_flies = some(self.flying)
-        by_velocity = self._by_velocity & ~climbing
-        target = self._target.copy()
-        target[:, :2] += self._wobble / TRACKED_SHARE
-        wanted = clamp(self._velocity_setpoint, -self._speed, self._speed)
-        if self._any_by_velocity:
-            wanted[:, :2] += self._drift
+        any_flies = some(flying)
+        target[:, :2] += wobble / TRACKED_SHARE
+        wanted = clamp(velocity, -self._speed, self._speed)
+        wanted[:, :2] += np.where(by_velocity[:, None], drift, 0.0)
         force = np.zeros((len(state), 4))
         for _ in range(self._ticks):
             if any_flies:
-                force = self._motor_forces(target, wanted, by_velocity)
+                self._heading = np.where(by_velocity, self._heading + self._period * yaw_rate, yaw)
+                force = self._motor_forces(target, wanted, by_velocity, flying)
             before = state[awake] if alone else state
             control = np.repeat((force[awake] if alone else force)[:, None], SUBSTEPS, axis=1)
             path = np.empty((len(awake), SUBSTEPS, FULL_STATE))
@@ -178,56 +245,46 @@ class Drones(OnboardFlight):
             )  # fmt: skip
             state[awake] = path[:, -1]
             self._update_angles()
-        self._update_grounded()
+        self._update_drones()
 
-    def _motor_forces(self, target: Array, wanted: Array, by_velocity: Mask) -> Array:
+    def _motor_forces(self, target: Array, wanted: Array, by_velocity: Mask, flying: Mask) -> Array:
         """Thrust setpoints of the motors, by the firmware's cascade: (n, 4) [N]."""
-        state, firmware = self._state, self._firmware
-        self._heading = np.where(by_velocity, self._heading + self._period * self._yaw_rate, self._yaw_setpoint)
-        firmware.advance_outer_loops(target - state[:, PLACE], state[:, SPEED], wanted, by_velocity, self.yaw)
+        state, firmware = self.state, self._firmware
+        firmware.advance_outer_loops(target - state[:, PLACE], state[:, SPEED], wanted, by_velocity, self._yaw)
         share = firmware.advance_inner_loops(self._angles, state[:, SPIN], self._heading)
-        return np.where(self.flying[:, None], self._full * share, 0.0)
+        return np.where(flying[:, None], self._full * share, 0.0)
 
     def _update_angles(self) -> None:
         """Update roll, pitch (nose down) and yaw of each row; yaw without jumps."""
-        w, x, y, z = self._state[:, TURN].T
+        w, x, y, z = self.state[:, TURN].T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        self.yaw = yaw + 2.0 * np.pi * np.round((self.yaw - yaw) / (2.0 * np.pi))
+        self._yaw = yaw + 2.0 * np.pi * np.round((self._yaw - yaw) / (2.0 * np.pi))
         roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-        self._angles = np.stack([roll, np.arcsin(clamp(2.0 * (w * y - z * x), -1.0, 1.0)), self.yaw], axis=1)
+        self._angles = np.stack([roll, np.arcsin(clamp(2.0 * (w * y - z * x), -1.0, 1.0)), self._yaw], axis=1)
 
-    def _update_grounded(self) -> None:
-        """End completed landings and bring drones on the ground to rest."""
-        state = self._state
-        self.position, self.velocity = state[:, PLACE].copy(), state[:, SPEED].copy()
-        self._touch_down()
-        if some(self.flying):
-            # the firmware's supervisor switches the motors off when the drone is upside down
-            over = np.flatnonzero(self.flying & (self._tilt_cosine(slice(None)) < 0.0))
-            if len(over):
-                self.stop(over)
-        moving = self.flying | (norm(state[:, SPEED]) > AT_REST) | (norm(state[:, SPIN]) > 10.0 * AT_REST)
+    def _update_drones(self) -> None:
+        """Give the drones their state; end completed landings, and bring drones on the ground to rest."""
+        state, drones = self.state, self._drones
+        columns = (state[:, PLACE], state[:, SPEED], self._yaw, state[:, TURN])
+        for drone, place, speed, yaw, turn in zip(drones, *(each.tolist() for each in columns), strict=True):
+            drone.take(tuple(place), tuple(speed), yaw, tuple(turn))
+        upside_down = self._tilt_cosine(slice(None)) < 0.0
+        for row in np.flatnonzero(upside_down).tolist():
+            if drones[row].flying:  # the firmware's supervisor switches the motors off
+                drones[row].stop()
+        flying = np.array([drone.flying for drone in drones])
+        moving = flying | (norm(state[:, SPEED]) > AT_REST) | (norm(state[:, SPIN]) > 10.0 * AT_REST)
         self._quiet = np.where(moving, 0.0, self._quiet + self._period * self._ticks)
-        if some(rests := self._quiet >= QUIET_S):
+        rests = self._quiet >= QUIET_S
+        if some(rests):
             state[rests, SPEED] = state[rests, SPIN] = 0.0
-            self.velocity[rests] = 0.0
+            for row in np.flatnonzero(rests).tolist():
+                drones[row].velocity = ZERO
 
     def _tilt_cosine(self, rows: Index | slice) -> Array:
-        turn = self._state[rows, TURN]
+        turn = self.state[rows, TURN]
         return np.asarray(1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2))
 
-    def _set_state(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        state = self._state
-        state[rows] = 0.0
-        state[rows, PLACE], state[rows, TURN] = position, _upright_quaternions(yaw)
-        state[rows, LIFT] = np.where(flying, self._hover[rows], 0.0)[:, None]
-        self._quiet[rows] = 0.0
-        self.yaw[rows] = self._heading[rows] = yaw
-        self.position, self.velocity = state[:, PLACE].copy(), state[:, SPEED].copy()
-        self._update_angles()
 
-
-def _upright_quaternions(yaw: Array) -> Array:
-    """Quaternions (n, 4) of upright rows."""
-    zero = np.zeros(len(yaw))
-    return np.stack([np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)], axis=1)
+def _upright_quaternion(yaw: float) -> Attitude:
+    return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)

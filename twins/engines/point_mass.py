@@ -1,20 +1,23 @@
-"""Point-mass engine: every row moves by its own model, without contacts; for thousands of robots."""
+"""Point-mass engine: every robot moves by its own model, without contacts; for thousands of robots."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar, Final
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 
 import msgspec
-import numpy as np
 
-from agents.arrays import Array, Index, Mask, span
 from agents.body.interface import BodyError
 from agents.body.kinds import Kind
-from twins.engines.engine import Stage, Touch
+from agents.vectors import Setpoint, Vector
+from twins.engines.engine import Mirrored, Motion, Planar, Pose, Stage, Touch
 from twins.models.differential import DRIVES, Differential
-from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import RESPONSES, Quadrotor
+
+if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
+    from twins.scene import Scene
+
+Moving = Quadrotor | Differential | Mirrored
 
 
 class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -23,7 +26,7 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
-        return PointMassEngine(stage)
+        return PointMassEngine(moving_models(stage), stage.dt, stage.scene, max(stage.copy, default=0) + 1)
 
 
 TWINLESS: Final = (  # remedy for a kind of which `has_model` is false
@@ -37,104 +40,93 @@ def has_model(kind: Kind) -> bool:
     return kind.name in (RESPONSES if kind.flies else DRIVES) and kind.flies == (kind.takes != "twist")
 
 
-class Models:
-    """Motion models of rows of any kinds: quadrotors for flying rows (`air`), differential drives for the `floor`."""
-
-    def __init__(self, stage: Stage, flights: Callable[..., OnboardFlight] = Quadrotor) -> None:
-        """`flights` makes the model of flying rows, with the arguments of `Quadrotor`."""
-        kinds = stage.kinds
-        if unknown := sorted({kind.name for kind in kinds if not has_model(kind)}):
-            raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
-        flies = np.array([kind.flies for kind in kinds])
-        air, floor = np.flatnonzero(flies), np.flatnonzero(~flies)
-        self.in_air, self.on_floor = air, floor
-        self.air, self.floor = span(air), span(floor)
-        self.quadrotor = flights([kinds[i] for i in air], stage.start[air], stage.yaw[air], stage.dt)
-        self.differential = Differential([kinds[i] for i in floor], stage.start[floor], stage.yaw[floor], stage.dt)
-        self.position, self.yaw = np.array(stage.start, dtype=float), np.array(stage.yaw, dtype=float)
-        self.velocity, self.flying = np.zeros_like(self.position), np.zeros(len(kinds), dtype=bool)
-        self._mirrored = np.flatnonzero(stage.mirrored)
-        count = len(self._mirrored)
-        self._mirrored_state = np.full((count, 3), np.nan), np.zeros((count, 3)), np.zeros(count)
-
-    def command(self, setpoint: Array) -> None:
-        if len(self.in_air):
-            self.quadrotor.command(setpoint[self.air])
-        if len(self.on_floor):
-            self.differential.command(setpoint[self.floor, :2])
-
-    def takeoff(self, rows: Index, height: Array) -> None:
-        flies = np.isin(rows, self.in_air)
-        self.quadrotor.takeoff(np.searchsorted(self.in_air, rows[flies]), height[flies])
-
-    def land(self, rows: Index) -> None:
-        self.quadrotor.land(self._indices_in(self.in_air, rows))
-        self.differential.halt(self._indices_in(self.on_floor, rows))
-
-    def stop(self, rows: Index) -> None:
-        self.quadrotor.stop(self._indices_in(self.in_air, rows))
-        self.differential.halt(self._indices_in(self.on_floor, rows))
-
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        for part, model in ((self.in_air, self.quadrotor), (self.on_floor, self.differential)):
-            which = np.isin(rows, part)
-            at = np.searchsorted(part, rows[which])
-            model.place(at, position[which], yaw[which], flying[which])
-        self.position[rows], self.yaw[rows], self.velocity[rows], self.flying[rows] = position, yaw, 0.0, flying
-
-    def mirror(self, rows: Index, position: Array, yaw: Array, velocity: Array) -> None:
-        at = np.searchsorted(self._mirrored, rows)
-        for state, values in zip(self._mirrored_state, (position, velocity, yaw), strict=True):
-            state[at] = values
-
-    def push(self, rows: Index, velocity: Array) -> None:
-        """Set velocities (len(rows), 3) [m/s]; of ground robots the component along their heading."""
-        flies = np.isin(rows, self.in_air)
-        self.quadrotor.velocity[np.searchsorted(self.in_air, rows[flies])] = velocity[flies]
-        self.differential.roll(np.searchsorted(self.on_floor, rows[~flies]), velocity[~flies])
-
-    @staticmethod
-    def _indices_in(part: Index, rows: Index) -> Index:
-        """Indices in `part` of the `rows` that belong to it."""
-        return np.searchsorted(part, rows[np.isin(rows, part)])
+def require_models(kinds: Iterable[Kind]) -> None:
+    """Raises BodyError for a kind without a model."""
+    if unknown := sorted({kind.name for kind in kinds if not has_model(kind)}):
+        raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
 
 
-class PointMassEngine(Models):
-    """Implements `twins.engines.engine.Engine`."""
+def model(kind: Kind, start: Vector, yaw: float) -> Quadrotor | Differential:
+    """Motion model of a robot at rest at `start` [m], `yaw` [rad]."""
+    return Quadrotor(kind, start, yaw) if kind.flies else Differential(kind, start, yaw)
 
-    attitude: Array | None = None
 
-    def __init__(self, stage: Stage, flights: Callable[..., OnboardFlight] = Quadrotor) -> None:
-        super().__init__(stage, flights)
-        self.position[self._mirrored] = np.nan
-        self._scene, self._moves = stage.scene, len(stage.scene.moving) > 0
-        self.obstacles = np.tile(stage.scene.pose, (int(stage.copy.max(initial=0)) + 1, 1, 1))
+def moving_models(stage: Stage) -> list[Moving]:
+    """Motion models of all robots; raises BodyError for a kind without one."""
+    require_models(stage.kinds)
+    return [
+        Mirrored(yaw) if mirrored else model(kind, start, yaw)
+        for kind, start, yaw, mirrored in zip(stage.kinds, stage.start, stage.yaw, stage.mirrored, strict=True)
+    ]
 
-    def advance(self, t: float, wobble: Array) -> None:
-        if len(self.on_floor):
-            drive = self.differential
-            drive.advance()
-            floor = self.floor
-            self.position[floor], self.velocity[floor], self.yaw[floor] = drive.position, drive.velocity, drive.yaw
-        if len(self.in_air):
-            self._fly(wobble)
-        if len(self._mirrored):
-            rows = self._mirrored
-            self.position[rows], self.velocity[rows], self.yaw[rows] = self._mirrored_state
-        if self._moves:
-            self.obstacles = np.tile(self._scene.at(t), (len(self.obstacles), 1, 1))
 
-    def _fly(self, wobble: Array) -> None:
-        """Advance flying rows by one step; hover jitter is added to the position, not to the motion."""
-        self.quadrotor.advance()
-        self._copy_flight_state()
-        self.position[self.air, :2] += wobble[self.air]
+MotionT = TypeVar("MotionT", bound=Motion)
 
-    def _copy_flight_state(self) -> None:
-        """Copy the state of flying rows from their model."""
-        flight, air = self.quadrotor, self.air
-        self.position[air], self.velocity[air], self.yaw[air] = flight.position, flight.velocity, flight.yaw
-        self.flying[air] = flight.flying
+
+class Orders(Generic[MotionT]):
+    """Orders to robots by their rows."""
+
+    motions: list[MotionT]
+
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        for motion, setpoint in zip(self.motions, setpoints, strict=True):
+            motion.command(setpoint)
+
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        for row, height in zip(rows, heights, strict=True):
+            self.motions[row].takeoff(height)
+
+    def land(self, rows: Sequence[int]) -> None:
+        for row in rows:
+            self.motions[row].land()
+
+    def stop(self, rows: Sequence[int]) -> None:
+        for row in rows:
+            self.motions[row].stop()
+
+    def place(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
+    ) -> None:
+        for row, position, yaw, flies in zip(rows, positions, yaws, flying, strict=True):
+            self.motions[row].place(position, yaw, flying=flies)
+
+    def mirror(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], velocities: Sequence[Vector]
+    ) -> None:
+        for row, position, yaw, velocity in zip(rows, positions, yaws, velocities, strict=True):
+            motion = self.motions[row]
+            if isinstance(motion, Mirrored):
+                motion.show(position, yaw, velocity)
+
+
+class PointMassEngine(Orders[Moving]):
+    """Implements `twins.engines.engine.Engine`. Its robots may as well be moved one by one, see `twins.body.Twin`."""
+
+    def __init__(self, motions: list[Moving], dt: float, scene: Scene | None = None, copies: int = 1) -> None:
+        self.motions = motions
+        self._dt, self._copies = dt, copies
+        self._scene = scene
+        self.moves_obstacles = scene is not None and any(scene.plans)
+        self.obstacles: Sequence[Sequence[Pose]] = [[] if scene is None else scene.start] * copies
+
+    def advance(self, t: float, wobble: Sequence[Planar]) -> None:
+        dt = self._dt
+        for motion, displacement in zip(self.motions, wobble, strict=True):
+            motion.wobble = displacement
+            motion.move(dt)
+        if self.moves_obstacles:
+            self.move_obstacles(t)
+
+    def move_obstacles(self, t: float) -> None:
+        """Move obstacles with a plan to where they are at `t` [s] after the common start."""
+        if self._scene is not None:
+            self.obstacles = [self._scene.poses(t)] * self._copies
+
+    def push(self, row: int, velocity: Vector) -> None:
+        """Set a velocity [m/s]; of a ground robot the component along its heading."""
+        motion = self.motions[row]
+        if not isinstance(motion, Mirrored):
+            motion.push(velocity)
 
     def touches(self) -> list[Touch]:
         """See `Engine.touches`: always empty."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
 import pymunk
 
-from agents.arrays import Array
 from twins.engines.engine import Touch
 
 APART_S: Final = 0.1  # a shorter separation does not end a contact
@@ -19,10 +19,10 @@ AT_REST: Final = 1e-9  # [m/s], [N s] smaller values count as zero
 
 @dataclass
 class Layers:
-    """Vertical extents of rows and obstacles, by number: rows, and −1 − k as in `Touch.second`."""
+    """Vertical extents of n robots and M obstacles, by number: rows, and −1 − k as in `Touch.second`."""
 
-    bottom: Array  # (n + M + 1,) [m]; negative numbers count from the end
-    top: Array  # (n + M + 1,) [m]
+    bottom: list[float]  # (n + M + 1) [m]; negative numbers count from the end
+    top: list[float]  # (n + M + 1) [m]
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Contacts:
         space.collision_bias = (1.0 - CORRECTION) ** (1.0 / self.step)
         space.on_collision(pre_solve=self._pre_solve, post_solve=self._post_solve)
 
-    def reset_rows(self, rows: list[int]) -> None:
+    def reset_rows(self, rows: Iterable[int]) -> None:
         """Forget earlier contacts of rows that were moved to another place."""
         gone = set(rows)
         for pair in [pair for pair in self._last if not gone.isdisjoint(pair)]:
@@ -61,7 +61,7 @@ class Contacts:
         one, other = arbiter.shapes
         a, b = self.numbers[one], self.numbers[other]
         bottom, top = self.layers.bottom, self.layers.top
-        apart = bool(top[a] <= bottom[b] or top[b] <= bottom[a])
+        apart = top[a] <= bottom[b] or top[b] <= bottom[a]
         arbiter.process_collision = not apart
         if apart or (a < 0 and b < 0):
             return

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Final
 
 import msgspec
-import numpy as np
 import pymunk
 import pymunk.batch
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, Share, clamp, every, norm, some, span
-from twins.engines.engine import Stage, Touch
-from twins.engines.point_mass import Models
+from agents.body.kinds import Kind
+from agents.vectors import Share, Vector, clamp, is_finite
+from twins.engines.engine import Mirrored, Pose, Stage, Touch
+from twins.engines.engine import Planar as Displacement
+from twins.engines.point_mass import Moving, Orders, moving_models
 from twins.engines.pymunk_contacts import Contacts, Layers
 from twins.engines.pymunk_space import Place, Surfaces
+from twins.models.differential import Differential
 from twins.models.onboard_flight import TOUCHDOWN
-from twins.models.quadrotor import GRAVITY
+from twins.models.quadrotor import GRAVITY, Quadrotor
 
 FIELDS: Final = (
     pymunk.batch.BodyFields.POSITION
@@ -26,10 +29,8 @@ FIELDS: Final = (
     | pymunk.batch.BodyFields.ANGULAR_VELOCITY
     | pymunk.batch.BodyFields.FORCE
 )
-PLACE, YAW, MOVE, TURN, PUSH = slice(0, 2), 2, slice(3, 5), 5, slice(6, 8)  # columns of a batch with these fields
+X, Y, YAW, V_X, V_Y, TURN, PUSH_X, PUSH_Y = range(8)  # numbers of a body in a batch with these fields
 WIDTH: Final = 8
-POSE: Final = slice(0, 3)
-RATE: Final = slice(3, 6)
 AWAY: Final = 1e6  # [m] position of absent mirrored robots
 UNFELT: Final = 1e-12  # [m/s] smaller changes of speed are rounding
 LEAP: Final = 10.0  # [m/s] faster motion of a plan is a jump
@@ -58,10 +59,10 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return PlanarEngine(stage, self)
 
 
-class PlanarEngine(Models):
+class PlanarEngine(Orders[Moving]):
     """Implements `twins.engines.engine.Engine`.
 
-    The motion models compute the velocity of each row after this tick; forces within the grip of the wheels, or the
+    The motion models compute the velocity of each robot after this tick; forces within the grip of the wheels, or the
     thrust of a tilted quadrotor, change the velocity to that, and pymunk's solver adds the contacts. Without contact a
     tick equals that of the point-mass engine. Pymunk moves bodies at the beginning of a step and computes velocities at
     its end; positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
@@ -70,229 +71,262 @@ class PlanarEngine(Models):
     of a crowd, would depend on other copies.
     """
 
-    attitude = None
-
     def __init__(self, stage: Stage, choice: Planar) -> None:
         """Raises BodyError for a kind without a twin."""
-        super().__init__(stage)
+        self.motions = moving_models(stage)
         self._dt, self._steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
         self._step = stage.dt / self._steps
         self._ticks = 0
         self._fastest = GRAVITY * math.tan(choice.tilt) * stage.dt  # change of speed in a tick [m/s]
         self._found: list[Touch] = []
-        rows = len(stage.kinds)
         self._layers = _build_layers(stage)
-        self._tall = np.array([stage.kinds[row].height for row in self.in_air])
-        mass = np.array([stage.kinds[row].mass for row in self.in_air])
-        self._force = (mass / self._step)[:, None]  # changes the speed by 1 m/s in one step
-        self._build_copies(stage, choice)
-        self._wobble = np.zeros((rows, 2))
         self._scene = stage.scene
-        self._pose = stage.scene.pose.copy()
-        self.obstacles = np.tile(stage.scene.pose, (len(self._copies), 1, 1))
-        self.place(np.arange(rows), self.position, self.yaw, self.flying)
-        self.position[self._mirrored] = np.nan
+        self._planned_poses: list[Pose] = list(stage.scene.start)
+        self._build_copies(stage, choice)
+        self.obstacles: list[list[Pose]] = [list(stage.scene.start) for _ in self._copies]
+        for robot, motion in zip(self._robots, self.motions, strict=True):
+            robot.put(motion.position, motion.yaw)
 
     def _build_copies(self, stage: Stage, choice: Planar) -> None:
-        """Build the copies, and record the index of each body in the state."""
+        """Build the copies of the scene, and find the numbers of each body in them."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
         self._copies: list[_Copy] = []
-        bodies, wheels = np.zeros(len(stage.kinds), dtype=np.intp), np.zeros(len(stage.kinds), dtype=np.intp)
-        movable: list[int] = []
-        things: list[list[int]] = []
-        feet: dict[int, tuple[pymunk.PivotJoint, float]] = {}
-        begin = 0
-        for number in range(int(stage.copy.max(initial=0)) + 1):
+        found: dict[int, _Robot] = {}
+        for number in range(max(stage.copy, default=0) + 1):
             place = Place(surfaces, -1 - len(stage.scene.names))
-            for row in np.flatnonzero(stage.copy == number).tolist():
-                place.add_robot(row, stage.kinds[row], mirrored=bool(stage.mirrored[row]))
+            for row, kind in enumerate(stage.kinds):
+                if stage.copy[row] == number:
+                    place.add_robot(row, kind, mirrored=bool(stage.mirrored[row]))
             place.furnish(stage.scene)
             contacts = Contacts(
                 place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
             )
-            copy = _Copy(place.space, contacts, choice.iterations, begin)
+            copy = _Copy(place, contacts, choice.iterations)
             for row, body in place.rows.items():
-                bodies[row] = copy.slot(body)
-            for row, body in place.wheels.items():
-                wheels[row] = copy.slot(body)
-            movable = list(place.obstacles)  # the same in every copy
-            things.append([copy.slot(body) for body in place.obstacles.values()])
-            feet |= place.feet
+                wheels = place.wheels.get(row, body)
+                robot = _Robot(copy.cells, copy.begin(body), copy.begin(wheels), stage.kinds[row], self._step)
+                if row in place.feet:
+                    robot.foot, robot.grip = place.feet[row]
+                found[row] = robot
             self._copies.append(copy)
-            begin = copy.block.stop
-        # one copy's state is pymunk's own memory: nothing needs to be copied
-        alone = len(self._copies) == 1
-        self._state = self._copies[0].state if alone else np.concatenate([copy.state for copy in self._copies])
-        self._bodies = span(bodies)
-        self._bodies_in_air = span(bodies[self.in_air])
-        self._wheels = span(wheels[self.on_floor])
-        self._movable = np.array(movable, dtype=np.intp)
-        self._things = np.array(things, dtype=np.intp).reshape(len(self._copies), -1)
-        planned = np.isin(self._movable, stage.scene.moving)
-        self._planned, self._carried = self._movable[planned], self._things[:, planned]
-        self._slots = bodies
-        self._feet = [feet[row] for row in sorted(feet)]
-        self._footed = np.searchsorted(self.in_air, sorted(feet))
-        self._stands = np.ones(len(feet), dtype=bool)
+        self._robots = [found[row] for row in range(len(stage.kinds))]
+        self._planned = [k for k in self._copies[0].obstacles if stage.scene.plans[k] is not None]
 
-    def advance(self, t: float, wobble: Array) -> None:
-        state, step, dt = self._state, self._step, self._dt
-        if len(self.on_floor):
-            drive, wheels = self.differential, self._wheels
-            drive.advance()
-            state[wheels, MOVE] = drive.velocity[:, :2]
-            state[wheels, TURN] = (drive.yaw - self.yaw[self.floor]) / dt
-        if len(self.in_air):
-            target, drift = self._push_flying(wobble)
-        if len(self._mirrored):
-            self._update_mirrors()
-        if len(self._planned):
+    def advance(self, t: float, wobble: Sequence[Displacement]) -> None:
+        step, dt = self._step, self._dt
+        for row, (robot, motion) in enumerate(zip(self._robots, self.motions, strict=True)):
+            if isinstance(motion, Quadrotor):
+                self._push_flying(row, robot, motion, wobble[row])
+            elif isinstance(motion, Differential):
+                robot.drive(motion, dt)
+            else:
+                self._show_mirrored(row, robot, motion)
+        if self._planned:
             self._move_planned(t)
         for copy in self._copies:
-            copy.advance(state, self._ticks * dt, step, self._steps)
+            copy.advance(self._ticks * dt, step, self._steps)
         self._ticks += 1
-        bodies = self._bodies
-        position, velocity = np.zeros_like(self.position), np.zeros_like(self.velocity)
-        moves = state[bodies, MOVE]
-        position[:, :2], velocity[:, :2] = state[bodies, PLACE] + step * moves, moves
-        yaw = state[bodies, YAW] + step * state[bodies, TURN]
-        if len(self.on_floor):
-            floor = self.floor
-            drive.position[:, :2], drive.yaw[:] = position[floor, :2], yaw[floor]
-            position[floor, 2] = drive.position[:, 2]
-        if len(self.in_air):
-            air, flight = self.air, self.quadrotor
-            blow = velocity[air, :2] - (target + drift)
-            felt = np.abs(blow) > UNFELT
-            if some(felt):
-                # a contact first stops the hover jitter, which the robot does not know
-                known = blow - clamp(blow, np.minimum(-drift, 0.0), np.maximum(-drift, 0.0))
-                target += np.where(felt, known, 0.0)
-            flight.velocity[:, :2] = target
-            flight.position[:, :2] = position[air, :2] - wobble[air]
-            position[air, 2], velocity[air], yaw[air] = flight.position[:, 2], flight.velocity, flight.yaw
-            self.flying[air] = flight.flying
-            self._wobble[air] = wobble[air]
-        if len(self._mirrored):
-            rows = self._mirrored
-            position[rows], velocity[rows], yaw[rows] = self._mirrored_state
-        self.position, self.velocity, self.yaw = position, velocity, yaw
-        if len(self._movable):
-            self.obstacles = self.obstacles.copy()
-            self.obstacles[:, self._movable] = state[self._things, POSE] + step * state[self._things, RATE]
+        for robot, motion in zip(self._robots, self.motions, strict=True):
+            if isinstance(motion, Quadrotor):
+                robot.take_flight(motion, step)
+            elif isinstance(motion, Differential):
+                robot.take_drive(motion, step)
+        for copy, poses in zip(self._copies, self.obstacles, strict=True):
+            copy.read_obstacles(poses, step)
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        super().place(rows, position, yaw, flying)
-        slots = self._slots[rows]
-        self._state[slots, PLACE], self._state[slots, YAW] = position[:, :2], yaw
-        self._state[slots, RATE] = 0.0
-        self._wobble[rows] = 0.0
+    def place(
+        self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
+    ) -> None:
+        super().place(rows, positions, yaws, flying)
+        for row, position, yaw in zip(rows, positions, yaws, strict=True):
+            self._robots[row].put(position, yaw)
         for copy in self._copies:
-            copy.contacts.reset_rows(rows.tolist())
+            copy.contacts.reset_rows(rows)
 
     def touches(self) -> list[Touch]:
         found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))
         self._found.clear()
         return found
 
-    def _push_flying(self, wobble: Array) -> tuple[Array, Array]:
-        """Apply forces to flying rows; returns the velocities (n_air, 2) of controllers and jitter [m/s]."""
-        flight, air = self.quadrotor, self.air
-        before = flight.velocity[:, :2].copy()
-        flight.advance()
-        change = flight.velocity[:, :2] - before
-        size = norm(change)
-        if some(size > self._fastest):
-            change *= (self._fastest / np.maximum(size, self._fastest))[:, None]
-        aloft = every(flight.flying)
-        if not aloft:
-            change *= flight.flying[:, None]
-        drift = (wobble[air] - self._wobble[air]) / self._dt
-        target, height = before + change, flight.position[:, 2]
-        # all in the first step of the tick: then the tick equals one of the point-mass engine, whose steps are ticks
-        bodies = self._bodies_in_air
-        self._state[bodies, PUSH] = (target + drift - self._state[bodies, MOVE]) * self._force
-        self._layers.bottom[air], self._layers.top[air] = height, height + self._tall
-        if not aloft or some(self._stands):
-            self._set_floor_grip(~flight.flying & (height <= TOUCHDOWN) & (drift == 0.0).all(axis=1))
-        return target, drift
+    def _push_flying(self, row: int, robot: _Robot, flight: Quadrotor, wobble: Displacement) -> None:
+        """Apply the force that a flying robot's model asks for."""
+        height = robot.fly(flight, wobble, self._dt, self._fastest)
+        self._layers.bottom[row], self._layers.top[row] = height, height + robot.tall
 
-    def _set_floor_grip(self, stands: Mask) -> None:
-        """Switch the floor's friction on for flying rows (n_air,) that stand on the floor, and off for others."""
-        stands = stands[self._footed]
-        for k in np.flatnonzero(stands != self._stands).tolist():
-            joint, force = self._feet[k]
-            joint.max_force = force if stands[k] else 0.0
-        self._stands = stands
-
-    def _update_mirrors(self) -> None:
-        """Set mirrored rows to their received poses; the solver sees their motion from there."""
-        position, velocity, yaw = self._mirrored_state
-        here = np.isfinite(position[:, :2]).all(axis=1)
-        moves = np.where(here[:, None], np.nan_to_num(velocity[:, :2]), 0.0)
-        slots, state = self._slots[self._mirrored], self._state
-        state[slots, MOVE], state[slots, TURN] = moves, 0.0
-        state[slots, PLACE] = np.where(here[:, None], position[:, :2], AWAY) - self._step * moves
-        state[slots, YAW] = np.nan_to_num(yaw)
-        aloft = np.isin(self._mirrored, self.in_air)
-        rows, height = self._mirrored[aloft], position[aloft, 2]
-        tall = self._tall[np.searchsorted(self.in_air, rows)]
-        self._layers.bottom[rows], self._layers.top[rows] = height, height + tall
+    def _show_mirrored(self, row: int, robot: _Robot, motion: Mirrored) -> None:
+        """Set a mirrored robot to its received pose; the solver sees its motion from there."""
+        motion.move(self._dt)
+        robot.show(motion, self._step)
+        if robot.flies:
+            height = motion.position[2]
+            self._layers.bottom[row], self._layers.top[row] = height, height + robot.tall
 
     def _move_planned(self, t: float) -> None:
         """Move obstacles by their plans, with the velocity that reaches the planned pose in this tick."""
-        pose = self._scene.at(t)
-        before, now = self._pose[self._planned], pose[self._planned]
-        rate = now - before
-        rate[:, 2] = np.remainder(rate[:, 2] + math.pi, 2.0 * math.pi) - math.pi
-        rate /= self._dt
-        jumps = norm(rate[:, :2]) > LEAP
-        before[jumps], rate[jumps] = now[jumps], 0.0
-        self._state[self._carried, POSE] = before - self._step * rate
-        self._state[self._carried, RATE] = rate
-        self._pose = pose
+        poses = self._scene.poses(t)
+        for k in self._planned:
+            (x, y, yaw), (to_x, to_y, to_yaw) = self._planned_poses[k], poses[k]
+            turn = ((to_yaw - yaw + math.pi) % (2.0 * math.pi) - math.pi) / self._dt
+            v_x, v_y = (to_x - x) / self._dt, (to_y - y) / self._dt
+            if math.sqrt(v_x * v_x + v_y * v_y) > LEAP:
+                x, y, yaw, v_x, v_y, turn = to_x, to_y, to_yaw, 0.0, 0.0, 0.0
+            for copy in self._copies:
+                cells, at = copy.cells, copy.obstacles[k]
+                cells[at + X], cells[at + Y] = x - self._step * v_x, y - self._step * v_y
+                cells[at + YAW] = yaw - self._step * turn
+                cells[at + V_X], cells[at + V_Y], cells[at + TURN] = v_x, v_y, turn
+        self._planned_poses = poses
+
+
+class _Robot:
+    """A robot's body, and its wheels, in the numbers of a copy."""
+
+    __slots__ = (
+        "_at", "_cells", "_drift", "_force", "_stands", "_target", "_wheels", "_wobble", "flies", "foot", "grip",
+        "tall",
+    )  # fmt: skip
+
+    flies: bool
+    tall: float  # [m]
+    foot: pymunk.PivotJoint | None  # friction of a landed robot with the floor,
+    grip: float  # and its force [N]
+
+    def __init__(self, cells: memoryview[float], at: int, wheels: int, kind: Kind, step: float) -> None:
+        """Numbers from `at` and, of the wheels, from `wheels` on."""
+        self._cells, self._at, self._wheels = cells, at, wheels
+        self._force = kind.mass / step  # changes the speed by 1 m/s in one step
+        self._wobble = self._drift = self._target = (0.0, 0.0)  # of the last tick [m], [m/s], [m/s]
+        self._stands = True
+        self.flies, self.tall, self.foot, self.grip = kind.flies, kind.height, None, 0.0
+
+    def put(self, position: Vector, yaw: float) -> None:
+        """Place the body at rest."""
+        cells, at = self._cells, self._at
+        cells[at + X], cells[at + Y], cells[at + YAW] = position[0], position[1], yaw
+        cells[at + V_X] = cells[at + V_Y] = cells[at + TURN] = 0.0
+        self._wobble = (0.0, 0.0)
+
+    def drive(self, drive: Differential, dt: float) -> None:
+        """Turn the wheels as their model does."""
+        before = drive.yaw
+        drive.move(dt)
+        cells, at = self._cells, self._wheels
+        cells[at + V_X], cells[at + V_Y] = drive.velocity[0], drive.velocity[1]
+        cells[at + TURN] = (drive.yaw - before) / dt
+
+    def take_drive(self, drive: Differential, step: float) -> None:
+        """Give the model the state of the body."""
+        cells, at = self._cells, self._at
+        v_x, v_y = cells[at + V_X], cells[at + V_Y]
+        drive.position = (cells[at + X] + step * v_x, cells[at + Y] + step * v_y, drive.position[2])
+        drive.velocity, drive.yaw = (v_x, v_y, 0.0), cells[at + YAW] + step * cells[at + TURN]
+
+    def fly(self, flight: Quadrotor, wobble: Displacement, dt: float, fastest: float) -> float:
+        """Push the body to the velocity of its model and of the hover jitter; returns the height [m]."""
+        flight.wobble = wobble
+        before_x, before_y, _ = flight.velocity
+        flight.move(dt)
+        v_x, v_y, _ = flight.velocity
+        d_x, d_y = v_x - before_x, v_y - before_y
+        size = math.sqrt(d_x * d_x + d_y * d_y)
+        if size > fastest:
+            d_x, d_y = d_x * (fastest / size), d_y * (fastest / size)
+        if not flight.flying:
+            d_x = d_y = 0.0
+        drift_x, drift_y = (wobble[0] - self._wobble[0]) / dt, (wobble[1] - self._wobble[1]) / dt
+        target_x, target_y = before_x + d_x, before_y + d_y
+        # all in the first step of the tick: then the tick equals one of the point-mass engine, whose steps are ticks
+        cells, at = self._cells, self._at
+        cells[at + PUSH_X] = (target_x + drift_x - cells[at + V_X]) * self._force
+        cells[at + PUSH_Y] = (target_y + drift_y - cells[at + V_Y]) * self._force
+        self._target, self._drift = (target_x, target_y), (drift_x, drift_y)
+        height = flight.held[2]
+        stands = not flight.flying and height <= TOUCHDOWN and drift_x == 0.0 and drift_y == 0.0
+        if stands != self._stands and self.foot is not None:
+            self.foot.max_force = self.grip if stands else 0.0
+            self._stands = stands
+        return height
+
+    def take_flight(self, flight: Quadrotor, step: float) -> None:
+        """Give the model the state of the body."""
+        cells, at = self._cells, self._at
+        v_x, v_y = cells[at + V_X], cells[at + V_Y]
+        x, y = cells[at + X] + step * v_x, cells[at + Y] + step * v_y
+        target_x = self._target[0] + _felt(v_x - (self._target[0] + self._drift[0]), self._drift[0])
+        target_y = self._target[1] + _felt(v_y - (self._target[1] + self._drift[1]), self._drift[1])
+        _, _, z = flight.held
+        flight.velocity = (target_x, target_y, flight.velocity[2])
+        flight.held = (x - flight.wobble[0], y - flight.wobble[1], z)
+        flight.position = (x, y, z)
+        self._wobble = flight.wobble
+
+    def show(self, motion: Mirrored, step: float) -> None:
+        """Place the body of a mirrored robot, far away while it is absent."""
+        cells, at = self._cells, self._at
+        x, y, _ = motion.position
+        v_x, v_y, _ = motion.velocity if is_finite(motion.velocity) else (0.0, 0.0, 0.0)
+        if not (math.isfinite(x) and math.isfinite(y)):
+            x, y, v_x, v_y = AWAY, AWAY, 0.0, 0.0
+        cells[at + X], cells[at + Y] = x - step * v_x, y - step * v_y
+        cells[at + YAW] = motion.yaw if math.isfinite(motion.yaw) else 0.0
+        cells[at + V_X], cells[at + V_Y], cells[at + TURN] = v_x, v_y, 0.0
+
+
+def _felt(blow: float, drift: float) -> float:
+    """Change of speed on an axis that the robot notices: a contact first stops the hover jitter, unknown to it."""
+    if not abs(blow) > UNFELT:
+        return 0.0
+    return blow - clamp(blow, min(-drift, 0.0), max(-drift, 0.0))
 
 
 class _Copy:
-    """Pymunk space of one copy; its bodies are the rows `block` of the engine's state."""
+    """Pymunk space of one copy, and the numbers of its bodies."""
 
-    def __init__(self, space: pymunk.Space, contacts: Contacts, iterations: int, begin: int) -> None:
-        self._space, self.contacts = space, contacts
-        space.iterations = iterations
-        contacts.attach(space)
+    cells: memoryview[float]  # of all bodies, WIDTH each; pymunk's own memory
+    obstacles: dict[int, int]  # index of the first number of each obstacle with a plan or a mass
+
+    def __init__(self, place: Place, contacts: Contacts, iterations: int) -> None:
+        self._space, self.contacts = place.space, contacts
+        self._space.iterations = iterations
+        contacts.attach(self._space)
         identities = pymunk.batch.Buffer()
-        pymunk.batch.get_space_bodies(space, pymunk.batch.BodyFields.BODY_ID, identities)
-        order = np.frombuffer(identities.int_buf(), dtype=np.uintp).tolist()
-        self._slots = {identity: begin + k for k, identity in enumerate(order)}
-        self.block = slice(begin, begin + len(order))
+        pymunk.batch.get_space_bodies(self._space, pymunk.batch.BodyFields.BODY_ID, identities)
+        order = memoryview(identities.int_buf()).cast("P").tolist()
+        self._begin = {identity: WIDTH * k for k, identity in enumerate(order)}
         self._buffer = pymunk.batch.Buffer()
-        pymunk.batch.get_space_bodies(space, FIELDS, self._buffer)
+        pymunk.batch.get_space_bodies(self._space, FIELDS, self._buffer)
         # pymunk fills the same memory at every call, because no body is added or removed any more
-        self.state: Array = np.frombuffer(self._buffer.float_buf()).reshape(-1, WIDTH)
+        self.cells = memoryview(self._buffer.float_buf()).cast("d")
+        self.obstacles = {k: self.begin(body) for k, body in place.obstacles.items()}
 
-    def slot(self, body: pymunk.Body) -> int:
-        """Index of a body in the engine's state."""
-        return self._slots[body.id]
+    def begin(self, body: pymunk.Body) -> int:
+        """Index of the first number of a body."""
+        return self._begin[body.id]
 
-    def advance(self, state: Array, begin: float, step: float, steps: int) -> None:
-        """Advance the bodies from `state`, and write the result to `state`."""
-        alone = state is self.state
-        if not alone:
-            self.state[:] = state[self.block]
+    def advance(self, begin: float, step: float, steps: int) -> None:
+        """Advance the bodies from their numbers, `begin` [s] after the first tick."""
         pymunk.batch.set_space_bodies(self._space, FIELDS, self._buffer)
         for k in range(steps):
             self.contacts.time = begin + k * step
             self._space.step(step)
         self._buffer.clear()
         pymunk.batch.get_space_bodies(self._space, FIELDS, self._buffer)
-        if not alone:
-            state[self.block] = self.state
+
+    def read_obstacles(self, poses: list[Pose], step: float) -> None:
+        """Update the poses of the obstacles that move."""
+        cells = self.cells
+        for k, at in self.obstacles.items():
+            poses[k] = (
+                cells[at + X] + step * cells[at + V_X],
+                cells[at + Y] + step * cells[at + V_Y],
+                cells[at + YAW] + step * cells[at + TURN],
+            )
 
 
 def _build_layers(stage: Stage) -> Layers:
     scene, rows = stage.scene, len(stage.kinds)
     # negative numbers count from the end: obstacle 0 is last, and the arena's walls come before all obstacles
-    bottom = np.concatenate([np.zeros(rows), [-np.inf], scene.bottom[::-1]])
-    top = np.concatenate([[kind.height for kind in stage.kinds], [np.inf], scene.top[::-1]])
+    bottom = [*(0.0,) * rows, -math.inf, *scene.bottom[::-1].tolist()]
+    top = [*(kind.height for kind in stage.kinds), math.inf, *scene.top[::-1].tolist()]
     return Layers(bottom, top)

@@ -1,4 +1,4 @@
-"""Motion models in rows: differential and flying robots, on-board flight control, disturbances, noise.
+"""Motion of one robot: differential drives, quadrotors with on-board flight control, disturbances, noise.
 
 May import: agents.
 """

@@ -1,4 +1,4 @@
-"""Differential drive: unicycle on two wheels with limits of speed and acceleration.
+"""Differential drive: unicycle on two wheels with limits of speed and acceleration; all of it is quiet.
 
 A command holds until the next one, as on the robots themselves: what stops wheels that are told nothing more is their
 bridge, a watchdog on the robot, or nothing (docs/hanging.md).
@@ -6,14 +6,13 @@ bridge, a watchdog on the robot, or nothing (docs/hanging.md).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from math import cos, isfinite, sin
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, clamp, every
+from agents.body.interface import NO_ATTITUDE, Attitude
 from agents.body.kinds import Kind
+from agents.vectors import ZERO, Setpoint, Vector, clamp
 
 
 @dataclass(frozen=True)
@@ -32,58 +31,73 @@ DRIVES: Final[dict[str, Drive]] = {
 
 
 class Differential:
-    """N differential robots."""
+    """One differential robot."""
 
-    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
-        drives = [DRIVES[kind.name] for kind in kinds]
-        self._dt = dt
-        self._half_base = np.array([0.5 * d.base for d in drives])
-        self._turn = np.array([dt / d.base for d in drives])  # change of yaw in a step per difference of the rim speeds
-        self._limit = np.array([d.speed for d in drives])
-        self._change = np.array([d.acceleration * dt for d in drives])
-        self._least = -self._change
-        self._wheels = np.zeros((2, len(drives)))  # rim speeds, left and right [m/s]
-        self._wanted = np.zeros((2, len(drives)))
-        self.position = np.array(start, dtype=float)  # (n, 3) [m]; z stays 0
-        self.yaw = np.array(yaw, dtype=float)  # (n,) [rad]
-        self.velocity = np.zeros_like(self.position)  # (n, 3) [m/s]
+    __slots__ = (
+        "_acceleration", "_base", "_half_base", "_left", "_limit", "_right", "_wanted_left", "_wanted_right",
+        "attitude", "flying", "position", "velocity", "wobble", "yaw",
+    )  # fmt: skip
 
-    def command(self, twist: Array) -> None:
-        """Set v [m/s] and ω [rad/s], (n, 2); rows of NaN keep their command."""
-        v, half = twist[:, 0], self._half_base * twist[:, 1]
-        wanted = np.empty((2, len(half)))
-        wanted[0], wanted[1] = v - half, v + half
-        given = np.isfinite(wanted[0])
-        if every(given):
-            self._wanted = wanted
-        else:
-            np.copyto(self._wanted, wanted, where=given)
+    position: Vector  # [m]; z stays as it is
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad]
+    flying: bool  # never
+    attitude: Attitude  # NaN: upright
+    wobble: tuple[float, float]  # of no effect: hover jitter is of flying robots
 
-    def halt(self, rows: Index) -> None:
+    def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
+        """At rest at `start` [m] with `yaw` [rad]."""
+        drive = DRIVES[kind.name]
+        self._base, self._half_base = drive.base, 0.5 * drive.base
+        self._limit, self._acceleration = drive.speed, drive.acceleration
+        self.attitude, self.flying, self.wobble = NO_ATTITUDE, False, (0.0, 0.0)
+        self.place(start, yaw, flying=False)
+
+    def command(self, setpoint: Setpoint) -> None:
+        """Set v [m/s] and ω [rad/s], the first two numbers; NaN keeps the command."""
+        v, half = setpoint[0], self._half_base * setpoint[1]
+        left = v - half
+        if isfinite(left):
+            self._wanted_left, self._wanted_right = left, v + half  # rim speeds [m/s]
+
+    def takeoff(self, height: float) -> None:
+        """Of no effect."""
+
+    def land(self) -> None:
         """Command zero wheel speed."""
-        self._wanted[:, rows] = 0.0
+        self._wanted_left = self._wanted_right = 0.0
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Set positions (len(rows), 3) [m] and yaws [rad], at rest."""
-        self.position[rows], self.yaw[rows], self.velocity[rows] = position, yaw, 0.0
-        self._wanted[:, rows] = self._wheels[:, rows] = 0.0
+    def stop(self) -> None:
+        """Command zero wheel speed."""
+        self._wanted_left = self._wanted_right = 0.0
 
-    def roll(self, rows: Index, velocity: Array) -> None:
-        """Drive rows straight ahead with the component of a velocity (len(rows), 3) [m/s] along their heading."""
-        speed = velocity[:, 0] * np.cos(self.yaw[rows]) + velocity[:, 1] * np.sin(self.yaw[rows])
-        self._wanted[:, rows] = self._wheels[:, rows] = speed
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        """Set position [m] and yaw [rad], at rest."""
+        self.position, self.velocity, self.yaw = position, ZERO, yaw
+        self._left = self._right = self._wanted_left = self._wanted_right = 0.0  # rim speeds [m/s]
 
-    def advance(self) -> None:
-        """One step of dt, along an arc: no side-slip (paper, eq. (1))."""
-        wanted = self._wanted
-        speed = np.abs(wanted)
-        if not every(speed <= self._limit):  # both wheels are slowed by the same factor, which keeps the curvature
-            wanted = wanted / np.maximum(np.maximum(speed[0], speed[1]) / self._limit, 1.0)
-        self._wheels += clamp(wanted - self._wheels, self._least, self._change)
-        left, right = self._wheels[0], self._wheels[1]
+    def push(self, velocity: Vector) -> None:
+        """Drive straight ahead with the component of a velocity [m/s] along the heading."""
+        speed = velocity[0] * cos(self.yaw) + velocity[1] * sin(self.yaw)
+        self._left = self._right = self._wanted_left = self._wanted_right = speed
+
+    def move(self, dt: float) -> None:
+        """One step of `dt` [s], along an arc: no side-slip (paper, eq. (1))."""
+        left, right, limit = self._wanted_left, self._wanted_right, self._limit
+        if abs(left) > limit or abs(right) > limit:
+            # both wheels are slowed by the same factor, which keeps the curvature
+            excess = max(abs(left), abs(right)) / limit
+            left, right = left / excess, right / excess
+        change = self._acceleration * dt
+        self._left += clamp(left - self._left, -change, change)
+        self._right += clamp(right - self._right, -change, change)
+        left, right = self._left, self._right
         v = 0.5 * (left + right)
-        turn = (right - left) * self._turn
-        middle = self.yaw + 0.5 * turn
-        self.velocity[:, 0], self.velocity[:, 1] = v * np.cos(middle), v * np.sin(middle)
-        self.position += self._dt * self.velocity
-        self.yaw = self.yaw + turn  # see `Quadrotor.advance`
+        turn = (right - left) * (dt / self._base)
+        yaw = self.yaw
+        middle = yaw + 0.5 * turn
+        vx, vy = v * cos(middle), v * sin(middle)
+        x, y, z = self.position
+        self.velocity = (vx, vy, 0.0)
+        self.position = (x + dt * vx, y + dt * vy, z)
+        self.yaw = yaw + turn

@@ -1,82 +1,116 @@
-"""Disturbances of a model: hover jitter, measurement noise, drift of odometry, and command latency."""
+"""Disturbances of one robot: hover jitter, measurement noise, drift of odometry, and command latency.
+
+Everything but the constructors is quiet. `noise` of a disturbance is refilled by its owner (`noise.refill`).
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from math import exp, sqrt
+from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, every, norm
 from agents.body.interface import Disturbance
+from agents.vectors import NO_SETPOINT, Setpoint
 from twins.models.noise import Noise
 
-FULL_WOBBLE = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
+FULL_WOBBLE: Final = 0.2  # [m] hover jitter grows from the ground up to this height: a standing robot has none
+
+Planar = tuple[float, float]  # x, y
 
 
 class HoverJitter:
     """Ornstein-Uhlenbeck displacement of each horizontal axis about the position held by the robot's controller."""
 
-    def __init__(self, disturbance: Sequence[Disturbance], noise: Noise, dt: float) -> None:
-        jitter = [d.hover_jitter for d in disturbance]
-        sigma = np.array([0.0 if j is None else j.sigma for j in jitter])
-        keep = np.array([1.0 if j is None else math.exp(-dt / j.correlation_s) for j in jitter])
-        self._keep = np.repeat(keep[:, None], 2, axis=1)
-        noise.scale = np.repeat((sigma * np.sqrt(1.0 - keep**2))[:, None], 2, axis=1)
-        self._push = noise
-        self.present = bool(sigma.any())
-        self._displacement = np.zeros((len(disturbance), 2))
+    __slots__ = ("_keep", "_x", "_y", "noise", "present")
 
-    def advance(self, height: Array) -> Array:
-        """Step by dt, exact for any dt; returns the displacement (n, 2) of rows at `height` (n,) [m]."""
-        self._displacement = self._keep * self._displacement + self._push.draw()
-        if every(height >= FULL_WOBBLE):
-            return self._displacement
-        return np.asarray(np.minimum(height / FULL_WOBBLE, 1.0)[:, None] * self._displacement)
+    present: bool
+    noise: Noise
+
+    def __init__(self, disturbance: Disturbance, name: str, seed: int, dt: float) -> None:
+        """`dt`: time between two calls of `advance` [s]."""
+        jitter = disturbance.hover_jitter
+        sigma = 0.0 if jitter is None else jitter.sigma
+        self._keep = 1.0 if jitter is None else exp(-dt / jitter.correlation_s)
+        self.noise = Noise(name, seed, "hover jitter", (sigma * sqrt(1.0 - self._keep * self._keep),) * 2)
+        self.present = sigma != 0.0
+        self._x = self._y = 0.0
+
+    def advance(self, height: float) -> Planar:
+        """Step by dt, exact for any dt; returns the displacement at `height` [m]."""
+        noise = self.noise
+        k = noise.next
+        noise.next = k + 2
+        keep = self._keep
+        self._x = x = keep * self._x + noise.ahead[k]
+        self._y = y = keep * self._y + noise.ahead[k + 1]
+        if height >= FULL_WOBBLE:
+            return x, y
+        share = height / FULL_WOBBLE
+        return share * x, share * y
 
 
 class Measurement:
     """White noise on the measured position and yaw."""
 
-    def __init__(self, disturbance: Sequence[Disturbance], spatial: Array, noise: Noise) -> None:
-        """`spatial` (n, 3): 1 on the axes on which a row's position is measured, else 0."""
-        sigma = np.array([d.position_sigma or 0.0 for d in disturbance])
-        yaw = np.array([d.yaw_sigma or 0.0 for d in disturbance])
-        noise.scale = np.concatenate([sigma[:, None] * spatial, yaw[:, None]], axis=1)
-        self._noise = noise
-        self.present = bool(noise.scale.any())
+    __slots__ = ("noise", "present")
 
-    def draw(self) -> Array:
-        """Noise (n, 4): x, y, z [m], yaw [rad]."""
-        return self._noise.draw()
+    present: bool
+    noise: Noise  # x, y, z [m], yaw [rad] in a draw
+
+    def __init__(self, disturbance: Disturbance, name: str, seed: int, *, spatial: bool) -> None:
+        """`spatial`: the height is measured, too."""
+        sigma, yaw = disturbance.position_sigma or 0.0, disturbance.yaw_sigma or 0.0
+        self.noise = Noise(name, seed, "measurement", (sigma, sigma, sigma if spatial else 0.0, yaw))
+        self.present = self.noise.present
+
+    def draw(self) -> tuple[float, float, float, float]:
+        """Noise of x, y, z [m] and yaw [rad]."""
+        noise = self.noise
+        k, ahead = noise.next, noise.ahead
+        noise.next = k + 4
+        return ahead[k], ahead[k + 1], ahead[k + 2], ahead[k + 3]
 
 
 class Drift:
     """Error of odometry: a random walk of the measured position whose variance grows with the distance driven."""
 
-    def __init__(self, disturbance: Sequence[Disturbance], noise: Noise) -> None:
-        self._rate = np.array([d.odometry_drift or 0.0 for d in disturbance])
-        self._noise = noise
-        self.present = bool(self._rate.any())
-        self.error = np.zeros((len(disturbance), 2))
+    __slots__ = ("_rate", "noise", "present", "x", "y")
 
-    def advance(self, moved: Array) -> None:
-        """One step in which each row moved by (n, 2) [m]."""
-        self.error += (self._rate * np.sqrt(norm(moved)))[:, None] * self._noise.draw()
+    present: bool
+    noise: Noise
+    x: float  # error [m]
+    y: float
+
+    def __init__(self, disturbance: Disturbance, name: str, seed: int) -> None:
+        self._rate = disturbance.odometry_drift or 0.0
+        self.present = self._rate != 0.0
+        self.noise = Noise(name, seed, "odometry", (1.0, 1.0) if self.present else (0.0, 0.0))
+        self.x = self.y = 0.0
+
+    def advance(self, x: float, y: float) -> None:
+        """One step in which the robot moved by x, y [m]."""
+        noise = self.noise
+        k = noise.next
+        noise.next = k + 2
+        scale = self._rate * sqrt(sqrt(x * x + y * y))
+        self.x += scale * noise.ahead[k]
+        self.y += scale * noise.ahead[k + 1]
 
 
 class Latency:
-    """Commands (n, 4) take effect some ticks later."""
+    """Commands take effect some ticks later."""
 
-    def __init__(self, disturbance: Sequence[Disturbance], dt: float) -> None:
-        self._ticks = np.array([round((d.latency_s or 0.0) / dt) for d in disturbance])
-        self._past = np.full((int(self._ticks.max(initial=0)) + 1, len(disturbance), 4), np.nan)
-        self._rows = np.arange(len(disturbance))
+    __slots__ = ("_now", "_past", "_ticks", "present")
+
+    present: bool
+
+    def __init__(self, disturbance: Disturbance, dt: float) -> None:
+        self._ticks = round((disturbance.latency_s or 0.0) / dt)
+        self._past: list[Setpoint] = [NO_SETPOINT] * (self._ticks + 1)
         self._now = 0
-        self.present = bool(self._ticks.any())
+        self.present = self._ticks != 0
 
-    def delay(self, command: Array) -> Array:
+    def delay(self, command: Setpoint) -> Setpoint:
         """Store this tick's command; returns the command that takes effect now."""
-        self._now = (self._now + 1) % len(self._past)
         self._past[self._now] = command
-        return np.asarray(self._past[(self._now - self._ticks) % len(self._past), self._rows])
+        self._now = (self._now + 1) % (self._ticks + 1)
+        return self._past[self._now]

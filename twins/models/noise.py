@@ -1,40 +1,55 @@
-"""Random numbers in rows: each row has its own streams, so its noise is the same alone and in a swarm."""
+"""Random numbers of one robot: each purpose has its own stream, so noise is the same alone and in a swarm.
+
+Reading is quiet; `refill` is rare, and alone needs numpy.
+"""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
-from agents.arrays import Array
+BLOCK: Final = 64  # draws per refill: spreads the generator's overhead over this many ticks
 
-BLOCK = 256  # draws per refill: spreads the generator's overhead over this many ticks
+
+def stream(name: str, seed: int, purpose: str) -> np.random.Generator:
+    """Generator of a robot's noise: one for each name, seed and purpose."""
+    import numpy as np  # noqa: PLC0415 - a robot without noise needs no numpy
+
+    return np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(purpose.encode())])
 
 
 class Noise:
-    """White Gaussian noise, (n, width) per draw, of unit variance times `scale`."""
+    """White Gaussian noise, `len(scale)` numbers per draw; a reader takes them from `ahead` and moves `next` on."""
 
-    scale: Array | float = 1.0  # (n, width); set it before the first draw
+    __slots__ = ("_block", "_generator", "_scale", "ahead", "end", "next", "present")
 
-    def __init__(
-        self, names: Sequence[str], seeds: Sequence[int], purpose: str, width: int, block: int = BLOCK
-    ) -> None:
-        """One stream for each name, seed and purpose; it does not depend on `block`, the draws per refill."""
-        self._width, self._size = width, block
-        self._generators = [
-            np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(purpose.encode())])
-            for name, seed in zip(names, seeds, strict=True)
-        ]
-        self._block: Array = np.zeros((0, len(self._generators), width))
-        self._next = 0
+    present: bool  # a scale is not 0
+    ahead: list[float]  # numbers drawn ahead, one draw after the other
+    next: int  # index of the next draw in `ahead`
+    end: int  # value of `next` at which `refill` is due; −1 without noise
 
-    def draw(self) -> Array:
-        """The next (n, width)."""
-        if self._next == len(self._block):
-            self._block = np.stack([g.standard_normal((self._size, self._width)) for g in self._generators], axis=1)
-            self._block *= self.scale
-            self._next = 0
-        drawn: Array = self._block[self._next]
-        self._next += 1
-        return drawn
+    def __init__(self, name: str, seed: int, purpose: str, scale: Sequence[float], block: int = BLOCK) -> None:
+        """`scale`: standard deviations. The stream does not depend on `block`, the draws per refill."""
+        self.present = any(scale)
+        self.ahead, self.next, self.end = [], 0, -1
+        self._scale, self._block = tuple(scale), block
+        if self.present:
+            self._generator = stream(name, seed, purpose)
+            self.end = block * len(self._scale)
+            self.refill()
+
+    def refill(self) -> None:
+        """Draw the next block."""
+        drawn = self._generator.standard_normal((self._block, len(self._scale)))
+        self.ahead, self.next = (drawn * self._scale).ravel().tolist(), 0
+
+
+def refill(*noises: Noise) -> None:
+    """Refill what is used up; due after every step of a reader."""
+    for noise in noises:
+        if noise.next == noise.end:
+            noise.refill()

@@ -1,14 +1,12 @@
-"""On-board flight control of quadrotors: setpoints, and autonomous take-offs and landings."""
+"""On-board flight control of a quadrotor: setpoints, and autonomous take-offs and landings. All of it is quiet."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, every, some
+from agents.body.interface import NO_ATTITUDE, Attitude
 from agents.body.kinds import Kind
+from agents.vectors import ZERO, Setpoint, Vector
 
 CLIMB: Final = 0.4  # [m/s] mean speed of take-offs and landings
 SHORTEST_S: Final = 0.5  # duration of a take-off or landing
@@ -16,98 +14,80 @@ TOUCHDOWN: Final = 0.02  # [m] a landing robot below this height is down
 
 
 class OnboardFlight:
-    """State, setpoints, take-offs and landings of n quadrotors; subclasses add the motion (`advance`)."""
+    """State, setpoints, take-offs and landings of a quadrotor; subclasses add the motion."""
 
-    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
-        """At rest at `start` (n, 3) [m] with `yaw` (n,) [rad], motors off."""
-        rows = len(kinds)
-        self._dt = dt
-        self.position = np.array(start, dtype=float)  # (n, 3) [m]
-        self.velocity = np.zeros_like(self.position)  # (n, 3) [m/s]
-        self.yaw = np.array(yaw, dtype=float)  # (n,) [rad]
-        self.flying = np.zeros(rows, dtype=bool)  # (n,) motors on
-        self._landing = np.zeros(rows, dtype=bool)
-        self._by_velocity = np.array([kind.takes == "velocity" for kind in kinds], dtype=bool)
-        self._by_position = ~self._by_velocity
-        self._any_by_velocity = some(self._by_velocity)
-        self._target = self.position.copy()  # (n, 3) position setpoint [m]
-        self._yaw_setpoint = self.yaw.copy()
-        self._velocity_setpoint = np.zeros((rows, 3))  # of rows `_by_velocity` [m/s]
-        self._yaw_rate = np.zeros(rows)  # of rows `_by_velocity` [rad/s]
-        self._from = self._target[:, 2].copy()  # take-offs and landings: heights [m], times [s]
-        self._to = self._from.copy()
-        self._elapsed = np.full(rows, np.inf)
-        self._span = np.ones(rows)
-        self._any_climbing = False
+    __slots__ = (
+        "_by_velocity", "_climb_s", "_climbing", "_elapsed", "_from", "_landing", "_target", "_to",
+        "_velocity_setpoint", "_yaw_rate", "_yaw_setpoint", "attitude", "flying", "held", "position", "velocity",
+        "wobble", "yaw",
+    )  # fmt: skip
 
-    def advance(self) -> None:
-        """Advance one step of dt."""
-        raise NotImplementedError
+    position: Vector  # the truth, hover jitter included [m]
+    held: Vector  # as the controller knows it: without hover jitter [m]
+    velocity: Vector  # as the controller knows it [m/s]
+    yaw: float  # [rad]
+    flying: bool  # motors on
+    attitude: Attitude  # NaN where it is always upright
+    wobble: tuple[float, float]  # hover jitter of the next step [m]
 
-    def command(self, setpoint: Array) -> None:
-        """Set position and yaw, or velocity and yaw rate (n, 4); no effect on rows of NaN, on the ground or landing."""
-        unknown = np.isnan(setpoint[:, 0])
-        if every(self.flying) and not (self._any_by_velocity or self._any_climbing or some(unknown)):
-            self._target[:], self._yaw_setpoint[:] = setpoint[:, :3], setpoint[:, 3]
+    def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
+        """At rest at `start` [m] with `yaw` [rad], motors off."""
+        self._by_velocity = kind.takes == "velocity"
+        self.attitude, self.wobble = NO_ATTITUDE, (0.0, 0.0)
+        self._from = self._to = start[2]  # heights of a take-off or landing [m],
+        self._elapsed, self._climb_s = 0.0, 1.0  # time since its begin, and its duration [s]
+        self.place(start, yaw, flying=False)
+
+    def command(self, setpoint: Setpoint) -> None:
+        """Set position and yaw, or velocity and yaw rate; no effect if it is NaN, or on the ground, or landing."""
+        x = setpoint[0]
+        if x != x or self._landing or not self.flying:  # noqa: PLR0124 - NaN
             return
-        given = self.flying & ~(unknown | self._landing)
-        position = given & self._by_position
-        np.copyto(self._target, setpoint[:, :3], where=position[:, None])
-        np.copyto(self._yaw_setpoint, setpoint[:, 3], where=position)
-        if self._any_climbing:
-            self._elapsed[given] = np.inf
-            self._any_climbing = some(self._climbing())
-        if self._any_by_velocity:
-            velocity = given & self._by_velocity
-            np.copyto(self._velocity_setpoint, setpoint[:, :3], where=velocity[:, None])
-            np.copyto(self._yaw_rate, setpoint[:, 3], where=velocity)
+        self._climbing = False
+        if self._by_velocity:
+            self._velocity_setpoint, self._yaw_rate = (x, setpoint[1], setpoint[2]), setpoint[3]
+        else:
+            self._target, self._yaw_setpoint = (x, setpoint[1], setpoint[2]), setpoint[3]
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        """Start the motors and climb to `height` (len(rows),) [m] at the present place."""
-        self.flying[rows] = True
-        self._landing[rows] = False
-        self._climb(rows, height)
+    def takeoff(self, height: float) -> None:
+        """Start the motors and climb to `height` [m] at the present place."""
+        self.flying, self._landing = True, False
+        self._climb(height)
 
-    def land(self, rows: Index) -> None:
+    def land(self) -> None:
         """Descend at the present place, then switch the motors off; a repeated order changes nothing."""
-        rows = rows[self.flying[rows] & ~self._landing[rows]]
-        self._landing[rows] = True
-        self._climb(rows, np.zeros(len(rows)))
+        if self.flying and not self._landing:
+            self._landing = True
+            self._climb(0.0)
 
-    def stop(self, rows: Index) -> None:
-        """Switch the motors off: rows in the air fall."""
-        self.flying[rows] = False
-        self._landing[rows] = False
+    def stop(self) -> None:
+        """Switch the motors off: in the air the robot falls."""
+        self.flying = self._landing = False
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        """Set positions (len(rows), 3) [m] and yaws [rad], at rest; flying rows hold them."""
-        self.position[rows], self.velocity[rows], self.yaw[rows] = position, 0.0, yaw
-        self._target[rows], self._yaw_setpoint[rows] = position, yaw
-        self._velocity_setpoint[rows], self._yaw_rate[rows] = 0.0, 0.0
-        self.flying[rows], self._landing[rows] = flying, False
-        self._elapsed[rows] = np.inf
-        self._any_climbing = some(self._climbing())
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        """Set position [m] and yaw [rad], at rest; a flying robot holds them."""
+        self.position = self.held = self._target = position
+        self.velocity = self._velocity_setpoint = ZERO
+        self.yaw = self._yaw_setpoint = yaw
+        self._yaw_rate = 0.0
+        self.flying, self._landing, self._climbing = flying, False, False
 
-    def _climbing(self) -> Mask:
-        """Rows (n,) in a take-off or landing."""
-        return np.asarray(np.isfinite(self._elapsed))
+    def _climb(self, height: float) -> None:
+        self._target = self.held
+        self._from, self._to = self.held[2], height
+        self._elapsed, self._climbing = 0.0, True
+        self._climb_s = max(abs(height - self.held[2]) / CLIMB, SHORTEST_S)
 
-    def _climb(self, rows: Index, height: Array) -> None:
-        self._target[rows] = self.position[rows]
-        self._from[rows], self._to[rows] = self.position[rows, 2], height
-        self._elapsed[rows] = 0.0
-        self._any_climbing = some(self._climbing())
-        self._span[rows] = np.maximum(np.abs(height - self.position[rows, 2]) / CLIMB, SHORTEST_S)
+    def _advance_climb(self, dt: float) -> None:
+        """Advance the height setpoint by one step, on a polynomial without jerk at both ends."""
+        self._elapsed += dt
+        s = min(self._elapsed / self._climb_s, 1.0)
+        s2 = s * s
+        share = s2 * s2 * (35.0 - 84.0 * s + 70.0 * s2 - 20.0 * (s2 * s))
+        self._target = (self._target[0], self._target[1], self._from + share * (self._to - self._from))
 
-    def _advance_climb(self, climbing: Mask) -> None:
-        """Advance the height setpoint of rows `climbing` by one step, on a polynomial without jerk at both ends."""
-        self._elapsed += self._dt
-        s = np.clip(self._elapsed[climbing] / self._span[climbing], 0.0, 1.0)
-        share = s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-        self._target[climbing, 2] = self._from[climbing] + share * (self._to[climbing] - self._from[climbing])
-
-    def _touch_down(self) -> None:
-        """Switch off the motors of rows whose landing is complete."""
-        down = self._landing & (self.position[:, 2] < TOUCHDOWN) & (self._elapsed > self._span)
-        self.flying &= ~down
-        self._landing &= ~down
+    def _touches_down(self, height: float) -> bool:
+        """Switch the motors off when a landing is complete at `height` [m]; returns whether they are off."""
+        if self._landing and height < TOUCHDOWN and self._elapsed > self._climb_s:
+            self.flying = self._landing = False
+        return not self.flying

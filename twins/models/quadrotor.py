@@ -1,17 +1,13 @@
-"""Quadrotors as point masses under on-board position or velocity control, with limits and lag."""
+"""Quadrotor as a point mass under on-board position or velocity control, with limits and lag; `move` is quiet."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, clamp, every, some
 from agents.body.kinds import Kind
-from agents.decision.position_control import wrap
+from agents.vectors import ZERO, Vector, clamp, wrap
 from twins.models.onboard_flight import TOUCHDOWN, OnboardFlight
 
 GRAVITY: Final = 9.81  # [m/s²]
@@ -21,11 +17,11 @@ GRAVITY: Final = 9.81  # [m/s²]
 class Response:
     """Closed loop on board, for x, y and z."""
 
-    position: tuple[float, float, float]  # gains [1/s]
-    velocity: tuple[float, float, float]  # gains [1/s]
-    speed: tuple[float, float, float]  # limits [m/s]
+    position: Vector  # gains [1/s]
+    velocity: Vector  # gains [1/s]
+    speed: Vector  # limits [m/s]
     # rate at which the acceleration follows, because the quadrotor must tilt first [1/s]; inf: at once
-    tilt: tuple[float, float, float]
+    tilt: Vector
 
 
 RESPONSES: Final[dict[str, Response]] = {
@@ -36,68 +32,91 @@ RESPONSES: Final[dict[str, Response]] = {
 }
 
 
-def linear_step(response: Response, axis: int, dt: float) -> Array:
-    """Step (4, 4) of `Quadrotor` within its limits, of position [m], velocity [m/s], its change in a step, and goal."""
-    tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
-    pull = tilt * gain * response.position[axis]
-    place, speed, _, goal = np.eye(4)
-    change = np.array([-pull, -tilt * gain, 1.0 - tilt, pull])
-    velocity = speed + change
-    return np.stack([place + dt * velocity, velocity, change, goal])
-
-
 class Quadrotor(OnboardFlight):
-    """N quadrotors; `position` is that of the on-board controller, without hover jitter."""
+    """One quadrotor."""
 
-    def __init__(self, kinds: Sequence[Kind], start: Array, yaw: Array, dt: float) -> None:
-        super().__init__(kinds, start, yaw, dt)
-        responses = [RESPONSES[kind.name] for kind in kinds]
-        rows = len(responses)
-        self._kp = np.array([r.position for r in responses])
-        self._gain = dt * np.array([r.velocity for r in responses])  # of a step: k_v dt
-        self._speed = np.array([r.speed for r in responses]).reshape(rows, 3)
-        self._slowest = -self._speed
-        self._tilt = np.minimum(dt * np.array([r.tilt for r in responses]).reshape(rows, 3), 1.0)
-        self._rest = 1.0 - self._tilt
-        self._change = np.zeros((rows, 3))  # of velocity in a step, with the lag of tilting [m/s]
-        self._turn = np.array([kind.turn_response for kind in kinds])
-        self._turn_rate = np.array([kind.turn_rate for kind in kinds])
+    __slots__ = ("_change", "_dt", "_gain", "_response", "_speed", "_step_gain", "_tilt", "_turn", "_turn_rate")
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask) -> None:
-        super().place(rows, position, yaw, flying)
-        self._change[rows] = 0.0
+    def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
+        self._response = RESPONSES[kind.name]
+        self._gain, self._speed = self._response.position, self._response.speed
+        self._turn, self._turn_rate = kind.turn_response, kind.turn_rate
+        self._dt = 0.0  # step for which the next two hold
+        self._step_gain = self._tilt = ZERO  # k_v dt, and share of the acceleration that is reached in a step
+        super().__init__(kind, start, yaw)
 
-    def advance(self) -> None:
-        """Advance one step of dt: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting."""
-        if self._any_climbing:
-            self._advance_climb(self._climbing())
-        wanted = self._kp * (self._target - self.position)
-        turn = self._turn * wrap(self._yaw_setpoint - self.yaw)
-        if self._any_by_velocity:
-            wanted = np.where((self._by_velocity & ~self._climbing())[:, None], self._velocity_setpoint, wanted)
-            turn = np.where(self._by_velocity, self._yaw_rate, turn)
-        wanted = clamp(wanted, self._slowest, self._speed)
-        turn = np.minimum(np.maximum(turn, -self._turn_rate), self._turn_rate)
-        # written as a sum, a row that tilts at once keeps the bits of its change
-        self._change = self._rest * self._change + self._tilt * (self._gain * (wanted - self.velocity))
-        velocity = self.velocity + self._change
-        aloft = every(self.flying)
-        if not aloft:
-            velocity = np.where(self.flying[:, None], velocity, self._falling())
-            turn = np.where(self.flying, turn, 0.0)
-            self._change[~self.flying] = 0.0
+    def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
+        super().place(position, yaw, flying=flying)
+        self._change = ZERO  # of velocity in a step, with the lag of tilting [m/s]
+
+    def push(self, velocity: Vector) -> None:
+        """Set the velocity [m/s]."""
         self.velocity = velocity
-        self.position += self._dt * velocity
-        self.yaw = self.yaw + self._dt * turn  # in place, numpy adds one number as a sum: 7 µs more
-        if not aloft or some(self._landing):
-            self._touch_down()
 
-    def _falling(self) -> Array:
-        fall = self.velocity - [0.0, 0.0, GRAVITY * self._dt]
-        return np.where((self.position[:, 2] > 0.0)[:, None], fall, 0.0)
+    def move(self, dt: float) -> None:
+        """One step of `dt` [s]: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting."""
+        if dt != self._dt:
+            self._set_step(dt)
+        if self._climbing:
+            self._advance_climb(dt)
+        x, y, z = self.held
+        if not self.flying:
+            self._fall(dt, x, y, z)
+            return
+        kx, ky, kz = self._gain
+        limit_x, limit_y, limit_z = self._speed
+        gain_x, gain_y, gain_z = self._step_gain
+        tilt_x, tilt_y, tilt_z = self._tilt
+        vx, vy, vz = self.velocity
+        ax, ay, az = self._change
+        if self._by_velocity and not self._climbing:
+            wx, wy, wz = self._velocity_setpoint
+        else:
+            wx, wy, wz = self._target
+            wx, wy, wz = kx * (wx - x), ky * (wy - y), kz * (wz - z)
+        turn = self._yaw_rate if self._by_velocity else self._turn * wrap(self._yaw_setpoint - self.yaw)
+        wx = limit_x if wx > limit_x else -limit_x if wx < -limit_x else wx
+        wy = limit_y if wy > limit_y else -limit_y if wy < -limit_y else wy
+        wz = limit_z if wz > limit_z else -limit_z if wz < -limit_z else wz
+        # written as a sum, an axis that tilts at once keeps the bits of its change
+        ax = (1.0 - tilt_x) * ax + tilt_x * (gain_x * (wx - vx))
+        ay = (1.0 - tilt_y) * ay + tilt_y * (gain_y * (wy - vy))
+        az = (1.0 - tilt_z) * az + tilt_z * (gain_z * (wz - vz))
+        self._change = (ax, ay, az)
+        vx, vy, vz = vx + ax, vy + ay, vz + az
+        x, y, z = x + dt * vx, y + dt * vy, z + dt * vz
+        self.yaw += dt * clamp(turn, -self._turn_rate, self._turn_rate)
+        if self._landing and self._touches_down(z):
+            self._rest(x, y)
+            return
+        self.velocity = (vx, vy, vz)
+        self.held = (x, y, z)
+        wobble_x, wobble_y = self.wobble
+        self.position = (x + wobble_x, y + wobble_y, z)
 
-    def _touch_down(self) -> None:
-        super()._touch_down()
-        grounded = ~self.flying & (self.position[:, 2] <= TOUCHDOWN)
-        self.position[grounded, 2] = 0.0
-        self.velocity[grounded] = 0.0
+    def _set_step(self, dt: float) -> None:
+        gain, tilt = self._response.velocity, self._response.tilt
+        self._dt, self._step_gain = dt, (dt * gain[0], dt * gain[1], dt * gain[2])
+        self._tilt = (min(dt * tilt[0], 1.0), min(dt * tilt[1], 1.0), min(dt * tilt[2], 1.0))
+
+    def _fall(self, dt: float, x: float, y: float, z: float) -> None:
+        """Motors off: fall from x, y, z [m], or stand."""
+        self._change = ZERO
+        if z > 0.0:
+            vx, vy, vz = self.velocity
+            vz -= GRAVITY * dt
+            x, y, z = x + dt * vx, y + dt * vy, z + dt * vz
+            self.velocity = (vx, vy, vz)
+        else:
+            self.velocity = ZERO
+        if z <= TOUCHDOWN:
+            self._rest(x, y)
+            return
+        self.held = (x, y, z)
+        self.position = (x + self.wobble[0], y + self.wobble[1], z)
+
+    def _rest(self, x: float, y: float) -> None:
+        """Stand on the floor at x, y [m]."""
+        self.velocity = ZERO
+        self.held = (x, y, 0.0)
+        self.position = (x + self.wobble[0], y + self.wobble[1], 0.0)

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 from statistics import NormalDist
 from typing import Final
 
 import numpy as np
 
 from agents.arrays import Array, Index
-from agents.body.interface import BodyError, BodyRequest, Rays
+from agents.body.interface import BodyError, BodyRequest, RangeScan
 from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
 from twins.engines.engine import Engine
-from twins.models.noise import Noise
+from twins.models.noise import stream
 from twins.scene import World
 from twins.sensing.ray_casting import Beams, Caster, Fan
 
@@ -111,57 +111,74 @@ OF_KIND: Final[dict[str, tuple[str, ...]]] = {
 
 
 class RangeSensors:
-    """Range sensors of all rows of a world. Rays of a row are contiguous, in the order of its sensors."""
+    """Range sensors of all robots of a world. Rays of a robot are in the order of its sensors."""
+
+    scans: list[RangeScan | None]  # newest readings of each robot; None before the first, and without sensors
 
     def __init__(self, request: BodyRequest, world: World) -> None:
         """Raises BodyError for an unknown sensor."""
-        self.rays: Rays | None = None  # last readings, each ray at the time of its own sensor; None before the first
         carried = [tuple(dict.fromkeys(own)) for own in world.sensors]
         for robot, own in zip(request.names, carried, strict=True):
             for name in own:
                 if name not in SENSORS:
                     raise BodyError(f"{robot}: there is no sensor {name}; there are {', '.join(SENSORS)}")
-        self._caster = Caster(world.scene, request.kinds, world.copy)
+        self._caster = Caster(world.scene, request.kinds, np.array(world.copy, dtype=np.intp))
         fans = [(row, name) for row, own in enumerate(carried) for name in own]
-        count = np.array([len(SENSORS[name].bearing) for _, name in fans], dtype=np.intp)
-        first = np.cumsum(count) - count
         self._mounted = []
         for name in dict.fromkeys(name for _, name in fans):
-            mine = [k for k, (_, other) in enumerate(fans) if other == name]
-            rows = np.array([fans[k][0] for k in mine])
-            self._mounted.append(_Mounted(name, rows, first[mine], request, world.sensor_noise))
-        self._row = np.repeat(np.array([row for row, _ in fans], dtype=np.intp), count)
-        self._bearing, self._elevation = np.zeros((2, len(self._row)))
-        for each in self._mounted:
-            self._bearing[each.rays], self._elevation[each.rays] = each.sensor.bearing, each.sensor.elevation
-        self._time = self._distance = np.full(len(self._row), np.nan)
+            rows = np.array([row for row, other in fans if other == name])
+            self._mounted.append(_Mounted(name, rows, request, world.sensor_noise))
+        self._carried = carried
+        self._rays = [_directions(own) for own in carried]
+        # distance to what each sensor of a robot has seen last
+        self._seen: list[dict[str, list[float]]] = [
+            {name: [nan] * len(SENSORS[name].bearing) for name in own} for own in carried
+        ]
+        self.scans = [None] * len(carried)
         self._due = [-inf] * len(self._mounted)
         self._next = -inf if self._mounted else inf
         self._beams: dict[tuple[int, ...], Beams] = {}
 
-    def sweep(self, t: float, engine: Engine) -> None:
-        """Measure with the sensors that are due at `t` [s], at first with all; missed measurements are not repeated."""
+    def sweep(self, t: float, engine: Engine) -> bool:
+        """Measure with the sensors that are due at `t` [s], at first with all; returns whether there are any.
+
+        Missed measurements are not repeated.
+        """
         if t < self._next:
-            return
+            return False
         due = tuple(k for k, when in enumerate(self._due) if when <= t)
         beams = self._beams.get(due)
         if beams is None:
             beams = self._beams[due] = _arrange_beams([self._mounted[k] for k in due])
-        truth = self._caster.cast(beams, engine.position, engine.yaw, engine.obstacles)
-        time, distance = self._time.copy(), self._distance.copy()
+        position = np.array([motion.position for motion in engine.motions])
+        yaw = np.array([motion.yaw for motion in engine.motions])
+        obstacles = np.array(engine.obstacles, dtype=float).reshape(len(engine.obstacles), -1, 3)
+        truth = self._caster.cast(beams, position, yaw, obstacles)
         begin = 0
+        changed: set[int] = set()
         for k in due:
             one = self._mounted[k]
-            end = begin + one.rays.size
-            distance[one.rays] = one.read(truth[begin:end].reshape(one.rays.shape))
-            time[one.rays] = t
+            rows, width = one.rows.tolist(), len(one.sensor.bearing)
+            end = begin + len(rows) * width
+            for row, distance in zip(rows, one.read(truth[begin:end].reshape(-1, width)).tolist(), strict=True):
+                self._seen[row][one.name] = distance
+            changed.update(rows)
             begin = end
             period = 1.0 / one.sensor.rate_hz
             following = self._due[k] + period
             self._due[k] = following if following > t - period else t - ON_TIME + period
-        self._time, self._distance = time, distance
-        self.rays = Rays(self._row, time, self._bearing, self._elevation, distance)
+        for row in changed:
+            bearing, elevation = self._rays[row]
+            distances = [each for name in self._carried[row] for each in self._seen[row][name]]
+            self.scans[row] = RangeScan(t, bearing, elevation, distances)
         self._next = min(self._due)
+        return True
+
+
+def _directions(sensors: Sequence[str]) -> tuple[list[float], list[float]]:
+    """Bearings and elevations of the rays of some sensors [rad]."""
+    bearing = [each for name in sensors for each in SENSORS[name].bearing.tolist()]
+    return bearing, [each for name in sensors for each in SENSORS[name].elevation.tolist()]
 
 
 def _arrange_beams(mounted: Sequence[_Mounted]) -> Beams:
@@ -172,20 +189,19 @@ def _arrange_beams(mounted: Sequence[_Mounted]) -> Beams:
 
 
 class _Mounted:
-    """One kind of sensor on the rows that have it."""
+    """One kind of sensor on the robots that have it."""
 
-    def __init__(self, name: str, rows: Index, first: Index, request: BodyRequest, scale: float) -> None:
+    def __init__(self, name: str, rows: Index, request: BodyRequest, scale: float) -> None:
         sensor = self.sensor = SENSORS[name]
-        width = len(sensor.bearing)
+        self.name = name
         self.rows = rows  # (k,)
-        self.rays = first[:, None] + np.arange(width)  # (k, m) numbers of their rays among all
         self._scale = scale
         share = min(sensor.dropout * scale, 1.0)
         self._lost = NormalDist().inv_cdf(share) if 0.0 < share < 1.0 else inf
-        names, seeds = [request.names[row] for row in rows], [request.seeds[row] for row in rows]
-        ahead = max(DRAWN_AHEAD // width, 1)
-        self._noise = Noise(names, seeds, f"{name} noise", width, ahead) if scale > 0.0 else None
-        self._dropouts = Noise(names, seeds, f"{name} dropouts", width, ahead) if share > 0.0 else None
+        robots = [(request.names[row], request.seeds[row]) for row in rows.tolist()]
+        width = len(sensor.bearing)
+        self._noise = _Streams(robots, f"{name} noise", width) if scale > 0.0 else None
+        self._dropouts = _Streams(robots, f"{name} dropouts", width) if share > 0.0 else None
 
     def read(self, truth: Array) -> Array:
         """Readings for true distances from the robots' centres (k, m) [m]; NaN where nothing is reported."""
@@ -200,3 +216,22 @@ class _Mounted:
                 reading[self._dropouts.draw() < self._lost] = np.nan
         outside = (reading < sensor.nearest) | (reading > sensor.farthest)
         return np.where(outside, np.nan, sensor.mount + reading)
+
+
+class _Streams:
+    """White Gaussian noise of unit variance for the rays of a sensor on k robots; each has its own stream."""
+
+    def __init__(self, robots: Sequence[tuple[str, int]], purpose: str, width: int) -> None:
+        """`robots`: names and seeds."""
+        self._generators = [stream(name, seed, purpose) for name, seed in robots]
+        self._shape = max(DRAWN_AHEAD // width, 1), width
+        self._ahead: Array = np.zeros((0, len(robots), width))
+        self._next = 0
+
+    def draw(self) -> Array:
+        """The next (k, width)."""
+        if self._next == len(self._ahead):
+            drawn = [generator.standard_normal(self._shape) for generator in self._generators]
+            self._ahead, self._next = np.stack(drawn, axis=1), 0
+        self._next += 1
+        return np.asarray(self._ahead[self._next - 1])
