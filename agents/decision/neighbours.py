@@ -79,7 +79,7 @@ class Neighbour:
         return difference(position, predictor.position(self, t - self.stamp))
 
     def place(self, predictor: Predictor, t: float) -> Vector:
-        """Believed position at `t` [s], NaN before the first pose. A lost sender has stopped where it was at its loss."""
+        """Believed position at `t` [s], NaN before the first pose; a lost sender stopped where it was at its loss."""
         if self.stamp == -inf:
             return predictor.position(self, 0.0)
         if self.lost_since < inf:

@@ -1,90 +1,76 @@
-"""Transmission: which rows transmit their pose now, smoothed if the trigger asks for it."""
+"""Transmission: whether a robot transmits its pose now, smoothed if the trigger asks for it. All of it is quiet."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from math import expm1, inf, isfinite, nan
+from typing import Final
 
-import msgspec
-import numpy as np
-
-from agents.arrays import Array, Index, clamp, every
 from agents.body.kinds import Kind
 from agents.network.validation import MAX_SPEED
-from agents.plugins.calls import failure
-from agents.plugins.predictors import HOLD, Predictor
-from agents.plugins.registry import FAILURES
-from agents.plugins.triggers import LastEvent, Trigger, View
+from agents.plugins.predictors import Predictor
+from agents.plugins.triggers import Trigger, TriggerState
+from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector, clamp, distance, is_finite
 
-
-class Transmission(msgspec.Struct, frozen=True):
-    """Poses to transmit."""
-
-    rows: Index  # (K,) that transmit
-    position: Array  # (N, 3) to transmit [m]
-    velocity: Array  # (N, 3) to transmit [m/s]
+STILL: Final[Vector] = ZERO
 
 
 class Transmitter:
-    """Transmissions of N rows."""
+    """Transmissions of one robot."""
 
-    def __init__(
-        self, trigger: Trigger, rows: int, predictor: Predictor = HOLD, *, kinds: Sequence[Kind] | None = None
-    ) -> None:
-        """Without `kinds` rows are smoothed as robots on wheels are."""
-        self.trigger = trigger  # may be replaced by one of the same kind
-        self.last_event = LastEvent(rows)  # last transmission of each row
-        self._kinds = kinds
-        self._predictor, self._state = predictor, trigger.state(rows)
-        self._smoothed: LowPass | None = None
+    __slots__ = ("_predictor", "_smooths", "asking", "position", "smoothed", "velocity")
 
-    def transmit(
+    asking: TriggerState
+    position: Vector  # of the last question: what would be transmitted [m],
+    velocity: Vector  # and its velocity [m/s], NaN where unknown
+    smoothed: LowPass
+
+    def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind) -> None:
+        self.asking, self._predictor, self.smoothed = TriggerState(trigger), predictor, LowPass(kind)
+        self._smooths = trigger.smoothing_s > 0.0
+        self.position = self.velocity = UNKNOWN
+        self.asking.view.reach_s = predictor.reach()
+
+    def replace_trigger(self, trigger: Trigger) -> None:
+        """Use another trigger of the same kind from now on; what was remembered stays."""
+        self.asking.trigger, self._smooths = trigger, trigger.smoothing_s > 0.0
+
+    def transmits(
         self,
         t: float,
-        position: Array,
-        velocity: Array,
+        position: Vector,
+        velocity: Vector,
         *,
-        error: Array,
-        energy: Array,
-        start: Array,
-        offset: Array,
-        setpoint: Array | None = None,
-    ) -> Transmission:
-        """Transmission at `t` [s]; rows without a known position do not transmit. For the arguments see `View`.
+        error: float,
+        energy: float,
+        since_start: float,
+        offset: Vector,
+        setpoint: Setpoint,
+    ) -> bool:
+        """Whether the robot transmits its pose at `t` [s]; without a known position it does not.
 
-        `setpoint` (N, 4) is the last command to the bodies, NaN for rows that their bodies drive by themselves. An
-        unknown velocity is transmitted as NaN, and counts as 0 for trigger and smoothing, as the neighbours assume.
-        Raises PluginError, which names the trigger, if it fails.
+        For the arguments see `View`. `setpoint` is the last command to the body, NaN where the body drives by itself.
+        An unknown velocity is transmitted as NaN, and counts as 0 for trigger and smoothing, as the neighbours assume.
         """
-        trigger = self.trigger
-        unknown: Index | None = None
-        if not every(known := np.abs(velocity) <= MAX_SPEED):  # implausible, hence unknown
-            unknown = np.flatnonzero(~known.all(axis=1))
-            velocity = velocity.copy()
-            velocity[unknown] = 0.0
-        if trigger.smoothing_s > 0.0:
-            if self._smoothed is None:
-                self._smoothed = LowPass(len(position), self._kinds)
-            position, velocity = self._smoothed.smooth(t, position, velocity, trigger.smoothing_s, setpoint)
-        view = View(t, position, velocity, self.last_event, error, energy, start, offset, self._predictor)
-        rows = due_rows(trigger, view, self._state)
-        if len(rows):
-            valid = np.isfinite(position if len(rows) == len(position) else position[rows])
-            if not every(valid):
-                rows = rows[valid.all(axis=1)]
-            self.last_event.record(rows, view)
-        if unknown is not None:
-            velocity = velocity.copy()  # the recorded event keeps its values
-            velocity[unknown] = np.nan
-        return Transmission(rows, position, velocity)
-
-
-def due_rows(trigger: Trigger, view: View, state: Array) -> Index:
-    """`Trigger.due`, with an error that names the trigger."""
-    try:
-        return trigger.due(view, state)
-    except FAILURES as error:
-        raise failure("trigger", trigger, error) from error
+        known = abs(velocity[0]) <= MAX_SPEED and abs(velocity[1]) <= MAX_SPEED and abs(velocity[2]) <= MAX_SPEED
+        if not known:  # implausible, hence unknown
+            velocity = STILL
+        asking = self.asking
+        if self._smooths:
+            smoothed = self.smoothed
+            smoothed.smooth(t, position, velocity, asking.trigger.smoothing_s, setpoint)
+            position, velocity = smoothed.position, smoothed.velocity
+        view, last = asking.view, asking.last
+        view.t, view.position, view.velocity, view.error, view.energy = t, position, velocity, error, energy
+        view.since_start, view.offset, view.since_event = since_start, offset, t - last.time
+        if last.time > -inf:
+            believed = self._predictor.position(last, view.since_event)
+            view.deviation = distance(position, believed)
+            view.drift = distance(last.velocity, self._predictor.velocity(last, 0.0))
+        due = asking.due() and is_finite(position)
+        if due:
+            asking.record()
+        self.position, self.velocity = position, velocity if known else UNKNOWN
+        return due
 
 
 class LowPass:
@@ -101,43 +87,57 @@ class LowPass:
     p_f is off by τ·Δv.
     """
 
-    def __init__(self, rows: int, kinds: Sequence[Kind] | None = None) -> None:
-        self._t = -math.inf
-        self._position, self._velocity = np.full((rows, 3), np.nan), np.full((rows, 3), np.nan)
-        kinds = [] if kinds is None else kinds
-        flies = np.flatnonzero([kind.flies for kind in kinds])
-        self._flies, aloft = flies, [kind for kind in kinds if kind.flies]
-        self._by_place = np.array([kind.takes == "position" for kind in aloft], dtype=bool)[:, None]
-        self._response, self._speed, self._lag = (
-            np.array([getattr(kind, name) for kind in aloft])[:, None] for name in ("response", "speed", "lag")
-        )
-        self._driven = np.full((len(flies), 2), np.nan)
+    __slots__ = (
+        "_by_place", "_driven_x", "_driven_y", "_flies", "_lag", "_response", "_speed", "_t", "position", "velocity",
+    )  # fmt: skip
 
-    def smooth(
-        self, t: float, position: Array, velocity: Array, constant_s: float, setpoint: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Smoothed position [m] and velocity [m/s] (N, 3) at `t` [s], from the measured ones and the last setpoint.
+    position: Vector  # smoothed [m], NaN at the beginning
+    velocity: Vector  # likewise [m/s]
 
-        Rows begin at their measured pose, and begin anew after it was unknown.
+    def __init__(self, kind: Kind) -> None:
+        self._flies, self._by_place = kind.flies, kind.takes == "position"
+        self._response, self._speed, self._lag = kind.response, kind.speed, kind.lag
+        self._t = -inf
+        self._driven_x = self._driven_y = nan
+        self.position = self.velocity = UNKNOWN
+
+    def smooth(self, t: float, position: Vector, velocity: Vector, constant_s: float, setpoint: Setpoint) -> None:
+        """Smooth a measured `position` [m] and `velocity` [m/s] at `t` [s], with the last setpoint.
+
+        A robot begins at its measured pose, and begins anew after it was unknown.
         """
-        step = t - self._t if math.isfinite(self._t) else 0.0
-        if setpoint is not None and len(self._flies):
-            velocity = velocity.copy()
-            velocity[self._flies, :2] = self._drive(step, velocity[self._flies, :2], setpoint[self._flies, :2])
-        share = -math.expm1(-step / constant_s)
-        carried = self._position + step * velocity
-        smoothed = carried + share * (position - carried)
-        slow = self._velocity + share * (velocity - self._velocity)
-        anew = np.isnan(smoothed) | np.isnan(slow)
-        if anew.any():
-            smoothed, slow = np.where(anew, position, smoothed), np.where(anew, velocity, slow)
-        self._t, self._position, self._velocity = t, smoothed, slow
-        return smoothed, slow
+        step = t - self._t if isfinite(self._t) else 0.0
+        self._t = t
+        if self._flies:
+            velocity = self._driven(step, velocity, setpoint)
+        share = -expm1(-step / constant_s)
+        self.position = (
+            _drawn(self.position[0] + step * velocity[0], position[0], share),
+            _drawn(self.position[1] + step * velocity[1], position[1], share),
+            _drawn(self.position[2] + step * velocity[2], position[2], share),
+        )
+        self.velocity = (
+            _drawn(self.velocity[0], velocity[0], share),
+            _drawn(self.velocity[1], velocity[1], share),
+            _drawn(self.velocity[2], velocity[2], share),
+        )
+        if not (is_finite(self.position) and is_finite(self.velocity)):
+            self.position, self.velocity = position, velocity
 
-    def _drive(self, step: float, measured: Array, setpoint: Array) -> Array:
-        """Horizontal velocity (F, 2) of the flying rows from their setpoints; without setpoints the measured one."""
-        toward = self._response * (setpoint - self._position[self._flies, :2])
-        due_rows = clamp(np.where(self._by_place, toward, setpoint), -self._speed, self._speed)
-        driven = self._driven + step / (self._lag + step) * (due_rows - self._driven)
-        self._driven = np.where(np.isnan(driven), measured, driven)
-        return self._driven
+    def _driven(self, step: float, measured: Vector, setpoint: Setpoint) -> Vector:
+        """Velocity of a flying robot: horizontally from its setpoints, without setpoints the measured one."""
+        x, y = setpoint[0], setpoint[1]
+        if self._by_place:
+            x, y = self._response * (x - self.position[0]), self._response * (y - self.position[1])
+        share = step / (self._lag + step)
+        self._driven_x += share * (clamp(x, -self._speed, self._speed) - self._driven_x)
+        self._driven_y += share * (clamp(y, -self._speed, self._speed) - self._driven_y)
+        if not isfinite(self._driven_x):
+            self._driven_x = measured[0]
+        if not isfinite(self._driven_y):
+            self._driven_y = measured[1]
+        return self._driven_x, self._driven_y, measured[2]
+
+
+def _drawn(carried: float, measured: float, share: float) -> float:
+    return carried + share * (measured - carried)

@@ -2,48 +2,40 @@
 
 from __future__ import annotations
 
-import numpy as np
-from msgspec.structs import replace
+import msgspec
 
-from agents.arrays import Array, Columns, Index, norm
+from agents.vectors import Vector, difference, dot, norm
 
 
-class Anchors(Columns, frozen=True):
-    """Distances (A) to a fixed point, to a line along `axis` through it, or to a plane across `axis` through it."""
+class Anchor(msgspec.Struct, frozen=True):
+    """Distance of a robot to a fixed point, a line along `axis` through it, or a plane across `axis` through it."""
 
-    row: Index  # (A,) robot
-    point: Array  # (A, 3) [m]
-    axis: Array  # (A, 3) unit vectors; unused for points
-    whole: Array  # (A,) share of p − point that counts: 1 for points and lines, 0 for planes
-    along: Array  # (A,) share of its part along `axis` that is added: 0 for points, −1 for lines, 1 for planes
-    distance: Array  # (A,) wanted [m]; 0: on it
-    gain: Array  # (A,) [1/(m² decision)], or [1/decision] where the distance is 0
+    point: Vector  # [m]
+    axis: Vector  # unit vector; unused for points
+    whole: float  # share of p − point that counts: 1 for points and lines, 0 for planes
+    along: float  # share of its part along `axis` that is added: 0 for points, −1 for lines, 1 for planes
+    distance: float  # wanted [m]; 0: on it
+    gain: float  # [1/(m² decision)], or [1/decision] where the distance is 0
 
-    def repeated(self, times: int, rows: int) -> Anchors:
-        """Anchors of `times` copies of an experiment of `rows` robots, one copy behind the other."""
-        shift = np.repeat(np.arange(times) * rows, len(self))
-        many = self.take(np.tile(np.arange(len(self)), times))
-        return replace(many, row=many.row + shift)
-
-    def offset(self, position: Array) -> Array:
-        """u (N, 3) [m] of all rows: ½ g (d² − ‖x‖²) x, with x from the nearest point to p; −g x where d = 0.
+    def pull(self, position: Vector) -> Vector:
+        """½ g (d² − ‖x‖²) x [m], with x from the nearest point to p; −g x where d = 0.
 
         For points this is the pull to the origin of the authors' controllers; −g x because the cube of a small x never
         gets there.
         """
-        away = self.displacement(position)
-        square = np.vecdot(away, away)
-        share = np.where(self.distance > 0.0, 0.5 * (self.distance**2 - square), -1.0)
-        total = np.zeros_like(position)
-        np.add.at(total, self.row, (self.gain * share)[:, None] * away)
-        return total
+        x, y, z = self.displacement(position)
+        share = -1.0
+        if self.distance > 0.0:
+            share = 0.5 * (self.distance * self.distance - (x * x + y * y + z * z))
+        pull = self.gain * share
+        return pull * x, pull * y, pull * z
 
-    def error(self, position: Array) -> Array:
-        """|d − ‖x‖| (A,) [m]."""
-        return np.abs(self.distance - norm(self.displacement(position)))
+    def error(self, position: Vector) -> float:
+        """|d − ‖x‖| [m]."""
+        return abs(self.distance - norm(self.displacement(position)))
 
-    def displacement(self, position: Array) -> Array:
-        """x (A, 3) from the nearest point of each point, line or plane to its robot [m]."""
-        apart = position[self.row] - self.point
-        part = np.vecdot(apart, self.axis) * self.along
-        return np.asarray(self.whole[:, None] * apart + part[:, None] * self.axis)
+    def displacement(self, position: Vector) -> Vector:
+        """x from the nearest point of the point, line or plane to the robot [m]."""
+        (x, y, z), (ax, ay, az), whole = difference(position, self.point), self.axis, self.whole
+        part = dot((x, y, z), self.axis) * self.along
+        return whole * x + part * ax, whole * y + part * ay, whole * z + part * az

@@ -6,27 +6,27 @@ It starts at the robot's place (its anchor and heading when the leg begins), so 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Protocol
+from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
+from typing import Annotated, Final, Protocol
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, Positive
+from agents.vectors import Positive, Setpoint, Vector, distance, is_finite
 
 Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
+Pose = Setpoint  # x, y, z [m] and yaw [rad], NaN where any yaw will do
+NO_TARGET: Final[Pose] = (nan, nan, nan, nan)
 
 
 class Planner(Protocol):
     """Target as a function of time."""
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        """Target position (R, 3) [m] and yaw (R,) [rad], NaN where any yaw will do.
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        """Target x, y, z [m] and yaw [rad], NaN where any yaw will do.
 
-        The rows began this leg `elapsed` (R,) [s] ago, at `anchor` (R, 3) [m] with the yaw `heading` (R,) [rad].
+        The leg began `elapsed` [s] ago, at `anchor` [m] with the yaw `heading` [rad].
         """
         ...
 
@@ -39,13 +39,9 @@ class Parameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """Parameters of a planner, as they stand in the experiment file."""
 
 
-def _any_yaw(rows: int) -> Array:
-    return np.full(rows, np.nan)
-
-
-def _spatial(values: Sequence[float]) -> Array:
-    """(3,) from a planar or spatial offset."""
-    return np.array([*values, 0.0][:3])
+def spatial(place: Sequence[float], height: float) -> Vector:
+    """Vector from a place or offset of two or three numbers; `height` is what is left out."""
+    return place[0], place[1], place[2] if len(place) > 2 else height
 
 
 class Hold(Parameters, frozen=True):
@@ -54,11 +50,9 @@ class Hold(Parameters, frozen=True):
     at: Annotated[Offset | None, Meta(description="x, y (, z) [m]")] = None
     yaw: Annotated[float | None, Meta(description="[rad]")] = None
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        position = anchor.copy()
-        if self.at is not None:
-            position[:, : len(self.at)] = self.at
-        return position, np.full(len(elapsed), np.nan if self.yaw is None else self.yaw)
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        x, y, z = anchor if self.at is None else spatial(self.at, anchor[2])
+        return x, y, z, nan if self.yaw is None else self.yaw
 
     def speed(self) -> float:
         return 0.0
@@ -71,14 +65,12 @@ class Line(Parameters, frozen=True):
     speed_: Annotated[Positive, Meta(description="[m/s]")] = msgspec.field(name="speed")
     yaw: Annotated[float | None, Meta(description="at the end [rad]")] = None
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        way = _spatial(self.move_by)
-        length = math.sqrt(float(way @ way))
-        share = np.minimum(elapsed * self.speed_ / length, 1.0) if length else np.ones_like(elapsed)
-        yaw = _any_yaw(len(elapsed))
-        if self.yaw is not None:
-            yaw[share >= 1.0] = self.yaw
-        return anchor + share[:, None] * way, yaw
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        (x, y, z), (dx, dy, dz) = anchor, spatial(self.move_by, 0.0)
+        length = sqrt(dx * dx + dy * dy + dz * dz)
+        share = min(elapsed * self.speed_ / length, 1.0) if length else 1.0
+        yaw = nan if self.yaw is None or share < 1.0 else self.yaw
+        return x + share * dx, y + share * dy, z + share * dz, yaw
 
     def speed(self) -> float:
         return self.speed_
@@ -91,37 +83,30 @@ class Waypoints(Parameters, frozen=True):
     speed_: Annotated[Positive, Meta(description="[m/s]")] = msgspec.field(name="speed")
     loop: Annotated[bool, Meta(description="from the last point to the first, and again")] = False
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        points = np.repeat(anchor[:, None, :], len(self.points), axis=1)  # (R, P, 3): heights left out stay
-        for k, point in enumerate(self.points):
-            points[:, k, : len(point)] = point
-        route = np.concatenate([anchor[:, None], points], axis=1)
-        way = elapsed * self.speed_
-        if not self.loop:
-            return _points_along(route, way), _any_yaw(len(elapsed))
-        ring = np.concatenate([points, points[:, :1]], axis=1)
-        approach, lap = _length(route[:, :2]), _length(ring)
-        on_ring = way > approach
-        rest = np.mod(way - approach, np.where(lap > 0, lap, 1.0))
-        return np.where(on_ring[:, None], _points_along(ring, rest), _points_along(route, way)), _any_yaw(len(elapsed))
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        points = [spatial(point, anchor[2]) for point in self.points]  # heights left out stay
+        way, approach = elapsed * self.speed_, distance(anchor, points[0])
+        if self.loop and way > approach:
+            ring = [*points, points[0]]
+            lap = sum(distance(a, b) for a, b in zip(ring[:-1], ring[1:], strict=True))
+            x, y, z = _point_along(ring, (way - approach) % (lap or 1.0))
+        else:
+            x, y, z = _point_along([anchor, *points], way)
+        return x, y, z, nan
 
     def speed(self) -> float:
         return self.speed_
 
 
-def _length(route: Array) -> Array:
-    """Lengths (R,) of the polylines (R, P, 3)."""
-    return np.asarray(np.sqrt(np.sum(np.diff(route, axis=1) ** 2, axis=2)).sum(axis=1))
-
-
-def _points_along(route: Array, way: Array) -> Array:
-    """The points (R, 3) reached after `way` (R,) metres along the polylines `route` (R, P, 3)."""
-    step = np.diff(route, axis=1)
-    length = np.sqrt(np.sum(step**2, axis=2))  # (R, P-1)
-    begun = np.cumsum(length, axis=1) - length
-    share = np.clip((way[:, None] - begun) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-    share = np.where(length > 0, share, 0.0)
-    return np.asarray(route[:, 0] + np.einsum("rp,rpk->rk", share, step))
+def _point_along(route: Sequence[Vector], way: float) -> Vector:
+    """The point reached after `way` metres along the polyline `route`; its last one beyond the end."""
+    for a, b in zip(route[:-1], route[1:], strict=True):
+        length = distance(a, b)
+        if way < length:
+            share = way / length
+            return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
+        way -= length
+    return route[-1]
 
 
 class Circle(Parameters, frozen=True):
@@ -132,21 +117,21 @@ class Circle(Parameters, frozen=True):
     turns: Annotated[Positive | None, Meta(description="how many; for ever if left out")] = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.radius) and self.radius != 0.0):
+        if not (isfinite(self.radius) and self.radius != 0.0):
             raise ValueError("`radius` must be a number other than 0")
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        x, y, z = anchor
         turned = elapsed / self.period_s
         if self.turns is not None:
-            turned = np.minimum(turned, self.turns)
-        angle = heading + math.copysign(2.0 * math.pi, self.radius) * turned
-        position = anchor.copy()
-        position[:, 0] += self.radius * (np.sin(angle) - np.sin(heading))
-        position[:, 1] += self.radius * (np.cos(heading) - np.cos(angle))
-        return position, _any_yaw(len(elapsed))
+            turned = min(turned, self.turns)
+        angle = heading + copysign(tau, self.radius) * turned
+        x += self.radius * (sin(angle) - sin(heading))
+        y += self.radius * (cos(heading) - cos(angle))
+        return x, y, z, nan
 
     def speed(self) -> float:
-        return 2.0 * math.pi * abs(self.radius) / self.period_s
+        return tau * abs(self.radius) / self.period_s
 
 
 class Lemniscate(Parameters, frozen=True):
@@ -155,21 +140,19 @@ class Lemniscate(Parameters, frozen=True):
     size: Annotated[Positive, Meta(description="half its length [m]")]
     period_s: Annotated[Positive, Meta(description="one figure [s]")]
 
-    def target(self, elapsed: Array, anchor: Array, heading: Array) -> tuple[Array, Array]:
-        angle = 2.0 * math.pi * elapsed / self.period_s
-        along, across = self.size * np.sin(angle), self.size * np.sin(angle) * np.cos(angle)
-        turn = heading - math.pi / 4.0  # the curve leaves its centre at 45 degrees
-        position = anchor.copy()
-        position[:, 0] += np.cos(turn) * along - np.sin(turn) * across
-        position[:, 1] += np.sin(turn) * along + np.cos(turn) * across
-        return position, _any_yaw(len(elapsed))
+    def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
+        (x, y, z), angle = anchor, tau * elapsed / self.period_s
+        along, across = self.size * sin(angle), self.size * sin(angle) * cos(angle)
+        turn = heading - pi / 4.0  # the curve leaves its centre at 45 degrees
+        x += cos(turn) * along - sin(turn) * across
+        y += sin(turn) * along + cos(turn) * across
+        return x, y, z, nan
 
     def speed(self) -> float:
-        return 2.0 * math.pi / self.period_s * self.size * math.sqrt(2.0)
+        return tau / self.period_s * self.size * sqrt(2.0)
 
 
-@dataclass(frozen=True)
-class Leg:
+class Leg(msgspec.Struct, frozen=True):
     """Leg of an itinerary: follow `planner` from `at` on [s of the experiment]."""
 
     at: float
@@ -177,53 +160,44 @@ class Leg:
 
 
 class Itinerary:
-    """Legs that some rows follow one after the other, and where each began."""
+    """Legs that a robot follows one after the other, and where each began."""
 
-    def __init__(self, rows: Index, legs: Sequence[Leg], *, holds_before: bool) -> None:
-        """Rows `rows` (R,) follow `legs`, given in order of time; the first may begin later than 0.
+    __slots__ = ("_anchor", "_heading", "_leg", "_next", "legs", "origin")
 
-        With `holds_before` the rows stay at their start until the first leg; else they have no target then.
+    legs: tuple[Leg, ...]
+    origin: Pose | None  # x, y, z [m] and yaw [rad] where its first leg began; None before
+
+    def __init__(self, legs: Sequence[Leg], *, holds_before: bool) -> None:
+        """Follow `legs`, given in order of time; the first may begin later than 0.
+
+        With `holds_before` the robot stays at its start until the first leg; else it has no target then.
         """
-        self.rows = rows
-        first = Leg(0.0, Hold()) if holds_before else None
-        self.legs = tuple(legs) if first is None else (first, *legs)
-        self._leg = np.full(len(rows), -1)
-        self._anchor = np.zeros((len(rows), 3))
-        self._heading = np.zeros(len(rows))
-        self._origin = np.full((len(rows), 4), np.nan)
+        self.legs = (Leg(0.0, Hold()), *legs) if holds_before else tuple(legs)
+        self.origin = None
+        self._leg, self._anchor, self._heading = -1, (0.0, 0.0, 0.0), 0.0
+        self._next = self.legs[0].at if self.legs else inf
 
-    def target(self, t: Array, position: Array, yaw: Array) -> tuple[Array, Array]:
-        """Target position (R, 3) [m] and yaw (R,) [rad] at times `t` (R,) [s]; NaN before the first leg.
+    def target(self, t: float, position: Vector, yaw: float) -> Pose:
+        """Target x, y, z [m] and yaw [rad] at time `t` [s]; NaN before the first leg.
 
-        The first leg begins at `position` (R, 3) [m] and `yaw` (R,) [rad].
+        The first leg begins at `position` [m] and `yaw` [rad].
         """
-        target, toward = np.full((len(self.rows), 3), np.nan), _any_yaw(len(self.rows))
-        for number, leg in enumerate(self.legs):
-            begins = (t >= leg.at - 1e-9) & (self._leg < number)
-            if begins.any() and (begins := begins & np.isfinite(position).all(axis=1)).any():  # or it begins later
-                self._begin(number, begins, position, yaw)
-            mine = self._leg == number
-            if mine.any():
-                elapsed = np.maximum(t[mine] - leg.at, 0.0)
-                target[mine], toward[mine] = leg.planner.target(elapsed, self._anchor[mine], self._heading[mine])
-        return target, toward
+        if t >= self._next - 1e-9 and (self._leg >= 0 or is_finite(position)):  # or it begins later
+            self._begin(t, position, yaw)
+        if self._leg < 0:
+            return NO_TARGET
+        leg = self.legs[self._leg]
+        return leg.planner.target(max(t - leg.at, 0.0), self._anchor, self._heading)
 
-    def origin(self, row: int) -> tuple[float, float, float, float] | None:
-        """x, y, z [m] and yaw [rad] of a row when its first leg began; None before that, and of other rows."""
-        mine = np.flatnonzero((self.rows == row) & (self._leg >= 0))
-        if not len(mine):
-            return None
-        x, y, z, yaw = self._origin[mine[0]].tolist()
-        return x, y, z, yaw
-
-    def _begin(self, number: int, rows: Mask, position: Array, yaw: Array) -> None:
-        """Anchor a leg at the end of the one before, so that tracking errors do not add up, or at the robot."""
-        anchor, heading = position[rows], yaw[rows].copy()
-        if number:
-            before = self.legs[number - 1]
-            elapsed = np.full(len(anchor), self.legs[number].at - before.at)
-            anchor, toward = before.planner.target(elapsed, self._anchor[rows], self._heading[rows])
-            heading = np.where(np.isnan(toward), heading, toward)
-        else:
-            self._origin[rows, :3], self._origin[rows, 3] = anchor, heading
-        self._leg[rows], self._anchor[rows], self._heading[rows] = number, anchor, heading
+    def _begin(self, t: float, position: Vector, yaw: float) -> None:
+        """Anchor legs that are due at the end of the one before, so that tracking errors do not add up."""
+        while self._leg + 1 < len(self.legs) and t >= self.legs[self._leg + 1].at - 1e-9:
+            if self._leg < 0:
+                x, y, z = position
+                self.origin, self._anchor, self._heading = (x, y, z, yaw), position, yaw
+            else:
+                before, after = self.legs[self._leg], self.legs[self._leg + 1]
+                x, y, z, toward = before.planner.target(after.at - before.at, self._anchor, self._heading)
+                self._anchor, self._heading = (x, y, z), yaw if isnan(toward) else toward
+            self._leg += 1
+        self._next = self.legs[self._leg + 1].at if self._leg + 1 < len(self.legs) else inf

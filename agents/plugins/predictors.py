@@ -2,38 +2,46 @@
 
 Receiver and sender extrapolate the last transmitted pose with the same model, so the sender knows its neighbours'
 error without receiving anything. A predictor is a frozen struct of its parameters, found by the entry-point group
-`zenpark.predictors`.
+`zenpark.predictors`. All methods run on quiet ticks.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from math import inf
+from typing import Annotated, Protocol
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Positive
+from agents.vectors import ZERO, Positive, Vector
+
+
+class Sent(Protocol):
+    """A transmitted pose."""
+
+    @property
+    def position(self) -> Vector: ...  # [m]
+    @property
+    def velocity(self) -> Vector: ...  # [m/s]
 
 
 class Predictor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Extrapolation between two messages; a subclass that defines nothing holds the last pose."""
 
-    @property
-    def reach_s(self) -> float:
-        """Time for which the belief moves as `velocity` says at age 0 [s]; infinity where that never changes."""
-        return np.inf
-
-    def position(self, position: Array, velocity: Array, age: Array) -> Array:
-        """Believed positions (K, 3) [m] from `position` (K, 3) and `velocity` (K, 3) of `age` (K,) [s].
+    def position(self, pose: Sent, age: float) -> Vector:
+        """Believed position [m] of the robot whose `pose` is of this `age` [s].
 
         Negative ages, which clocks of two machines can make, count as zero.
         """
-        return position
+        return pose.position
 
-    def velocity(self, velocity: Array, age: Array) -> Array:
-        """Velocity (K, 3) [m/s] of that belief."""
-        return np.zeros_like(velocity)
+    def velocity(self, pose: Sent, age: float) -> Vector:
+        """Velocity [m/s] of that belief."""
+        return ZERO
+
+    def reach(self) -> float:
+        """Time for which the belief moves as `velocity` says at age 0 [s]; infinity where that never changes."""
+        return inf
 
 
 class Hold(Predictor, frozen=True):
@@ -48,19 +56,18 @@ class ConstantVelocity(Predictor, frozen=True):
     last message was lost runs away until its next message.
     """
 
-    horizon_s: Annotated[
-        Positive | None, Meta(description="the last velocity is used for this long [s]; left out: for ever")
-    ] = None
+    horizon_s: Annotated[Positive, Meta(description="the last velocity is used for this long [s]; inf: for ever")] = inf
 
-    @property
-    def reach_s(self) -> float:
-        return np.inf if self.horizon_s is None else self.horizon_s
+    def position(self, pose: Sent, age: float) -> Vector:
+        seconds = min(max(age, 0.0), self.horizon_s)
+        (x, y, z), (vx, vy, vz) = pose.position, pose.velocity
+        return x + vx * seconds, y + vy * seconds, z + vz * seconds
 
-    def position(self, position: Array, velocity: Array, age: Array) -> Array:
-        return position + velocity * np.minimum(np.maximum(age, 0.0), self.reach_s)[:, None]
+    def velocity(self, pose: Sent, age: float) -> Vector:
+        return pose.velocity if age < self.horizon_s else ZERO
 
-    def velocity(self, velocity: Array, age: Array) -> Array:
-        return np.where((age < self.reach_s)[:, None], velocity, 0.0)
+    def reach(self) -> float:
+        return self.horizon_s
 
 
 HOLD = Hold()

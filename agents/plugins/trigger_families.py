@@ -1,35 +1,36 @@
 """Families of triggers from the literature on event-based sampling and control, by their inequalities.
 
-ε is the held value less the true one, e the errors of a row's links, y = Σ|e| and V = Σ ½e² as the row itself knows
+ε is the held value less the true one, e the errors of a robot's links, y = Σ|e| and V = Σ ½e² as the robot itself knows
 them, t_k its last event. Each publication is about a state, an input and a plant of its own; here ε and y take their
 place.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from math import exp, isfinite, isnan, nan, sqrt
 from typing import Annotated, ClassVar
 
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Mask, NotNegative, Positive, norm
 from agents.plugins.triggers import ROUNDING_S, Place, SendOnDelta, Trigger, View
+from agents.vectors import NotNegative, Positive, distance, norm
 
 
 class Relative(Trigger, frozen=True):
-    """‖ε‖ > σ·y: off by more than a share of the error that the row has still to correct.
+    """‖ε‖ > σ·y: off by more than a share of the error that the robot has still to correct.
 
     P. Tabuada, "Event-triggered real-time scheduling of stabilizing control tasks", IEEE Transactions on Automatic
     Control 52(9), 2007, 1680–1685; for agents that look at their neighbours only: D. V. Dimarogonas, E. Frazzoli and
     K. H. Johansson, "Distributed event-triggered control for multi-agent systems", ibid. 57(5), 2012, 1291–1297.
-    A row without errors, such as a leader without links, transmits whenever noise moves it: `mixed` has a floor.
+    A robot without errors, such as a leader without links, transmits whenever noise moves it: `mixed` has a floor.
     """
 
-    judges_errors: ClassVar[bool] = True
+    JUDGES_ERRORS: ClassVar[bool] = True
 
     share: Annotated[Positive, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = 0.03
 
-    def fires(self, view: View, memory: Array) -> Mask:
+    def fires(self, view: View) -> bool:
         return view.deviation > self.share * view.error
 
 
@@ -41,15 +42,15 @@ class Mixed(Trigger, frozen=True):
     threshold is what keeps the time between two events from going to zero.
     """
 
-    judges_errors: ClassVar[bool] = True
+    JUDGES_ERRORS: ClassVar[bool] = True
 
     share: Annotated[NotNegative, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = (
         0.0004
     )
     floor: Annotated[Positive, Meta(description="c: deviation that is allowed without errors [m]")] = 0.007
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        return view.deviation**2 > self.share * view.error**2 + self.floor**2
+    def fires(self, view: View) -> bool:
+        return view.deviation * view.deviation > self.share * view.error * view.error + self.floor * self.floor
 
 
 class Decaying(Trigger, frozen=True):
@@ -64,8 +65,8 @@ class Decaying(Trigger, frozen=True):
     extra: Annotated[NotNegative, Meta(description="c1: deviation that is allowed beside it at the start [m]")] = 0.02
     rate: Annotated[Positive, Meta(description="α: rate at which that addition fades [1/s]")] = 0.3
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        return view.deviation > self.floor + self.extra * np.exp(-self.rate * view.since_start)
+    def fires(self, view: View) -> bool:
+        return view.deviation > self.floor + self.extra * exp(-self.rate * view.since_start)
 
 
 class Dynamic(Trigger, frozen=True):
@@ -76,7 +77,7 @@ class Dynamic(Trigger, frozen=True):
     the later one, and η, which never falls below zero in continuous time, is kept from it.
     """
 
-    judges_errors: ClassVar[bool] = True
+    JUDGES_ERRORS: ClassVar[bool] = True
 
     share: Annotated[NotNegative, Meta(description="σ: share of the error, as a deviation, that is allowed [1]")] = (
         0.0003
@@ -85,20 +86,24 @@ class Dynamic(Trigger, frozen=True):
     decay: Annotated[Positive, Meta(description="λ: rate at which earlier margin is forgotten [1/s]")] = 2.0
     weight: Annotated[NotNegative, Meta(description="θ: weight of the present margin [s]")] = 0.5
 
-    def memory(self, rows: int) -> Array:
-        """η [m² s] and time of its last computation [s]."""
-        return np.tile([0.0, np.nan], (rows, 1))
+    # η [m² s], and time of its last computation [s]
+    MEMORY: ClassVar[Mapping[str, float]] = {"eta": 0.0, "computed_at": nan}
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        gap = view.deviation
-        known = np.isfinite(gap)
-        w = self.share * view.error**2 + self.floor**2 - np.where(known, gap, 0.0) ** 2
-        step = np.where(np.isnan(memory[:, 1]), 0.0, view.t - memory[:, 1])
-        kept = np.exp(-self.decay * step)
-        eta = np.maximum(kept * memory[:, 0] + (1.0 - kept) / self.decay * w, 0.0)
-        memory[:, 0] = np.where(known, eta, memory[:, 0])
-        memory[:, 1] = view.t
-        return np.asarray(known & (eta + self.weight * w <= 0.0))
+    def fires(self, view: View) -> bool:
+        memory, gap = view.memory, view.deviation
+        known = isfinite(gap)
+        w = self.share * view.error * view.error + self.floor * self.floor
+        if known:
+            w -= gap * gap
+        step = view.t - memory.computed_at
+        kept = 1.0 if isnan(step) else exp(-self.decay * step)
+        eta = kept * memory.eta + (1.0 - kept) / self.decay * w
+        eta = max(eta, 0.0)
+        memory.computed_at = view.t
+        if not known:
+            return False
+        memory.eta = eta
+        return eta + self.weight * w <= 0.0
 
 
 class Integral(Trigger, frozen=True):
@@ -111,18 +116,17 @@ class Integral(Trigger, frozen=True):
 
     area: Annotated[Positive, Meta(description="A: integral of the deviation that is allowed [m s]")] = 0.001
 
-    def memory(self, rows: int) -> Array:
-        """Integral [m s], its end and the time of its event [s]."""
-        return np.tile([0.0, 0.0, np.nan], (rows, 1))
+    # integral [m s], its end [s], and the time of the event since which it runs [s]
+    MEMORY: ClassVar[Mapping[str, float]] = {"area": 0.0, "until": 0.0, "event": nan}
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        event, deviation = view.last_event.time, view.deviation
-        anew = memory[:, 2] != event
-        area, until = np.where(anew, 0.0, memory[:, 0]), np.where(anew, event, memory[:, 1])
-        known = np.isfinite(deviation) & np.isfinite(until)
-        area = area + np.where(known, deviation, 0.0) * np.where(known, view.t - until, 0.0)
-        memory[:, 0], memory[:, 1], memory[:, 2] = area, view.t, event
-        return np.asarray(area > self.area)
+    def fires(self, view: View) -> bool:
+        memory, event = view.memory, view.last.time
+        if memory.event != event:
+            memory.area, memory.until, memory.event = 0.0, event, event
+        if isfinite(view.deviation) and isfinite(memory.until):
+            memory.area += view.deviation * (view.t - memory.until)
+        memory.until = view.t
+        return memory.area > self.area
 
 
 class Predictive(SendOnDelta, frozen=True):
@@ -132,8 +136,8 @@ class Predictive(SendOnDelta, frozen=True):
     on any belief: what makes it predictive is the experiment's `prediction`, which is constant velocity unless said.
     """
 
-    places: ClassVar[tuple[Place, ...]] = ("communication",)
-    prediction: ClassVar[str] = "constant-velocity"
+    PLACES: ClassVar[tuple[Place, ...]] = ("communication",)
+    PREDICTION: ClassVar[str] = "constant-velocity"
 
 
 class SelfTriggered(Trigger, frozen=True):
@@ -148,10 +152,10 @@ class SelfTriggered(Trigger, frozen=True):
     acceleration: Annotated[Positive, Meta(description="a: bound on the acceleration of the deviation [m/s²]")] = 0.25
     longest_s: Annotated[Positive, Meta(description="longest planned interval [s]")] = 2.0
 
-    def fires(self, view: View, memory: Array) -> Mask:
+    def fires(self, view: View) -> bool:
         drift, bound = view.drift, self.acceleration
-        wait = 2.0 * self.threshold / (drift + np.sqrt(drift**2 + 2.0 * bound * self.threshold))
-        return view.since_event >= np.minimum(wait, min(self.longest_s, view.reach_s)) - ROUNDING_S
+        wait = 2.0 * self.threshold / (drift + sqrt(drift * drift + 2.0 * bound * self.threshold))
+        return view.since_event >= min(wait, self.longest_s, view.reach_s) - ROUNDING_S
 
 
 class Lyapunov(Trigger, frozen=True):
@@ -163,7 +167,7 @@ class Lyapunov(Trigger, frozen=True):
     formation can travel.
     """
 
-    judges_errors: ClassVar[bool] = True
+    JUDGES_ERRORS: ClassVar[bool] = True
 
     level: Annotated[
         float, Meta(gt=0, lt=1, description="η: share of the potential at the last event that bounds its level [1]")
@@ -171,10 +175,10 @@ class Lyapunov(Trigger, frozen=True):
     floor: Annotated[NotNegative, Meta(description="c: deviation that is allowed without errors [m]")] = 0.006
     largest: Annotated[Positive, Meta(description="δ: deviation that is allowed at any level [m]")] = 0.012
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        now, then, slack = view.energy, view.last_event.energy, 0.5 * self.floor**2
-        left = (now < self.level * then - slack) | (now > then / self.level + slack)
-        return left | (view.deviation > self.largest)
+    def fires(self, view: View) -> bool:
+        now, then, slack = view.energy, view.last.energy, 0.5 * self.floor * self.floor
+        left = now < self.level * then - slack or now > then / self.level + slack
+        return left or view.deviation > self.largest
 
 
 class RelativeControl(Trigger, frozen=True):
@@ -184,13 +188,13 @@ class RelativeControl(Trigger, frozen=True):
     Robotic-Park-Lab).
     """
 
-    places: ClassVar[tuple[Place, ...]] = ("control",)
+    PLACES: ClassVar[tuple[Place, ...]] = ("control",)
 
     floor: Annotated[Positive, Meta(description="c0: change of the law's output that is allowed [m]")] = 0.005
     share: Annotated[
         NotNegative, Meta(description="a: share of the output that is allowed beside it [1], and its largest value [m]")
     ] = 0.1
 
-    def fires(self, view: View, memory: Array) -> Mask:
-        u = view.offset
-        return norm(u - view.last_event.offset) >= self.floor + np.minimum(self.share * norm(u), self.share)
+    def fires(self, view: View) -> bool:
+        change = distance(view.offset, view.last.offset)
+        return change >= self.floor + min(self.share * norm(view.offset), self.share)

@@ -1,177 +1,147 @@
 """Triggers: decide when a robot transmits (communication) or computes its law anew (control).
 
-A trigger is a frozen struct of its parameters, found by the entry-point group `zenpark.triggers`. It has no state:
-its memory stands in rows outside of it, so that one serves a robot, a swarm, or a sweep of swarms. It judges a held
-value: for communication the position that the neighbours believe, for control the input of the last computation of
-the law. This module has the interface and the two basic ones; the others are in `agents.plugins.trigger_families`.
+A trigger is a frozen struct of its parameters, found by the entry-point group `zenpark.triggers`. What it remembers
+stands outside of it, by name, so that one serves all robots. It judges a held value: for communication the position
+that the neighbours believe, for control the input of the last computation of the law. This module has the interface and
+the two basic ones; the others are in `agents.plugins.trigger_families`. `fires` and `TriggerState.due` are quiet.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from math import inf
+from types import SimpleNamespace
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, NotNegative, Positive, norm, some
-from agents.plugins.predictors import HOLD, Predictor
+from agents.vectors import ZERO, NotNegative, Positive, Vector
 
 Place = Literal["communication", "control"]
 
-ROUNDING_S = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this
+ROUNDING_S: Final = 1e-6  # ticks are multiples of a period that binary fractions miss by less than this
+NOWHERE: Final[Vector] = (inf, inf, inf)
 
 
 class LastEvent:
-    """State at the last event of each row (N): its last transmission, or the last computation of its law.
+    """State of a robot at its last event: its last transmission, or the last computation of its law."""
 
-    Rows without an event have an infinite position and a time of minus infinity.
-    """
+    __slots__ = ("energy", "offset", "position", "time", "velocity")
 
-    def __init__(self, rows: int) -> None:
-        self.position: Array = np.full((rows, 3), np.inf)  # (N, 3) transmitted [m]
-        self.velocity: Array = np.zeros((rows, 3))  # (N, 3) transmitted [m/s]
-        self.offset: Array = np.zeros((rows, 3))  # (N, 3) of the law [m]
-        self.time: Array = np.full(rows, -np.inf)  # (N,) of the event [s]
-        self.energy: Array = np.zeros(rows)  # (N,) of the formation error [m²]
+    position: Vector  # transmitted [m]; infinite before the first event
+    velocity: Vector  # transmitted [m/s]
+    offset: Vector  # of the law [m]
+    time: float  # of the event [s]; minus infinity before the first
+    energy: float  # of the formation error [m²]
 
-    def record(self, rows: Index, view: View) -> None:
-        """Record an event of `rows` with the values of `view`."""
-        if len(rows) == len(self.time):  # all, as always in a process of one robot: a copy, without an index
-            self.position[:], self.velocity[:], self.time[:] = view.position, view.velocity, view.t
-            self.offset[:], self.energy[:] = view.offset, view.energy
-            return
-        self.position[rows], self.velocity[rows], self.time[rows] = view.position[rows], view.velocity[rows], view.t
-        self.offset[rows], self.energy[rows] = view.offset[rows], view.energy[rows]
+    def __init__(self) -> None:
+        self.position, self.velocity, self.offset = NOWHERE, ZERO, ZERO
+        self.time, self.energy = -inf, 0.0
 
 
-@dataclass(eq=False)
 class View:
-    """Quantities that a trigger may use, in rows (N); the costly ones are computed on first use."""
+    """Quantities that a trigger may use; overwritten at each question."""
+
+    __slots__ = (
+        "deviation", "drift", "energy", "error", "last", "memory", "offset", "position", "reach_s", "since_event",
+        "since_start", "t", "velocity",
+    )  # fmt: skip
 
     t: float  # now [s]
-    position: Array  # (N, 3) own [m]; for communication the pose to transmit, smoothed if asked for
-    velocity: Array  # (N, 3) own [m/s]
-    last_event: LastEvent  # of each row
-    error: Array  # (N,) Σ|e| of its links, as the row itself knows them [m]
-    energy: Array  # (N,) edge potential Σ ½e² of its links [m²]
-    start: Array  # (N,) start of each row in the experiment [s]
-    offset: Array  # (N, 3) u of the law [m]: of the last decision; for control, as it would be now
-    predictor: Predictor = HOLD  # of the neighbours
+    position: Vector  # own [m]; for communication the pose to transmit, smoothed if asked for
+    velocity: Vector  # own [m/s]
+    deviation: float  # ‖ε‖: distance of the held value from the true one [m]; infinite before the first event
+    since_event: float  # t − t_k: time since the last event [s], infinite before the first
+    since_start: float  # time since the robot's start in the experiment [s], 0 before
+    error: float  # Σ|e| of its links, as the robot itself knows them [m]
+    energy: float  # edge potential Σ ½e² of its links [m²]
+    offset: Vector  # u of the law [m]: of the last decision; for control, as it would be now
+    drift: float  # rate at which ε began to grow after the last event, as known then [m/s]
+    reach_s: float  # time after an event for which `drift` holds at constant speed [s]
+    last: LastEvent
+    memory: Any  # an attribute for each of the trigger's MEMORY, to be read and set
 
-    @property
-    def since_event(self) -> Array:
-        """(N,) t − t_k: time since the last event [s], infinite before the first."""
-        return self.t - self.last_event.time
-
-    @property
-    def since_start(self) -> Array:
-        """(N,) time since the row's start in the experiment [s], 0 before."""
-        return np.maximum(self.t - self.start, 0.0)
-
-    @cached_property
-    def believed(self) -> Array:
-        """(N, 3) position that the neighbours believe [m]; infinite before the first transmission."""
-        if self.predictor is HOLD:
-            return self.last_event.position
-        age = np.where(np.isinf(self.last_event.time), 0.0, self.since_event)
-        return self.predictor.position(self.last_event.position, self.last_event.velocity, age)
-
-    @cached_property
-    def deviation(self) -> Array:
-        """(N,) ‖ε‖: distance of the held value from the true one [m]."""
-        return norm(self.position - self.believed)
-
-    @property
-    def drift(self) -> Array:
-        """(N,) rate at which ε began to grow after the last event, as known then [m/s]."""
-        velocity = self.last_event.velocity
-        return norm(velocity - self.predictor.velocity(velocity, np.zeros(len(velocity))))
-
-    @property
-    def reach_s(self) -> float:
-        """Time after an event for which `drift` holds at constant speed [s]."""
-        return self.predictor.reach_s
+    def __init__(self, memory: Mapping[str, float]) -> None:
+        self.t = self.since_start = self.error = self.energy = self.drift = 0.0
+        self.deviation = self.since_event = self.reach_s = inf
+        self.position = self.velocity = self.offset = ZERO
+        self.last, self.memory = LastEvent(), SimpleNamespace(**memory)
 
 
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all triggers, with the parameters that every one has.
+    """Base of all triggers, with the parameters that every one has."""
 
-    Class attributes of a kind of trigger: `places` where it makes sense, the `prediction` that it needs (the default of
-    an experiment that names none), `judges_errors`: it uses errors of the formation, which are 0 for robots that the
-    central controller guides, and `timed`: it fires by time alone, whatever is measured.
-    """
-
-    places: ClassVar[tuple[Place, ...]] = ("communication", "control")
-    prediction: ClassVar[str] = "hold"
-    judges_errors: ClassVar[bool] = False
-    timed: ClassVar[bool] = False
+    PLACES: ClassVar[tuple[Place, ...]] = ("communication", "control")  # where it makes sense
+    PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
+    JUDGES_ERRORS: ClassVar[bool] = False  # uses errors of the formation, which are 0 for robots that a centre guides
+    TIMED: ClassVar[bool] = False  # fires by time alone, whatever is measured
+    MEMORY: ClassVar[Mapping[str, float]] = {}  # what it remembers from question to question, with its first values
 
     minimum_interval_s: Annotated[NotNegative, Meta(description="shortest time between two events [s]")] = 0.0
-    maximum_silence_s: Annotated[
-        Positive | None, Meta(description="longest time between two events [s]; left out: unlimited")
-    ] = None
+    maximum_silence_s: Annotated[Positive, Meta(description="longest time between two events [s]; inf: unlimited")] = (
+        inf
+    )
     evaluate_every_s: Annotated[
-        Positive | None,
-        Meta(description="period of the condition's evaluation [s]; left out: at every question"),
-    ] = None
+        NotNegative, Meta(description="period of the condition's evaluation [s]; 0: at every question")
+    ] = 0.0
     smoothing_s: Annotated[
         NotNegative, Meta(description="time constant of the low-pass on transmitted and judged poses [s]; 0: none")
     ] = 0.0
 
-    def memory(self, rows: int) -> Array:
-        """Initial memory of each row (N, k)."""
-        return np.zeros((rows, 0))
-
-    def fires(self, view: View, memory: Array) -> Mask:
-        """Rows (N,) whose condition holds; `memory` (N, k) is updated in place."""
+    def fires(self, view: View) -> bool:
+        """Whether the condition holds."""
         raise TypeError(f"{type(self).__name__} must define `fires`")
 
-    def state(self, rows: int) -> Array:
-        """Initial state from one question to the next (N, 1 + k): time of the last evaluation, and memory."""
-        return np.concatenate([np.full((rows, 1), -np.inf), self.memory(rows)], axis=1)
 
-    def due(self, view: View, state: Array) -> Index:
-        """Rows that have an event now; `state` of `Trigger.state` is updated in place.
+class TriggerState:
+    """A trigger at work for one robot: its view, its last event and its last evaluation."""
 
-        Rows without any event yet have one. Others have one where the condition holds, no sooner than the minimum
+    __slots__ = ("evaluated_at", "last", "trigger", "view")
+
+    trigger: Trigger  # may be replaced by one of the same kind
+    view: View  # for the next question
+    last: LastEvent
+    evaluated_at: float  # [s]
+
+    def __init__(self, trigger: Trigger) -> None:
+        self.trigger, self.view, self.evaluated_at = trigger, View(trigger.MEMORY), -inf
+        self.last = self.view.last
+
+    def due(self) -> bool:
+        """Whether the robot has an event now, by its `view`.
+
+        Without any event yet it has one. Else it has one where the condition holds, no sooner than the minimum
         interval, and in any case at the maximum silence. With `evaluate_every_s` this is periodic event-triggered
         control (Heemels, Donkers and Teel, "Periodic event-triggered control for linear systems", IEEE Transactions
-        on Automatic Control 58(4), 2013). Raises ValueError if `fires` does not give one bool per row.
+        on Automatic Control 58(4), 2013).
         """
-        fired = self._evaluated(view, state)
-        if np.shape(fired) != view.last_event.time.shape:
-            raise ValueError(f"`fires` must give one bool per row, {view.last_event.time.shape}, not {np.shape(fired)}")
-        quiet = view.since_event
-        if self.maximum_silence_s is not None:
-            fired = fired | (quiet >= self.maximum_silence_s - ROUNDING_S)
-        if self.minimum_interval_s > 0.0:
-            fired = fired & (quiet >= self.minimum_interval_s - ROUNDING_S)
-        return np.asarray((fired | (quiet == np.inf)).nonzero()[0])
+        trigger, view = self.trigger, self.view
+        fired, quiet = False, view.since_event
+        if not trigger.evaluate_every_s > 0.0 or view.t - self.evaluated_at >= trigger.evaluate_every_s - ROUNDING_S:
+            self.evaluated_at = view.t
+            fired = trigger.fires(view)
+        if quiet >= trigger.maximum_silence_s - ROUNDING_S:
+            fired = True
+        if quiet < trigger.minimum_interval_s - ROUNDING_S:
+            fired = False
+        return fired or quiet == inf
 
-    def _evaluated(self, view: View, state: Array) -> Mask:
-        if self.evaluate_every_s is None:
-            return self.fires(view, state[:, 1:])
-        ripe = view.t - state[:, 0] >= self.evaluate_every_s - ROUNDING_S
-        if not some(ripe):
-            return ripe
-        before = state.copy()
-        fired = self.fires(view, state[:, 1:])
-        state[:, 0] = view.t
-        state[~ripe] = before[~ripe]  # rows that were not evaluated keep their memory
-        return fired & ripe
+    def record(self) -> None:
+        """Record an event with the values of the view."""
+        view, last = self.view, self.last
+        last.position, last.velocity, last.time = view.position, view.velocity, view.t
+        last.offset, last.energy = view.offset, view.energy
 
 
 class Periodic(Trigger, frozen=True):
     """t − t_k ≥ T."""
 
-    timed: ClassVar[bool] = True
+    TIMED: ClassVar[bool] = True
 
     period_s: Annotated[Positive, Meta(description="T: time between two transmissions [s]")] = 0.02
 
-    def fires(self, view: View, memory: Array) -> Mask:
+    def fires(self, view: View) -> bool:
         return view.since_event >= self.period_s - ROUNDING_S
 
 
@@ -184,5 +154,5 @@ class SendOnDelta(Trigger, frozen=True):
 
     threshold: Annotated[Positive, Meta(description="δ: deviation of the held position that is allowed [m]")] = 0.01
 
-    def fires(self, view: View, memory: Array) -> Mask:
+    def fires(self, view: View) -> bool:
         return view.deviation > self.threshold
