@@ -6,157 +6,202 @@ its last received pose, extrapolated by the prediction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from math import inf, isfinite, nan
+from typing import Final, NamedTuple
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask, PoseTable, some
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
-from agents.decision.neighbours import NeighbourPoses
+from agents.plugins.planners import Pose
+from agents.vectors import UNKNOWN, ZERO, Vector, is_finite
 
-ROUNDING_S = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
+ROUNDING_S: Final = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
 
 
-@dataclass(frozen=True)
-class CentreGoals:
-    """Goals to be sent (K)."""
+class CentreGoal(NamedTuple):
+    """Goal to be sent to a robot."""
 
-    rows: Index  # (K,)
-    goal: Array  # (K, 3) [m]
-    yaw: Array  # (K,) wanted at the goal [rad], NaN for any
-    pose_stamp: Array  # (K,) time of the pose from which the goal was computed [s]
+    row: int
+    goal: Vector  # [m]
+    yaw: float  # wanted at the goal [rad], NaN for any
+    pose_stamp: float  # time of the pose from which the goal was computed [s]
+
+
+class Followed:
+    """A robot as the central controller knows it."""
+
+    __slots__ = (
+        "computer", "goal", "goal_yaw", "guided", "keeping", "lost_since", "needed", "pose_stamp", "position",
+        "receivers", "sent_at", "stamp", "updates", "velocity", "yaw",
+    )  # fmt: skip
+
+    guided: bool  # gets goals
+    needed: bool  # its poses are needed
+    computer: GoalComputer  # of its goals
+    receivers: list[tuple[GoalComputer, int]]  # guided robots that receive its poses, and by which link
+    position: Vector  # last received [m]
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad]
+    stamp: float  # [s]; minus infinity before the first pose
+    lost_since: float  # [s]; infinity: alive; minus infinity: never seen
+    goal: Vector  # last goal [m]
+    goal_yaw: float  # wanted there [rad], NaN for any
+    pose_stamp: float  # of the pose on which it rests [s]
+    sent_at: float  # [s]
+    updates: int  # decisions at which its goal was computed anew
+
+    def __init__(self, assignment: Assignment) -> None:
+        self.guided = self.needed = assignment.guided
+        self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)
+        self.receivers = []
+        self.position, self.velocity, self.yaw, self.stamp, self.lost_since = UNKNOWN, ZERO, 0.0, -inf, -inf
+        self.goal, self.goal_yaw, self.pose_stamp, self.sent_at, self.updates = UNKNOWN, nan, -inf, -inf, 0
 
 
 class Centre:
-    """Central controller of the rows `assignment.guided` among all robots (N) of an experiment."""
+    """Central controller of the guided ones among all robots of an experiment."""
 
-    def __init__(self, assignment: Assignment) -> None:
-        """Take the `assignment` of all robots, with links, anchors and plans of the guided ones."""
-        assert assignment.guided is not None
-        rows = len(assignment.names)
-        self.assignment, self.guided = assignment, assignment.guided
-        self.goal_computer = GoalComputer(assignment, self.guided)
-        self.poses = NeighbourPoses(rows)  # last received of each robot (N)
-        self.yaw: Array = np.zeros(rows)  # (N,) last received [rad]
-        self._holding = StationKeeping(self.goal_computer.ground)
-        self.goal, self.goal_yaw = np.full((rows, 3), np.nan), np.full(rows, np.nan)
-        self._pose_stamp, self._sent = np.full(rows, -np.inf), np.full(rows, -np.inf)
+    def __init__(self, assignments: Sequence[Assignment]) -> None:
+        """Take the assignments of all robots, with links, anchors and plans of the guided ones."""
+        self.assignments = tuple(assignments)
+        self.robots = [Followed(each) for each in assignments]
+        for assignment, robot in zip(assignments, self.robots, strict=True):
+            for link, incoming in enumerate(assignment.neighbours):
+                sender = self.robots[incoming.sender]
+                sender.receivers.append((robot.computer, link))
+                sender.needed = True
         self.decisions = 0  # since the first guided robot began
-        # (N,) decisions at which the goal of each row was computed anew
-        self.updates: Index = np.zeros(rows, dtype=np.intp)
-        sends = np.zeros(rows, dtype=bool)
-        sends[assignment.links.sender] = True
-        self.needed: Index = np.flatnonzero(self.guided | sends)  # rows whose poses are needed
 
-    def receive(self, received: PoseTable) -> None:
-        """Store poses, whose `link` is the row of the robot, in order of arrival; outdated ones are dropped."""
-        assert received.yaw is not None
-        poses, new = self.poses, self.poses.receive(received)
-        self.yaw[new.link] = new.yaw
-        links = self._links(new.link)
-        at = self.assignment.links.sender[links]
-        self.goal_computer.neighbours.receive(
-            PoseTable(links, links, poses.stamp[at], poses.arrival[at], poses.position[at], poses.velocity[at])
-        )
+    @property
+    def needed(self) -> list[int]:
+        """Rows of robots whose poses are needed."""
+        return [row for row, robot in enumerate(self.robots) if robot.needed]
 
-    def begin_plan(self, row: int, origin: tuple[float, float, float, float]) -> None:
+    def receive(self, row: int, position: Vector, velocity: Vector, yaw: float, stamp: float, arrival: float) -> None:
+        """Store a pose of a robot; an outdated one is dropped."""
+        robot = self.robots[row]
+        if not stamp > robot.stamp:
+            return
+        robot.position, robot.velocity, robot.yaw, robot.stamp = position, velocity, yaw, stamp
+        for computer, link in robot.receivers:
+            computer.neighbours.receive(link, position, velocity, stamp, arrival)
+
+    def begin_plan(self, row: int, origin: Pose) -> None:
         """Begin the plan of a robot that began at `origin`, x, y, z [m] and yaw [rad], before this controller."""
         x, y, z, yaw = origin
-        self.goal_computer.begin_plans(np.array([row]), np.array([[x, y, z]]), np.array([yaw]))
+        self.robots[row].computer.begin_plan((x, y, z), yaw)
 
-    def mark_lost(self, rows: Index, t: float) -> None:
-        """Liveliness tokens of these robots lost at `t` [s]."""
-        self.poses.mark_lost(rows, t)
-        self.goal_computer.neighbours.mark_lost(self._links(rows), t)
+    def mark_lost(self, row: int, t: float) -> None:
+        """Liveliness token of this robot lost at `t` [s]."""
+        robot = self.robots[row]
+        robot.lost_since = min(robot.lost_since, t)
+        for computer, link in robot.receivers:
+            computer.neighbours.mark_lost(link, t)
 
-    def mark_alive(self, rows: Index) -> None:
-        """Liveliness tokens of these robots seen, whether or not poses follow."""
-        self.poses.mark_alive(rows)
-        self.goal_computer.neighbours.mark_alive(self._links(rows))
+    def mark_alive(self, row: int) -> None:
+        """Liveliness token of this robot seen, whether or not poses follow."""
+        self.robots[row].lost_since = inf
+        for computer, link in self.robots[row].receivers:
+            computer.neighbours.mark_alive(link)
 
-    def discard_poses(self, rows: Index) -> None:
-        """Discard the poses of these robots, which were restarted."""
-        self.poses.discard(rows)
-        self.goal_computer.neighbours.discard_poses(self._links(rows))
+    def discard_pose(self, row: int) -> None:
+        """Discard the pose of this robot, which was restarted."""
+        robot = self.robots[row]
+        robot.velocity, robot.stamp = ZERO, -inf
+        for computer, link in robot.receivers:
+            computer.neighbours.discard_pose(link)
 
-    def missing_robots(self) -> Index:
-        """Needed rows without a pose so far, or lost."""
-        poses, rows = self.poses, self.needed
-        return rows[~np.isfinite(poses.stamp[rows]) | (poses.lost_since[rows] < np.inf)]
+    def missing_robots(self) -> list[int]:
+        """Needed robots without a pose so far, or lost."""
+        return [
+            row
+            for row, robot in enumerate(self.robots)
+            if robot.needed and (not isfinite(robot.stamp) or robot.lost_since < inf)
+        ]
 
-    def decide(self, t: float, phase: Index, start: Array) -> CentreGoals:
-        """Goals at `t` [s], for robots in `phase` (N,), as far as known, that `start` (N,) [s].
+    def decide(self, t: float, phase: Sequence[int], start: Sequence[float]) -> list[CentreGoal]:
+        """Goals at `t` [s], for robots in each `phase`, as far as known, that `start` [s].
 
         A running robot gets a goal whenever a new one was decided, and again before the last one is too old. A waiting
         robot gets its own place as goal: with this goal and poses of all its neighbours it can begin.
         """
-        deciding, poses, limits = self.goal_computer, self.poses, self.assignment.limits
-        deciding.update_links(t)
-        # a status with the new phase may be on its way, but the start is known
-        phase = np.where((phase == AIRBORNE) & (t >= start - ROUNDING_S), RUNNING, phase)
-        known = self.guided & np.isfinite(poses.stamp) & (poses.lost_since == np.inf)
-        running, waiting = known & (phase == RUNNING), known & (phase <= AIRBORNE) & self._complete(t)
-        position = np.full((len(known), 3), np.nan)
-        position[known] = poses.extrapolate_position(self.assignment.predictor, t, np.flatnonzero(known))
-        held = anew = (running & deciding.without_neighbours()) | waiting
-        if running.any():
-            self.decisions += 1
-            new = deciding.decide(t, position, poses.velocity, self.yaw, start=start, running=running)
-            self.goal = np.where(new.due[:, None], new.goal, self.goal)
-            self.goal_yaw = np.where(new.due, new.yaw, self.goal_yaw)
-            self.updates += new.due
-            held = (running & deciding.without_neighbours()) | waiting  # links may have come or gone by the decision
-            anew = held | new.due
-        self.goal, self.goal_yaw = self._holding.hold_position(held, position, self.goal, self.goal_yaw)
-        self._pose_stamp = np.where(anew, poses.stamp, self._pose_stamp)
-        deciding.require_update(np.flatnonzero(~running | held))
-        again = running & (t - self._sent >= 0.5 * limits.link_silence_s)
-        rows = np.flatnonzero((anew | again) & np.isfinite(self.goal).all(axis=1))
-        self._sent[rows] = t
-        return CentreGoals(rows, self.goal[rows], self.goal_yaw[rows], self._pose_stamp[rows])
+        found, any_runs = [], False
+        for row, robot in enumerate(self.robots):
+            if not robot.guided:
+                continue
+            robot.computer.update_links(t)
+            known = isfinite(robot.stamp) and robot.lost_since == inf
+            # a status with the new phase may be on its way, but the start is known
+            begun = phase[row] == AIRBORNE and t >= start[row] - ROUNDING_S
+            runs = known and (begun or phase[row] == RUNNING)
+            any_runs = any_runs or runs
+            waits = known and not runs and phase[row] <= AIRBORNE and self._complete(row, t)
+            if (goal := self._goal_of(row, t, start[row], runs=runs, waits=waits)) is not None:
+                found.append(goal)
+        self.decisions += any_runs
+        return found
 
-    def _complete(self, t: float) -> Mask:
-        """Rows (N,) with a pose of each neighbour, or after their patience."""
-        complete = np.ones(len(self.guided), dtype=bool)
-        patience, stamp = self.assignment.patience_s, self.goal_computer.neighbours.stamp_once_alive
-        if patience is None or t <= patience:
-            complete[self.assignment.links.receiver[self.assignment.unreceived(stamp)]] = False
-        return complete
+    def _goal_of(self, row: int, t: float, start: float, *, runs: bool, waits: bool) -> CentreGoal | None:
+        robot, assignment = self.robots[row], self.assignments[row]
+        computer, new = robot.computer, False
+        position = UNKNOWN
+        if isfinite(robot.stamp):
+            position = assignment.predictor.position(robot, t - robot.stamp)
+        if runs:
+            new = computer.decide(t, position, robot.velocity, robot.yaw, start)
+            if new:
+                robot.goal, robot.goal_yaw = computer.goal, computer.yaw
+                robot.updates += 1
+        held = (runs and computer.without_neighbours()) or waits
+        robot.keeping.hold(held, position)
+        if held:
+            robot.goal, robot.goal_yaw = robot.keeping.at, nan
+        if new or held:
+            robot.pose_stamp = robot.stamp
+        if held or not runs:
+            computer.require_update()
+        again = runs and t - robot.sent_at >= 0.5 * assignment.limits.link_silence_s
+        if not ((new or held or again) and is_finite(robot.goal)):
+            return None
+        robot.sent_at = t
+        return CentreGoal(row, robot.goal, robot.goal_yaw, robot.pose_stamp)
 
-    def _links(self, rows: Index) -> Index:
-        """All links with one of `rows` as sender."""
-        sends = np.zeros(len(self.guided), dtype=bool)
-        sends[rows] = True
-        return np.flatnonzero(sends[self.assignment.links.sender])
+    def _complete(self, row: int, t: float) -> bool:
+        """Whether a robot has a pose of each neighbour, or its patience is over."""
+        patience = self.assignments[row].patience_s
+        return (patience is not None and t > patience) or not self.robots[row].computer.neighbours.unreceived()
 
 
 class Guidance:
-    """Goals received from the central controller, one per row (N), their age, and liveliness of the controller."""
+    """Goal received from the central controller, its age, and liveliness of the controller."""
 
-    def __init__(self, guided: Mask, flies: Mask, silence_s: float) -> None:
-        """Start without goals; those on wheels are on the floor, those older than `silence_s` [s] are ignored."""
-        rows = len(guided)
-        self.guided, self._flies, self._silence_s = guided, flies, silence_s
-        self.goal: Array = np.full((rows, 3), np.nan)  # (N, 3) last received [m]
-        self.goal_yaw: Array = np.full(rows, np.nan)  # (N,) wanted there [rad], NaN for any
-        self.stamp: Array = np.full(rows, -np.inf)  # (N,) time of its decision [s]; minus infinity before the first
-        self.fresh: Mask = np.zeros(rows, dtype=bool)  # (N,) goals not used yet
-        self.lost_since = np.inf  # loss of the controller [s]; infinity while it is alive
+    __slots__ = ("_flies", "_silence_s", "fresh", "goal", "goal_yaw", "lost_since", "stamp")
 
-    def receive(self, rows: Index, goal: Array, yaw: Array, stamp: Array) -> Mask:
-        """Store goals (H, 3) of `rows` (H,), each once, decided at `stamp` (H,) [s]; returns which were new (H,)."""
-        newer = np.asarray((stamp > self.stamp[rows]) & self.guided[rows] & np.isfinite(goal).all(axis=1))
-        rows = rows[newer]
-        self.goal[rows], self.goal_yaw[rows], self.stamp[rows] = goal[newer], yaw[newer], stamp[newer]
-        self.goal[rows, 2] = np.where(self._flies[rows], self.goal[rows, 2], 0.0)
-        self.fresh[rows] = True
-        if self.lost_since < np.inf and some(
-            self.stamp[rows] > self.lost_since
-        ):  # decided after the loss: another controller
-            self.lost_since = np.inf
-        return newer
+    goal: Vector  # last received [m]
+    goal_yaw: float  # wanted there [rad], NaN for any
+    stamp: float  # time of its decision [s]; minus infinity before the first
+    fresh: bool  # not used yet
+    lost_since: float  # loss of the controller [s]; infinity while it is alive
+
+    def __init__(self, *, flies: bool, silence_s: float) -> None:
+        """Start without a goal; on wheels it is on the floor, and none is older than `silence_s` [s]."""
+        self._flies, self._silence_s = flies, silence_s
+        self.goal, self.goal_yaw, self.stamp, self.fresh, self.lost_since = UNKNOWN, nan, -inf, False, inf
+
+    def receive(self, goal: Vector, yaw: float, stamp: float) -> bool:
+        """Store a goal that was decided at `stamp` [s]; returns whether it was new."""
+        if not (stamp > self.stamp and is_finite(goal)):
+            return False
+        self.goal = goal if self._flies else (goal[0], goal[1], 0.0)
+        self.goal_yaw, self.stamp, self.fresh = yaw, stamp, True
+        if stamp > self.lost_since:  # decided after the loss: another controller
+            self.lost_since = inf
+        return True
+
+    def begin_anew(self) -> None:
+        """Forget the time of the last goal: the clock of a new controller may be behind that of the former one."""
+        self.stamp = -inf
 
     def mark_lost(self, t: float) -> None:
         """Controller lost at `t` [s]; a goal decided later comes from another controller."""
@@ -164,14 +209,13 @@ class Guidance:
 
     def mark_alive(self) -> None:
         """Controller alive, whether or not goals follow."""
-        self.lost_since = np.inf
+        self.lost_since = inf
 
-    def rows_without_goal(self) -> Mask:
-        """Guided rows (N,) without any goal so far."""
-        return np.asarray(self.guided & (self.stamp == -np.inf))
+    @property
+    def missing(self) -> bool:
+        """Whether there was no goal so far."""
+        return self.stamp == -inf
 
-    def unguided(self, t: float) -> Mask:
-        """Guided rows (N,) without guidance at `t` [s]: controller lost, or goal missing or too old."""
-        if self.lost_since < np.inf:
-            return self.guided
-        return np.asarray(self.guided & ~(t - self.stamp <= self._silence_s))
+    def unguided(self, t: float) -> bool:
+        """Whether guidance is missing at `t` [s]: controller lost, or goal missing or too old."""
+        return self.lost_since < inf or not t - self.stamp <= self._silence_s

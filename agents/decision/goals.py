@@ -1,217 +1,206 @@
-"""Goals of rows: formation law, plans, links and station keeping, from own positions and received poses.
+"""Goals of a robot: formation law, plan, links and station keeping, from its own position and received poses. Pure.
 
-Pure and row-wise. A robot computes its own goal from its measured position; the central controller computes the goals
-of all robots that it guides from their last received poses.
+A robot computes its own goal from its measured position; the central controller computes the goal of each robot that it
+guides from that robot's last received pose. `errors`, `law_offset` and `decide` are quiet unless the formation changes.
 """
 
 from __future__ import annotations
 
-import msgspec
-import numpy as np
+from math import nan
 
-from agents.arrays import Array, Index, Mask, some
 from agents.decision.assignment import Assignment
-from agents.decision.control_updates import ControlUpdates, ControlView
-from agents.decision.neighbours import NeighbourStates
-from agents.formation.changes import Reshaping
-from agents.plugins import laws
-from agents.plugins.calls import call
-from agents.plugins.planners import Itinerary, Leg, Waypoints
-
-
-class GoalDecision(msgspec.Struct, frozen=True):
-    """Result of a decision for all rows (N); meaningless for rows that are not `due`."""
-
-    due: Mask  # (N,) rows with a new goal
-    goal: Array  # (N, 3) [m]
-    offset: Array  # (N, 3) of the law, before it was clamped [m]
-    yaw: Array  # (N,) wanted at the goal [rad], NaN for any
+from agents.decision.control_updates import ControlUpdates
+from agents.decision.neighbours import Neighbours
+from agents.formation.changes import change_target, exists_now, planned_at
+from agents.formation.link import Link
+from agents.plugins.laws import Law, goal_position, tracking_offset
+from agents.plugins.planners import Itinerary, Leg, Pose, Waypoints
+from agents.vectors import UNKNOWN, ZERO, Vector, is_finite, norm
 
 
 class GoalComputer:
-    """Goals of some of N rows."""
+    """Goals of one robot."""
 
-    def __init__(self, assignment: Assignment, mine: Mask) -> None:
-        """Compute goals of the rows `mine` (N,); links, anchors and plans of the others are not used."""
-        rows = len(assignment.names)
-        self._assignment, links = assignment, assignment.links
-        self.neighbours = NeighbourStates(links, assignment.avoidance_only, assignment.limits.link_silence_s)
-        self.clamp = assignment.clamp  # largest step of a goal per axis and decision [m]
-        self.tracking_gain = assignment.tracking_gain  # k of (7) [1/(m² decision)]
-        self._updating = None if assignment.update is None else ControlUpdates(assignment.update, rows, links)
-        self._flies = np.array([kind.flies for kind in assignment.kinds])
-        self.ground: Array = np.where(self._flies, assignment.hover, 0.0)  # (N,) heights that rows hold [m]
-        self._anchored = np.zeros(rows, dtype=bool)
-        if assignment.anchors is not None:
-            self._anchored[assignment.anchors.row] = True
-        self._uses_law = self._anchored.copy()
-        avoidance_only = assignment.avoidance_only
-        self._uses_law[links.receiver if avoidance_only is None else links.receiver[~avoidance_only]] = True
-        changing = bool(assignment.changes) or assignment.presence is not None
-        self._reshaping = Reshaping(links, assignment.changes, assignment.presence) if changing else None
-        if self._reshaping is not None:
-            self.neighbours.set_targets(self._reshaping.links, self._reshaping.present)
-        planned = np.zeros(rows, dtype=bool)
-        itineraries = []
-        for group, legs in assignment.legs:
-            planned[group] = True
-            for lawful in (True, False):
-                part = group[self._uses_law[group] == lawful]
-                if len(part):
-                    itineraries.append(Itinerary(part, legs, holds_before=not lawful))
-        rest = np.flatnonzero(mine & ~planned & ~self._uses_law)
-        if len(rest):  # neither law nor plan: stay in place
-            itineraries.append(Itinerary(rest, (), holds_before=True))
-        self._itineraries = tuple(itineraries)
-        self._detours: dict[int, tuple[float, Itinerary]] = {}  # since when [s], by row
-        self._gated = self._uses_law & ~planned  # a plan moves its target at every decision
+    __slots__ = (
+        "_anchors", "_changes", "_detour", "_detour_since", "_flies", "_gated", "_given", "_predictor", "_reshapes",
+        "_updating", "clamp", "energy", "error", "follows", "goal", "ground", "itinerary", "law", "neighbours",
+        "offset", "tracking_gain", "yaw",
+    )  # fmt: skip
+
+    neighbours: Neighbours
+    follows: bool  # the law moves it: it has links or anchors
+    clamp: float  # largest step of a goal per axis and decision [m]
+    tracking_gain: float  # k of (7) [1/(m² decision)]
+    ground: float  # height that it holds [m]
+    goal: Vector  # decided last [m]
+    yaw: float  # wanted at the goal [rad], NaN for any
+    offset: Vector  # of the law at the last decision, before it was clamped [m]
+    error: float  # Σ|e| of the links, of the last call of `errors` [m]
+    energy: float  # Σ ½e², likewise [m²]
+
+    def __init__(self, assignment: Assignment) -> None:
+        links = assignment.neighbours
+        self.law: Law = assignment.law
+        self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
+        self.neighbours = Neighbours(links, assignment.limits.link_silence_s)
+        self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
+        self._flies, self.ground = assignment.kind.flies, assignment.ground
+        self.follows = bool(self._anchors) or any(link.in_law for link in links)
+        self._given = [Link(each.distance, each.gain, each.relative, each.bearing, each.wants) for each in links]
+        bounded = [
+            sender for sender in self.neighbours.all if not planned_at(sender.since, sender.until, sender.reach, 0.0)
+        ]
+        comes_and_goes = any(sender.until < float("inf") for sender in self.neighbours.all)
+        self._reshapes = bool(self._changes or bounded or comes_and_goes)
+        for sender in self.neighbours.all:
+            sender.present = sender.in_law and planned_at(sender.since, sender.until, sender.reach, 0.0)
+        legs = assignment.legs
+        self.itinerary: Itinerary | None = None
+        if legs or not (self.follows or assignment.guided):  # neither law nor plan: stay in place
+            self.itinerary = Itinerary(legs, holds_before=not self.follows)
+        self._detour: Itinerary | None = None
+        self._detour_since = 0.0
+        self._gated = self.follows and not legs  # a plan moves its target at every decision
+        self._updating = None
+        if assignment.update is not None:
+            self._updating = ControlUpdates(assignment.update, len(links), anchored=bool(self._anchors))
+        self.goal, self.yaw, self.offset, self.error, self.energy = UNKNOWN, nan, ZERO, 0.0, 0.0
 
     def update_links(self, t: float) -> None:
         """Update the active links at `t` [s] for neighbours that appeared or were lost."""
-        if self.neighbours.incomplete:
-            self.require_update(self.neighbours.update_active(t))
+        if self.neighbours.incomplete and self.neighbours.update_active(t):
+            self.require_update()
 
-    def without_neighbours(self) -> Mask:
-        """Rows (N,) for which the law has no input: all their neighbours are lost."""
-        neighbours = self.neighbours
-        if len(neighbours.active) == len(self._assignment.links):
-            return np.zeros(len(self._uses_law), dtype=bool)
-        has_input = self._anchored.copy()
-        has_input[neighbours.links.receiver] = True
-        return self._uses_law & ~has_input
+    def without_neighbours(self) -> bool:
+        """Whether the law has no input: all neighbours are lost, or not there now."""
+        if not self.follows or self._anchors:
+            return False
+        return not any(sender.active for sender in self.neighbours.all)
 
-    def begin_plans(self, rows: Index, place: Array, yaw: Array, elapsed_s: float = 0.0) -> None:
-        """Begin the plans of `rows` (K,) at `place` (K, 3) [m] and `yaw` (K,) [rad], if they have not begun.
+    def begin_plan(self, place: Vector, yaw: float, elapsed_s: float = 0.0) -> None:
+        """Begin the plan at `place` [m] and `yaw` [rad], if it has not begun.
 
         Legs that are due `elapsed_s` after the common start follow from there [s].
         """
-        count = len(self._uses_law)
-        elapsed, position, heading = np.full(count, -np.inf), np.full((count, 3), np.nan), np.zeros(count)
-        elapsed[rows], position[rows], heading[rows] = elapsed_s, place, yaw
-        position[:, 2] = self.ground
-        for itinerary in self._itineraries:
-            mine = itinerary.rows
-            itinerary.target(elapsed[mine], position[mine], heading[mine])
+        if self.itinerary is not None:
+            self.itinerary.target(elapsed_s, (place[0], place[1], self.ground), yaw)
 
-    def leads(self, row: int) -> bool:
-        """Whether a row has neither links nor anchors: it follows a plan, or stays."""
-        return not self._uses_law[row]
+    @property
+    def leads(self) -> bool:
+        """Whether the robot has neither links nor anchors: it follows a plan, or stays."""
+        return not self.follows
 
-    def redirect(self, row: int, goal: tuple[float, float], t: float, speed: float) -> None:
-        """Sends a row that leads to x, y [m] instead of along its plan, from `t` [s] on, at `speed` [m/s]."""
+    def redirect(self, goal: tuple[float, float], t: float, speed: float) -> None:
+        """Send a robot that leads to x, y [m] instead of along its plan, from `t` [s] on, at `speed` [m/s]."""
         way = Leg(0.0, Waypoints(points=[list(goal)], speed_=speed))
-        self._detours[row] = t, Itinerary(np.array([row]), (way,), holds_before=False)
+        self._detour, self._detour_since = Itinerary((way,), holds_before=False), t
 
-    def origin(self, row: int) -> tuple[float, float, float, float] | None:
-        """x, y, z [m] and yaw [rad] at which the plan of a row began; None without plan, or before."""
-        return next(filter(None, (itinerary.origin(row) for itinerary in self._itineraries)), None)
+    @property
+    def origin(self) -> Pose | None:
+        """x, y, z [m] and yaw [rad] at which the plan began; None without plan, or before."""
+        return None if self.itinerary is None else self.itinerary.origin
 
-    def require_update(self, rows: Index) -> None:
-        """Rows with old goals, or new targets, compute the law at the next decision, whatever a trigger decides."""
+    def require_update(self) -> None:
+        """Compute the law at the next decision, whatever a trigger decides: the goal is old, or targets are new."""
         if self._updating is not None:
-            self._updating.require_update(rows)
+            self._updating.require()
 
-    def decide(
-        self,
-        t: float,  # now [s]
-        position: Array,  # (N, 3) measured or believed [m]
-        velocity: Array,  # (N, 3) [m/s]
-        yaw: Array,  # (N,) [rad]
-        *,
-        start: Array,  # (N,) [s]
-        running: Mask,  # (N,) rows that want a goal
-    ) -> GoalDecision:
-        follows, due, view = self._uses_law, running, None
-        if self._reshaping is not None:
-            everywhere = self.neighbours.extrapolate_all(self._assignment.predictor, t)
-            self._reshaping.advance(t - start, position, everywhere)
-            self.require_update(self.neighbours.set_targets(self._reshaping.links, self._reshaping.present))
-        if self._updating is not None:
-            view = self.control_view(t, position, velocity, start)
-            due = running & (~self._gated | self._updating.due(view))
-        if view is None:
-            offset = self.law_offset(t, position)
-        else:
-            offset = view.offset if some(due & follows) else np.zeros_like(position)
-        goal = position.copy()
-        goal_yaw = np.full(len(position), np.nan)
-        place = position.copy()
-        place[:, 2] = self.ground  # a plan begins at the held height, not where the climb ended
-        for itinerary in self._itineraries:
-            rows = itinerary.rows
-            target, goal_yaw[rows] = itinerary.target(t - start[rows], place[rows], yaw[rows])
-            leads = ~follows[rows]
-            if leads.all():
-                goal[rows] = target
-            else:
-                offset[rows] += laws.tracking_offset(position[rows], target, self.tracking_gain)
-        for row, (since, way) in self._detours.items():
-            goal[[row]], goal_yaw[[row]] = way.target(np.array([t - since]), place[[row]], yaw[[row]])
-        goal = np.where(follows[:, None], laws.goal_position(position, offset, self.clamp), goal)
-        goal[:, 2] = np.where(follows | ~self._flies, self.ground, goal[:, 2])
-        return GoalDecision(due, goal, offset, goal_yaw)
+    def decide(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> bool:
+        """Decide the goal at `t` [s] of a robot that began at `start` [s]; returns whether it is a new one.
 
-    def law_offset(self, t: float, position: Array) -> Array:
-        """Offset of all rows (N, 3) [m]; raises PluginError, which names the law, if it fails."""
-        law, neighbours, anchors = self._assignment.law, self.neighbours, self._assignment.anchors
-        believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        inputs = position, believed, neighbours.links
-        offset = call("law", law, "offset", *inputs, shape=position.shape, each="a vector for each robot")
-        return offset if anchors is None else offset + anchors.offset(position)
-
-    def errors(self, t: float, position: Array) -> tuple[Array, Array]:
-        """Σ|e| [m] and Σ ½e² [m²] of the links of each row, as it knows them.
-
-        Raises PluginError if the law fails, or gives something else than one error for each link.
+        Args:
+            position: Measured or believed [m].
+            velocity: Likewise [m/s].
+            yaw: Likewise [rad].
         """
-        law, neighbours = self._assignment.law, self.neighbours
-        believed = neighbours.poses.extrapolate_position(self._assignment.predictor, t, neighbours.active)
-        inputs, shape = (position, believed, neighbours.links), neighbours.links.receiver.shape
-        error = call("law", law, "error", *inputs, shape=shape, each="one value for each link")
-        both = neighbours.links.sum_by_receiver(_error_and_energy(error), len(position))
-        anchors = self._assignment.anchors
-        if anchors is not None:
-            np.add.at(both, anchors.row, _error_and_energy(anchors.error(position)))
-        return both[:, 0], both[:, 1]
+        elapsed = t - start
+        if self._reshapes:
+            self._reshape(elapsed, position, t)
+        offset = ZERO
+        if self.follows:
+            offset = self.law_offset(t, position)
+        if self._updating is not None and self._gated:
+            if self._updating.asking.trigger.JUDGES_ERRORS:
+                self.errors(t, position)
+            if not self._updating.due(
+                t, position, velocity, self.neighbours, self._predictor,
+                since_start=max(elapsed, 0.0), offset=offset, error=self.error, energy=self.energy,
+            ):  # fmt: skip
+                return False
+        goal, goal_yaw = position, nan
+        place = position[0], position[1], self.ground  # a plan begins at the held height, not where the climb ended
+        if self.itinerary is not None:
+            x, y, z, goal_yaw = self.itinerary.target(elapsed, place, yaw)
+            if self.follows:
+                a, b, c = tracking_offset(position, (x, y, z), self.tracking_gain)
+                offset = offset[0] + a, offset[1] + b, offset[2] + c
+            else:
+                goal = x, y, z
+        if self._detour is not None:
+            x, y, z, goal_yaw = self._detour.target(t - self._detour_since, place, yaw)
+            goal = x, y, z
+        if self.follows:
+            goal = goal_position(position, offset, self.clamp)
+        if self.follows or not self._flies:
+            goal = goal[0], goal[1], self.ground
+        self.goal, self.yaw, self.offset = goal, goal_yaw, offset
+        return True
 
-    def control_view(self, t: float, position: Array, velocity: Array, start: Array) -> ControlView:
-        assert self._updating is not None
-        neighbours, predictor, active = self.neighbours, self._assignment.predictor, self.neighbours.active
-        receiver = neighbours.links.receiver
-        apart = position[receiver] - neighbours.poses.extrapolate_position(predictor, t, active)
-        rate = velocity[receiver] - neighbours.poses.extrapolate_velocity(predictor, t, active)
-        return ControlView(
-            t, position, velocity, self._updating.last_event, start, neighbours.links,
-            self._updating.inputs(active), (apart, rate), self._anchored,
-            law=lambda: self.law_offset(t, position),
-            errors=lambda: self.errors(t, position),
-        )  # fmt: skip
+    def law_offset(self, t: float, position: Vector) -> Vector:
+        """Offset u_i of the law and the anchors at `t` [s] for a robot at `position` [m]."""
+        law, predictor = self.law, self._predictor
+        x = y = z = 0.0
+        for sender in self.neighbours.all:
+            if sender.active:
+                a, b, c = law.pull(sender.apart(position, predictor, t), sender.link)
+                x, y, z = x + a, y + b, z + c
+        for anchor in self._anchors:
+            a, b, c = anchor.pull(position)
+            x, y, z = x + a, y + b, z + c
+        return x, y, z
+
+    def errors(self, t: float, position: Vector) -> None:
+        """Compute `error` and `energy` of the links at `t` [s], as a robot at `position` [m] knows them."""
+        law, predictor = self.law, self._predictor
+        total = energy = 0.0
+        for sender in self.neighbours.all:
+            if sender.active:
+                error = law.error(sender.apart(position, predictor, t), sender.link)
+                total, energy = total + error, energy + 0.5 * error * error
+        for anchor in self._anchors:
+            error = anchor.error(position)
+            total, energy = total + error, energy + 0.5 * error * error
+        self.error, self.energy = total, energy
+
+    def _reshape(self, elapsed: float, position: Vector, t: float) -> None:
+        """Set targets and presence of the links `elapsed` [s] after the start."""
+        elapsed, changed = max(elapsed, 0.0), False
+        for sender, given in zip(self.neighbours.all, self._given, strict=True):
+            if not sender.in_law:
+                continue
+            if self._changes:
+                changed |= change_target(sender.link, given, self._changes, sender.targets, elapsed)
+            a, b, c = sender.place(self._predictor, t)
+            apart = norm((position[0] - a, position[1] - b, position[2] - c))
+            sender.present = exists_now(sender, elapsed, apart)
+        if self.neighbours.select() or changed:
+            self.require_update()
 
 
 class StationKeeping:
-    """Rows (N) that stay at the place where their hold began."""
+    """The place where the hold of a robot began."""
 
-    def __init__(self, ground: Array) -> None:
-        """Hold at the heights `ground` (N,) [m]."""
-        self._ground, self._at = ground, np.full((len(ground), 3), np.nan)
-        self.held: Mask = np.zeros(len(ground), dtype=bool)  # (N,) rows that stay
+    __slots__ = ("at", "ground", "held")
 
-    def hold_position(self, held: Mask, position: Array, goal: Array, yaw: Array) -> tuple[Array, Array]:
-        """Goals (N, 3) [m] and yaws (N,) [rad]: the held place for rows `held` (N,), else the given ones."""
-        before, self.held = self.held, held
-        if not some(held):
-            return goal, yaw
-        entered = held & ~before
-        if some(entered):
-            self._at[entered] = np.nan
-        nowhere = held & np.isnan(self._at[:, 0])  # rows without a position stay at the first known one
-        if some(nowhere):
-            self._at[nowhere] = position[nowhere]
-            self._at[nowhere, 2] = self._ground[nowhere]
-        return np.where(held[:, None], self._at, goal), np.where(held, np.nan, yaw)
+    at: Vector  # [m]
+    held: bool
 
+    def __init__(self, ground: float) -> None:
+        """Hold at the height `ground` [m]."""
+        self.ground, self.at, self.held = ground, UNKNOWN, False
 
-def _error_and_energy(error: Array) -> Array:
-    both = np.empty((len(error), 2))  # `stack` takes three times as long
-    both[:, 0], both[:, 1] = error, 0.5 * error * error
-    return both
+    def hold(self, held: bool, position: Vector) -> None:
+        """Begin, go on or end a hold; a robot without a position stays at the first known one."""
+        if held and (not self.held or not self.at[0] == self.at[0]):
+            self.at = (position[0], position[1], self.ground) if is_finite(position) else UNKNOWN
+        self.held = held

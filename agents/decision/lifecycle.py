@@ -1,16 +1,16 @@
-"""Life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure and row-wise.
+"""Life of a robot in an experiment: idle, ready, airborne, running, landing, done. Pure.
 
-Orders and facts go in, phases come out; resulting commands to the body are collected in `BodyCommands`.
+Orders and facts go in, phases and commands to the body come out. `advance` is quiet while the robot runs.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
+from math import inf
+from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask
+from agents.body.kinds import Kind
+from agents.vectors import Vector
 
 
 class Phase(IntEnum):
@@ -32,153 +32,117 @@ class Phase(IntEnum):
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
-AT_HEIGHT = 0.05  # [m] from the hover height: arrived
-FINISHED, TOLD_TO_END = "finished", "told to end"  # reasons for a landing that is no fault; orders are others
-SETTLED = 0.1  # [m/s] slower: climbing or rolling has ended
-
-
-@dataclass(frozen=True)
-class BodyCommands:
-    """Commands to the body: rows that take off, land, and stop their motors."""
-
-    takeoff: Index
-    land: Index
-    stop: Index
+AT_HEIGHT: Final = 0.05  # [m] from the hover height: arrived
+FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
+TOLD_TO_END: Final = "told to end"
+SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
 
 
 class Lifecycle:
-    """Phases of N rows."""
+    """Phases of one robot."""
 
-    def __init__(self, flies: Mask, hover: Array, duration: float) -> None:
-        """Rows that fly (N,), their hover heights (N,) [m], and the duration of the experiment [s]."""
-        rows = len(flies)
-        self.phase = np.full(rows, IDLE)
-        self.start_at = np.full(rows, np.inf)
-        self.reason, self._waits = [""] * rows, [""] * rows
-        self.failing: dict[int, str] = {}  # rows that fail a check on this tick, though they may be ready, and why
-        self.moved = False  # whether a phase changed on the last tick, or by an order since the one before
-        self._before = self.phase.tobytes()
-        self._flies, self._hover, self._duration = flies, hover, duration
-        self._climbing = np.zeros(rows, dtype=bool)
-        self._due: dict[str, list[int]] = {"takeoff": [], "land": [], "stop": []}
-        self._settled_until = -np.inf  # no change by itself before this time
+    __slots__ = (
+        "_before", "_duration", "_flies", "_hover", "_settled_until", "_waits", "climbing", "failing", "land_due",
+        "moved", "phase", "reason", "start_at", "stop_due", "takeoff_due",
+    )  # fmt: skip
 
-    def takeoff(self, row: int) -> str:
+    phase: int  # of `Phase`
+    climbing: bool  # on its way up
+    start_at: float  # the common start on the process's clock [s]; infinity before it is known
+    moved: bool  # whether the phase changed on the last tick, or by an order since the one before
+    takeoff_due: bool  # commands that the body has not received yet
+    land_due: bool
+    stop_due: bool
+    reason: str  # why it is not ready, or has landed
+    failing: str  # check that fails on this tick, though the robot may be ready; empty: none
+
+    def __init__(self, kind: Kind, hover: float, duration: float) -> None:
+        """Of a robot that hovers at `hover` [m], in an experiment of `duration` [s]."""
+        self._flies, self._hover, self._duration = kind.flies, hover, duration
+        self.phase = self._before = IDLE
+        self.start_at, self._settled_until = inf, -inf
+        self.climbing = self.moved = self.takeoff_due = self.land_due = self.stop_due = False
+        self.reason = self._waits = self.failing = ""
+
+    def takeoff(self) -> str:
         """Order to climb; returns the reason of a refusal, empty when accepted."""
-        phase = Phase(self.phase[row])
-        if self._climbing[row] or phase in (AIRBORNE, RUNNING):
+        if self.climbing or self.phase in (AIRBORNE, RUNNING):
             return ""  # an order may be repeated when its reply was lost
-        if phase != READY:
-            return f"cannot take off while {phase.word}" + (f": {self.reason[row]}" if self.reason[row] else "")
-        if row in self.failing:  # it is being lifted, say: a failure that does not last is over when asked again
-            return f"cannot take off now: {self.failing[row]}"
-        self._climbing[row] = True
-        self._due["takeoff"].append(row)
+        if self.phase != READY:
+            return f"cannot take off while {Phase(self.phase).word}" + (f": {self.reason}" if self.reason else "")
+        if self.failing:  # it is being lifted, say: a failure that does not last is over when asked again
+            return f"cannot take off now: {self.failing}"
+        self.climbing = self.takeoff_due = True
         return ""
 
-    def start(self, row: int, at: float) -> str:
+    def start(self, at: float) -> str:
         """Order to begin the experiment at `at` on the process's clock [s]; returns as `takeoff`."""
-        phase = Phase(self.phase[row])
-        if phase == RUNNING:
+        if self.phase == RUNNING:
             return ""
-        if phase != AIRBORNE:
-            return f"cannot start while {phase.word}"
-        self.start_at[row] = at
+        if self.phase != AIRBORNE:
+            return f"cannot start while {Phase(self.phase).word}"
+        self.start_at = at
         return ""
 
-    def land(self, row: int, reason: str) -> None:
+    def land(self, reason: str) -> None:
         """Land, or roll out, in any phase."""
-        if self.phase[row] < LANDING:
-            self.phase[row], self._climbing[row], self.reason[row] = LANDING, False, reason
-            self._forget("takeoff", row)
-            self._due["land"].append(row)
-            self._settled_until = -np.inf
+        if self.phase < LANDING:
+            self.phase, self.climbing, self.reason = LANDING, False, reason
+            self.takeoff_due, self.land_due = False, True
+            self._settled_until = -inf
 
-    def stop(self, row: int, reason: str) -> None:
+    def stop(self, reason: str) -> None:
         """Motors off."""
-        self.phase[row], self._climbing[row], self.reason[row] = DONE, False, reason
-        self._forget("takeoff", row)
-        self._forget("land", row)  # the body would get it after the stop
-        self._due["stop"].append(row)
-        self._settled_until = -np.inf
+        self.phase, self.climbing, self.reason = DONE, False, reason
+        self.takeoff_due = self.land_due = False  # the body would get them after the stop
+        self.stop_due = True
+        self._settled_until = -inf
 
-    def _forget(self, what: str, row: int) -> None:
-        """Drop a command that the body has not received yet."""
-        if row in self._due[what]:
-            self._due[what].remove(row)
-
-    def set_missing(self, row: int, reason: str) -> None:
-        """Store why an idle row is not ready, or why a ready one will not be any more on this tick."""
-        self._waits[row] = reason
-        if self.phase[row] == IDLE:
-            self.reason[row] = reason
+    def set_missing(self, reason: str) -> None:
+        """Store why an idle robot is not ready, or why a ready one will not be any more on this tick."""
+        self._waits = reason
+        if self.phase == IDLE:
+            self.reason = reason
 
     @property
-    def active(self) -> Mask:
-        """Rows (N,) that climb, wait in the air, or run."""
-        return np.asarray(self._climbing | (self.phase == AIRBORNE) | (self.phase == RUNNING))
+    def active(self) -> bool:
+        """Whether the robot climbs, waits in the air, or runs."""
+        return self.climbing or self.phase in (AIRBORNE, RUNNING)
 
     @property
-    def climbing(self) -> Mask | None:
-        """Rows (N,) on their way up to their height; None if no row is."""
-        return self._climbing.copy() if self._climbing.any() else None
+    def in_motion(self) -> bool:
+        """Whether the robot climbs, waits in the air, runs, or lands."""
+        return self.climbing or AIRBORNE <= self.phase <= LANDING
 
-    def in_motion(self, row: int) -> bool:
-        """Whether a row climbs, waits in the air, runs, or lands."""
-        return bool(self._climbing[row] or AIRBORNE <= self.phase[row] <= LANDING)
+    def advance(self, t: float, position: Vector, velocity: Vector, *, flying: bool, ready: bool) -> None:
+        """Advance the phase at `t` [s]: `position` [m], `velocity` [m/s], `flying`: the motors are on.
 
-    @property
-    def waiting(self) -> bool:
-        """Whether a row has yet to take off."""
-        return self._settled_until == -np.inf and bool(self.phase.min() <= READY)
-
-    @property
-    def all_running(self) -> bool:
-        return self._settled_until > -np.inf or bool((self.phase == RUNNING).all())
-
-    def advance(self, t: float, ready: Mask, position: Array, velocity: Array, flying: Mask) -> BodyCommands | None:
-        """Advance the phase of every row at `t` [s]: `position` (N, 3) [m], `velocity` (N, 3) [m/s], `flying` (N,).
-
-        `ready` (N,): nothing is missing; a ready row that loses this is idle again, unless it climbs already.
+        `ready`: nothing is missing; a ready robot that loses this is idle again, unless it climbs already.
         """
-        if t < self._settled_until:
+        if t < self._settled_until:  # it runs, and goes on
             self.moved = False
-            return None
-        phase = self.phase
-        lowest, highest = phase.min(), phase.max()
-        if lowest <= READY:
-            for row in np.flatnonzero((phase == IDLE) & ready):
-                phase[row], self.reason[row] = READY, ""
-            for row in np.flatnonzero((phase == READY) & ~ready & ~self._climbing):
-                phase[row], self.reason[row] = IDLE, self._waits[row]
-        if self._climbing.any():
-            there = ~self._flies | (
-                (np.abs(position[:, 2] - self._hover) < AT_HEIGHT) & (np.abs(velocity[:, 2]) < SETTLED)
-            )
-            arrived = self._climbing & there & ~np.isin(np.arange(len(phase)), self._due["takeoff"])
-            phase[arrived] = AIRBORNE
-            self._climbing &= ~arrived
-        if lowest <= AIRBORNE:
-            phase[(phase == AIRBORNE) & (t >= self.start_at - 1e-6)] = RUNNING
-        if highest >= RUNNING:
-            over = (phase == RUNNING) & (t - self.start_at >= self._duration - 1e-6)
-            for row in np.flatnonzero(over) if over.any() else ():
-                self.land(int(row), FINISHED)
-        if highest >= LANDING:
-            slow = ~((velocity * velocity).sum(axis=1) >= SETTLED**2)  # an unknown velocity counts as slow
-            down = (phase == LANDING) & np.where(self._flies, ~flying, slow)
-            down[self._due["land"]] = False  # the body has not received the command yet
-            phase[down] = DONE
-        now = phase.tobytes()
-        self.moved, self._before = now != self._before, now  # orders between ticks count as well
-        if (phase == RUNNING).all():
-            self._settled_until = float(self.start_at.min()) + self._duration - 1e-6
-        return self._commands()
+            return
+        self._advance(t, position, velocity, flying, ready)
+        self.moved = self.phase != self._before  # orders between ticks count as well
+        self._before = self.phase
+        if self.phase == RUNNING:
+            self._settled_until = self.start_at + self._duration - 1e-6
 
-    def _commands(self) -> BodyCommands | None:
-        if not any(self._due.values()):
-            return None
-        commands = BodyCommands(*(np.array(self._due[what], dtype=np.intp) for what in ("takeoff", "land", "stop")))
-        for rows in self._due.values():
-            rows.clear()
-        return commands
+    def _advance(self, t: float, position: Vector, velocity: Vector, flying: bool, ready: bool) -> None:
+        if self.phase == IDLE and ready:
+            self.phase, self.reason = READY, ""
+        elif self.phase == READY and not (ready or self.climbing):
+            self.phase, self.reason = IDLE, self._waits
+        if self.climbing and not self.takeoff_due:
+            at_height = abs(position[2] - self._hover) < AT_HEIGHT and abs(velocity[2]) < SETTLED
+            if at_height or not self._flies:
+                self.phase, self.climbing = AIRBORNE, False
+        if self.phase == AIRBORNE and t >= self.start_at - 1e-6:
+            self.phase = RUNNING
+        if self.phase == RUNNING and t - self.start_at >= self._duration - 1e-6:
+            self.land(FINISHED)
+        if self.phase == LANDING and not self.land_due:  # else the body has not received the command yet
+            vx, vy, vz = velocity
+            slow = not vx * vx + vy * vy + vz * vz >= SETTLED * SETTLED  # an unknown velocity counts as slow
+            if not flying if self._flies else slow:
+                self.phase = DONE

@@ -147,6 +147,10 @@ class Neighbours:
         """Senders that were never received, or are lost."""
         return [sender.name for sender in self.all if not isfinite(sender.stamp) or sender.lost_since < inf]
 
+    def unreceived(self) -> bool:
+        """Whether a pose of an awaited sender that was alive once is still missing."""
+        return any(sender.awaited and (sender.lost_since == -inf or not isfinite(sender.stamp)) for sender in self.all)
+
     def update_active(self, t: float) -> bool:
         """Update the active links at `t` [s]; returns whether they changed."""
         complete = True

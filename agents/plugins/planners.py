@@ -7,6 +7,7 @@ It starts at the robot's place (its anchor and heading when the leg begins), so 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
 from typing import Annotated, Final, Protocol
 
@@ -88,7 +89,7 @@ class Waypoints(Parameters, frozen=True):
         way, approach = elapsed * self.speed_, distance(anchor, points[0])
         if self.loop and way > approach:
             ring = [*points, points[0]]
-            lap = sum(distance(a, b) for a, b in zip(ring[:-1], ring[1:], strict=True))
+            lap = sum(distance(a, b) for a, b in pairwise(ring))
             x, y, z = _point_along(ring, (way - approach) % (lap or 1.0))
         else:
             x, y, z = _point_along([anchor, *points], way)
@@ -100,7 +101,7 @@ class Waypoints(Parameters, frozen=True):
 
 def _point_along(route: Sequence[Vector], way: float) -> Vector:
     """The point reached after `way` metres along the polyline `route`; its last one beyond the end."""
-    for a, b in zip(route[:-1], route[1:], strict=True):
+    for a, b in pairwise(route):
         length = distance(a, b)
         if way < length:
             share = way / length
@@ -182,7 +183,7 @@ class Itinerary:
 
         The first leg begins at `position` [m] and `yaw` [rad].
         """
-        if t >= self._next - 1e-9 and (self._leg >= 0 or is_finite(position)):  # or it begins later
+        if t >= self._next - 1e-9 and is_finite(position):  # else it begins later
             self._begin(t, position, yaw)
         if self._leg < 0:
             return NO_TARGET

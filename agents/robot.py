@@ -1,0 +1,364 @@
+"""Decision of one robot: no clock, no I/O, no Zenoh, no randomness.
+
+Inputs are the time, the state of its body and received messages; outputs are transmissions, commands and the setpoint
+of its body. A robot's process calls this for its robot, a radio's process for three, the virtual clock for all robots
+of all repetitions: a swarm is many of one.
+
+A tick has two halves, `transmit` and `act`; the caller may deliver the new transmissions between them. While the robot
+runs and nothing is amiss both are quiet; what they call for texts, orders and changes of phase is not.
+"""
+
+from __future__ import annotations
+
+from math import inf, isfinite, isnan, nan
+from typing import Final
+
+from agents.body.interface import BodyState
+from agents.decision.assignment import Assignment
+from agents.decision.centralised import Guidance
+from agents.decision.goals import GoalComputer, StationKeeping
+from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
+from agents.decision.neighbours import Neighbours
+from agents.decision.perception import Perception
+from agents.decision.position_control import PositionController
+from agents.decision.transmission import Transmitter
+from agents.plugins.planners import Pose
+from agents.plugins.predictors import HOLD
+from agents.safety.detection import Detector, Status
+from agents.safety.hazards import Cause, Hazards, Outcome
+from agents.safety.landing import Landing
+from agents.safety.positions import Continuity, ExternalPositions
+from agents.safety.preflight import Preflight
+from agents.safety.setpoint_filter import SetpointFilter
+from agents.safety.situation import ProcessHealth, Situation
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Setpoint, Vector, is_finite
+
+CENTRE: Final = "centre"  # missing neighbour of a guided robot without guidance
+HALT: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
+
+
+class Robot:
+    """Decision of one robot."""
+
+    __slots__ = (
+        "_asked", "_blind", "_continuity", "_controller", "_decided", "_detector", "_external", "_filter",
+        "_ordered", "_origin", "_perception", "_place", "_preflight", "_status", "assignment", "avoided", "begun",
+        "changed", "decision_due", "decisions", "error", "goal", "goal_yaw", "goals", "guidance", "hazards", "health",
+        "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position", "sent_velocity", "setpoint",
+        "stops", "takes_off", "tick", "transmitter", "updates",
+    )  # fmt: skip
+
+    tick: int  # number of the next tick; 0 at the common start, so that robots decide together
+    now: Situation  # of this tick
+    goal: Vector  # pursued [m]
+    goal_yaw: float  # wanted at the goal [rad], NaN for any
+    error: float  # Σ of the link errors as the robot knows them [m]; 0 if guided, NaN without a position
+    setpoint: Setpoint  # of the last tick, NaN where the body drives by itself
+    changed: bool  # decided setpoint changed by safety
+    avoided: bool  # decided setpoint changed by avoidance
+    takes_off: bool  # commands to the body on this tick
+    lands: bool
+    stops: bool
+    sent_position: Vector  # what is transmitted, where `transmit` says so [m]
+    sent_velocity: Vector  # [m/s]
+    decisions: int  # since the common start
+    updates: int  # decisions at which the goal was computed anew; of a guided robot, received goals
+    decision_due: bool  # whether the goal is decided on this tick; known from its first half on
+    begun: bool  # whether the robot has begun to run
+
+    def __init__(self, assignment: Assignment, health: ProcessHealth | None = None) -> None:
+        """Take the `assignment`, and the `health` of the process, which sets it."""
+        kind, limits = assignment.kind, assignment.limits
+        self.assignment, self.health = assignment, health or ProcessHealth()
+        self.goals = GoalComputer(assignment)
+        self.neighbours: Neighbours = self.goals.neighbours
+        self.guidance: Guidance | None = None
+        if assignment.guided:
+            self.guidance = Guidance(flies=kind.flies, silence_s=limits.link_silence_s)
+        self.keeping = StationKeeping(assignment.ground)
+        self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration)
+        self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind)
+        self.hazards, self.landing = Hazards(kind, limits), Landing(assignment)
+        self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), Status()
+        self._controller, self._filter = PositionController(kind), SetpointFilter(kind, limits)
+        self._continuity, self._external = Continuity(kind), ExternalPositions(kind)
+        avoids = assignment.avoidance is not None and assignment.avoids
+        self._perception = Perception(assignment) if avoids else None
+        self.now = Situation()
+        self.goal, self.goal_yaw, self.error, self.setpoint = UNKNOWN, nan, 0.0, NO_SETPOINT
+        self.tick = self.decisions = self.updates = 0
+        self.changed = self.avoided = self.takes_off = self.lands = self.stops = False
+        self.begun = self.decision_due = self._ordered = self._blind = False
+        self.sent_position, self.sent_velocity, self._place = UNKNOWN, UNKNOWN, UNKNOWN
+        self._decided = self._asked = -1
+        self._origin: Pose | None = None
+
+    # ------------------------------------------------------------------ inputs
+
+    def hold(self) -> str:
+        """Order to stay in place; returns the reason of a refusal, empty when accepted."""
+        if self.lifecycle.phase not in (AIRBORNE, RUNNING):
+            return f"cannot hold while {Phase(self.lifecycle.phase).word}"
+        self._ordered = True
+        return ""
+
+    def resume(self) -> None:
+        """Order to go on after a hold, from where the robot is now."""
+        self._ordered = False
+        self._continuity.forget()
+        self._external.forget()
+
+    def believes(self, t: float, position: Vector) -> bool:
+        """Whether a `position` [m] that was measured from outside at `t` [s] may be used; ask for each one.
+
+        One that is not believed must not reach the body either: an estimator on board would fly by it.
+        """
+        return self._external.believes(t, position, watched=self.lifecycle.in_motion)
+
+    def believed_yaw(self, t: float, yaw: float) -> float:
+        """The `yaw` [rad] of a position that is believed, or NaN: then the body's own goes on."""
+        return self._external.believed_yaw(t, yaw, watched=self.lifecycle.in_motion)
+
+    def go(self, goal: tuple[float, float], t: float) -> str:
+        """Order of a leader to a place x, y [m], from `t` [s] on, instead of its plan; returns as `hold`.
+
+        The robot moves as on a leg of its plan: avoidance, setpoint filter and hazards are the same.
+        """
+        limits, phase = self.assignment.limits, Phase(self.lifecycle.phase)
+        if phase != RUNNING:
+            return f"cannot go anywhere while {phase.word}"
+        if self.guidance is not None:
+            return "its goals are the central controller's"
+        if not self.goals.leads:
+            return "it follows its neighbours: only a leader can be sent somewhere"
+        if not all(limits.low[k] <= goal[k] <= limits.high[k] for k in range(2)):
+            return f"x = {goal[0]:g} m, y = {goal[1]:g} m is outside the arena"
+        self.goals.redirect(goal, t, 0.5 * self.assignment.kind.speed)
+        return ""
+
+    def start(self, at: float, t: float = -inf, origin: Pose | None = None) -> str:
+        """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
+
+        `origin`: x, y, z [m] and yaw [rad] at which the plan of a restarted robot began; None: it begins anew.
+        """
+        waits = self.lifecycle.phase == AIRBORNE
+        refusal = self.lifecycle.start(at)
+        if not refusal:
+            if waits and self.assignment.kind.flies:  # the common start confirms no position that jumped in the air
+                self._ordered = False
+            else:
+                self.resume()
+            if origin is not None and waits:
+                x, y, z, yaw = origin
+                self._origin = origin
+                self.goals.begin_plan((x, y, z), yaw, max(0.0, t - at))
+        return refusal
+
+    @property
+    def origin(self) -> Pose | None:
+        """x, y, z [m] and yaw [rad] at which the plan began, by itself or by the start order."""
+        return self.goals.origin or self._origin
+
+    def missing_neighbours(self) -> list[str]:
+        """Neighbours that the robot has never received, or that are lost; likewise its central controller."""
+        names, guidance = self.neighbours.missing(), self.guidance
+        if guidance is not None and (guidance.lost_since < inf or guidance.missing):
+            names.append(CENTRE)
+        return names
+
+    def skip_ticks(self, ticks: int) -> None:
+        """Skip `ticks` that are too late; called before each tick, mostly with 0."""
+        self.tick += ticks
+
+    @property
+    def descending(self) -> bool:
+        """Whether the robot lands or has landed, and is not on its way to a landing place."""
+        return self.lifecycle.phase >= LANDING and not self.landing.aside
+
+    # ------------------------------------------------------------------ the decision
+
+    def transmit(self, t: float, state: BodyState) -> bool:
+        """First half of a tick at `t` [s]: advance the phase; returns whether the robot transmits its pose now."""
+        self.goals.update_links(t)
+        life, now = self.lifecycle, self.now
+        now.take(t, state)
+        external = self._external
+        now.jump = self._continuity.jump(state.time, state.position, state.yaw, life.in_motion)
+        now.turned = self._continuity.turned
+        if external.doubted:
+            now.jump = external.jump if isnan(now.jump) else max(now.jump, external.jump)
+        if isfinite(now.jump) or external.deceived:
+            now.position = UNKNOWN
+        self._filter.judge(now)
+        ready = life.phase <= READY and self._ready()
+        life.advance(t, now.position, now.velocity, flying=state.flying, ready=ready)
+        self._take_commands()
+        if life.moved and not self.begun and life.phase == RUNNING:
+            self._decided = self._asked = -1
+            # 0, unless it joins a run under way
+            self.begun, self.tick = True, round((t - life.start_at) * self.assignment.body_hz)
+        # by number, not by remainder: a decision due on a skipped tick is made on the next one
+        decision, question = self.tick // self.assignment.decide_every, self.tick // self.assignment.pose_every
+        self.decision_due, self._decided = decision != self._decided, decision
+        if question == self._asked:
+            return False
+        self._asked = question
+        goals, transmitter = self.goals, self.transmitter
+        goals.errors(t, now.position)
+        self.error = nan if now.invalid else goals.error
+        due = transmitter.transmits(
+            t, now.position, now.velocity,
+            error=self.error, energy=goals.energy, since_start=max(t - life.start_at, 0.0), offset=goals.offset,
+            setpoint=self.setpoint,
+        )  # fmt: skip
+        self.sent_position, self.sent_velocity = transmitter.position, transmitter.velocity
+        if self.assignment.predictor is not HOLD:
+            due = self._stands_blind() or due
+        return due
+
+    def _stands_blind(self) -> bool:
+        """Whether a robot on wheels has just become blind: it sends that it is at rest, or others would follow it."""
+        blind, now = self.now.invalid, self.now
+        begins, self._blind = blind and not self._blind, blind
+        if not blind:
+            self._place = now.position
+        if not (begins and not self.assignment.kind.flies and is_finite(self._place)):
+            return False
+        self.sent_position, self.sent_velocity = self._place, ZERO
+        return True
+
+    def _take_commands(self) -> None:
+        """Commands of the lifecycle to the body; a landing may have to wait until the place below is free."""
+        life = self.lifecycle
+        self.takes_off, self.stops = life.takeoff_due, life.stop_due
+        ordered = life.land_due
+        self.lands = ordered
+        if ordered or self.landing.aside:
+            self.lands = self.landing.filter_land(
+                self.now, self.neighbours, self.health, ordered=ordered, landing=life.phase == LANDING
+            )
+        life.takeoff_due = life.land_due = life.stop_due = False
+
+    def act(self, t: float) -> None:
+        """Second half of the tick at `t` [s]: goal, setpoint and commands."""
+        life, now, landing = self.lifecycle, self.now, self.landing
+        causes = self._causes(t)
+        troubled = causes != 0 or self.hazards.under_way
+        if troubled:
+            self._apply_hazards(causes)
+        if self.decision_due:
+            self._decide(t)
+        elif life.moved or troubled:
+            # a robot that arrived at its height, or must stop, needs a place until the next decision
+            held = life.phase == RUNNING and self.hazards.held
+            self._stay(held or self.keeping.held or life.phase == AIRBORNE)
+        if self.guidance is not None:
+            self._follow(self.guidance)
+        goal = landing.place if landing.aside else self.goal
+        self.avoided = False
+        if self._perception is None:
+            setpoint = self._controller.setpoint(goal, self.goal_yaw, now.position, now.yaw)
+            setpoint = self._filter.limit(setpoint, now)
+        else:
+            setpoint = self._avoid(self._perception, t, goal)
+        self.changed = self._filter.changed
+        if life.phase != RUNNING and life.phase != AIRBORNE and not landing.aside:
+            setpoint = NO_SETPOINT if self.assignment.kind.flies else HALT
+            self.changed = self.avoided = self._filter.not_finite = False
+        self.tick, self.setpoint = self.tick + 1, setpoint
+
+    def _avoid(self, perception: Perception, t: float, goal: Vector) -> Setpoint:
+        """Setpoint toward a goal, with avoidance."""
+        now, avoidance = self.now, perception.avoidance
+        perception.sense(t, now, self.neighbours)
+        own, near = perception.own, perception.near
+        shifted = avoidance.deviate(goal, own, near, 1.0 / self.assignment.body_hz)
+        setpoint = self._controller.setpoint(shifted, self.goal_yaw, now.position, now.yaw)
+        setpoint = self._filter.check(setpoint, now, avoidance, own, near)
+        x, y, z = goal
+        moved = abs(shifted[0] - x) > 0.0 or abs(shifted[1] - y) > 0.0 or abs(shifted[2] - z) > 0.0
+        self.avoided = self._filter.avoided or moved
+        return setpoint
+
+    def _ready(self) -> bool:
+        """Whether nothing is missing for a take-off; asked before it alone."""
+        t, life, assignment = self.now.t, self.lifecycle, self.assignment
+        lacks = False
+        if assignment.patience_s is None or t <= assignment.patience_s:
+            lacks = self.neighbours.unreceived() or (self.guidance is not None and self.guidance.missing)
+        missing = self.missing_neighbours() if lacks else []
+        failing = self._preflight.check(self.now, missing, self.neighbours, self.health)
+        life.failing, lost = failing, self._preflight.lost(t, failing)
+        if failing:
+            life.set_missing(failing)
+            return life.phase == READY and not lost
+        if life.phase == IDLE and not is_finite(self.goals.law_offset(t, self.now.position)):
+            life.set_missing("its law wants something that is not finite")
+            return False
+        return True
+
+    def _causes(self, t: float) -> int:
+        """Causes of hazards on this tick, a bit for each."""
+        life, status, guidance = self.lifecycle, self._status, self.guidance
+        phase = life.phase
+        status.ordered, status.setpoint, status.not_finite = self._ordered, self.setpoint, self._filter.not_finite
+        status.goal_height, status.aside = self.goal[2], self.landing.aside
+        status.cruising, status.climbing = phase == RUNNING or phase == AIRBORNE, life.climbing
+        status.landing = phase == LANDING
+        status.unstarted = life.start_at == inf and (life.climbing or phase == AIRBORNE)
+        status.alone = self.neighbours.incomplete and self.goals.without_neighbours()
+        if guidance is not None:
+            status.unguided, status.goal_stamp = phase == RUNNING and guidance.unguided(t), guidance.stamp
+        return self._detector.causes(self.now, status, self.neighbours, self.health)
+
+    def _apply_hazards(self, causes: int) -> None:
+        """Apply outcomes of hazards: the robot holds, lands, or has its motors cut."""
+        life, now, status = self.lifecycle, self.now, self._status
+
+        def words(cause: Cause) -> str:
+            if cause is Cause.BELOW:
+                return self.landing.robot_below()
+            return self._detector.words(cause, now, status, self.neighbours, self.health)
+
+        serious = self.hazards.update(now.t, causes, words, active=life.active, landing=life.phase == LANDING)
+        for incident in serious:
+            end = life.stop if incident.outcome == Outcome.CUT else life.land
+            end(incident.cause.rule.words)
+            misled = isfinite(now.jump) or incident.cause in (Cause.STILL, Cause.STRAYING)
+            if self.assignment.kind.flies and misled:
+                self._external.disbelieve()  # it lands by what it knows itself
+
+    def _decide(self, t: float) -> None:
+        """A new goal of a running robot that decides for itself; it may have to stay."""
+        life, now, goals = self.lifecycle, self.now, self.goals
+        running = life.phase == RUNNING
+        if running:
+            self.decisions += 1
+            if self.guidance is None and not now.invalid:
+                if goals.decide(t, now.position, now.velocity, now.yaw, life.start_at):
+                    self.goal, self.goal_yaw = goals.goal, goals.yaw
+                    self.updates += 1
+        self._stay((running and self._holds()) or life.phase == AIRBORNE)
+        if self.keeping.held or not running:
+            goals.require_update()  # its goal is old when it returns
+
+    def _stay(self, held: bool) -> None:
+        """Keep the place where the hold began."""
+        self.keeping.hold(held, self.now.position)
+        if held:
+            self.goal, self.goal_yaw = self.keeping.at, nan
+
+    def _holds(self) -> bool:
+        """Whether a running robot must stay: for its safety, or because no link of the law is active."""
+        return self.hazards.held or self.goals.without_neighbours()
+
+    def _follow(self, guidance: Guidance) -> None:
+        """A guided robot takes its received goal, on the tick of reception."""
+        running = self.lifecycle.phase == RUNNING
+        held = (running and self._holds()) or self.lifecycle.phase == AIRBORNE
+        if held != self.keeping.held:
+            self._stay(held)
+        if running and not held:
+            self.goal, self.goal_yaw = guidance.goal, guidance.goal_yaw
+            self.updates += guidance.fresh
+        guidance.fresh = False
