@@ -11,7 +11,7 @@ from math import nan
 from agents.decision.assignment import Assignment
 from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Neighbours
-from agents.formation.changes import change_target, exists_now, planned_at
+from agents.formation.changes import change_target, exists, planned_at
 from agents.formation.link import Link
 from agents.plugins.laws import Law, goal_position, tracking_offset
 from agents.plugins.planners import Itinerary, Leg, Pose, Waypoints
@@ -182,7 +182,8 @@ class GoalComputer:
                 changed |= change_target(sender.link, given, self._changes, sender.targets, elapsed)
             a, b, c = sender.place(self._predictor, t)
             apart = norm((position[0] - a, position[1] - b, position[2] - c))
-            sender.present = exists_now(sender, elapsed, apart)
+            reach = sender.release if sender.present else sender.reach
+            sender.present = exists(sender.since, sender.until, reach, elapsed, apart)
         if self.neighbours.select() or changed:
             self.require_update()
 

@@ -8,15 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import asin, atan2, cos, inf, isnan, nan, pi, sin, sqrt, tau
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from agents.formation.link import Link
 from agents.vectors import UNKNOWN, Vector, clamp, norm
-
-if TYPE_CHECKING:
-    from agents.decision.neighbours import Neighbour
 
 ROUNDING_S = 1e-6  # decisions are multiples of a period that binary fractions miss by less than this
 
@@ -122,8 +118,8 @@ def planned_at(since: float, until: float, reach: float, elapsed: float) -> bool
     return since <= elapsed + ROUNDING_S and until > elapsed + ROUNDING_S and reach == inf
 
 
-def exists_now(sender: Neighbour, elapsed: float, apart: float) -> bool:
-    """Whether the link from a sender that is `apart` [m], NaN where unknown, exists `elapsed` [s] after the start."""
-    if not sender.since - ROUNDING_S <= elapsed < sender.until - ROUNDING_S:
+def exists(since: float, until: float, reach: float, elapsed: float, apart: float) -> bool:
+    """Whether a link between robots that are `apart` [m], NaN where unknown, exists `elapsed` [s] after the start."""
+    if not since - ROUNDING_S <= elapsed < until - ROUNDING_S:
         return False
-    return sender.reach == inf or apart <= (sender.release if sender.present else sender.reach)
+    return reach == inf or apart <= reach

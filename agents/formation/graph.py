@@ -9,8 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agents.arrays import Array, Columns, Index, Mask
-
-BY_DISTANCE, BY_RELATIVE, BY_BEARING = range(3)  # kinds of link targets
+from agents.formation.link import BY_DISTANCE
 
 
 class Links(Columns, frozen=True, dict=True):

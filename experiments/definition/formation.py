@@ -1,178 +1,222 @@
-"""Formation as arrays: links with their targets, anchors, changes, and the link errors of a motion."""
+"""Formation of an experiment: links with their targets, anchors, changes, and the link errors of a motion."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace
 
-from agents.arrays import Array, Index, Mask, norm
-from agents.formation.anchors import Anchors
-from agents.formation.changes import Change, NewTargets, Presence, Reshaping, changed_targets
-from agents.formation.graph import BY_DISTANCE, Links
-from agents.plugins.laws import Distance, Law
+from agents.arrays import Array, Mask, norm
+from agents.formation import anchors
+from agents.formation.changes import Change, Target, change_target, exists, planned_at
+from agents.formation.graph import Links
+from agents.formation.link import BY_DISTANCE, Link
+from agents.plugins.laws import Distance, Gradient
 from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
-from experiments.definition.links import UNKNOWN, OneWay, held_height, link_pairs, link_target
+from experiments.definition.links import OneWay, held_height, link_pairs, link_target
 
-AT_ONCE: Final = 200_000  # errors of links that are held in memory at once
+AT_ONCE: Final = 2_000_000  # distances of links that are held in memory at once
 
 
 @dataclass(frozen=True)
-class FormationArrays:
+class Pattern:
     """Every possible link with its first target, the changes of the targets, and the times of presence."""
 
     links: Links  # (E), sorted by receiver, then sender
-    changes: tuple[Change, ...]  # of their targets, in order of time
-    presence: Presence | None  # when they are there; None if always
+    one_way: tuple[OneWay, ...]  # (E)
+    changes: tuple[Change, ...]  # of the targets, in order of time
+    targets: tuple[tuple[Target, ...], ...]  # (E) after each change
 
     @classmethod
-    def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> FormationArrays:
-        """Arrays of these links; rows are the robots of the file."""
+    def compiled(cls, experiment: Experiment, there: Sequence[OneWay]) -> Pattern:
+        """Pattern of these links; rows are the robots of the file."""
         row = {name: number for number, name in enumerate(experiment.robots)}
-        wants = np.array([link.wanted.wants for link in there], dtype=np.intp)
-        plain = bool((wants == BY_DISTANCE).all())
-        links = Links(
-            np.array([row[link.receiver] for link in there], dtype=np.intp),
-            np.array([row[link.sender] for link in there], dtype=np.intp),
-            np.array([link.wanted.distance for link in there], dtype=float),
-            np.array([link.gain for link in there], dtype=float),
-            None if plain else _vectors([link.wanted.relative for link in there]),
-            None if plain else _vectors([link.wanted.bearing for link in there]),
-            None if plain else wants,
-        )
-        return cls(links, _changes_of(experiment, there), _presence_of(there))
-
-    def select(self, which: Index) -> FormationArrays:
-        """Some of the links, or the same in another order."""
-        changes = tuple(replace(change, to=change.to.take(which)) for change in self.changes)
-        return FormationArrays(
-            self.links.take(which), changes, None if self.presence is None else self.presence.take(which)
+        in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
+        after = [_targets(experiment, each, there) for each in in_order]
+        return cls(
+            linked([_link(each) for each in there], [(row[each.receiver], row[each.sender]) for each in there]),
+            tuple(there),
+            tuple(Change(each.at_s, each.over_s, each.scale, each.rotate) for each in in_order),
+            tuple(zip(*after, strict=True)) if after else ((),) * len(there),
         )
 
-    def to_receivers(self, rows: Index) -> FormationArrays:
-        """Links on which these rows receive, as `Links.of` gives them."""
-        at, receiver = self.links.indices_to_receivers(rows)
-        mine = self.select(at)
-        return replace(mine, links=msgspec.structs.replace(mine.links, receiver=receiver))
+    @property
+    def bounded(self) -> bool:
+        """Whether a link comes or goes."""
+        return any(link.since > 0.0 or min(link.until, link.reach, link.release) < math.inf for link in self.one_way)
 
-    def without_receivers(self, rows: Index) -> FormationArrays:
-        """Links on which other rows than these receive."""
-        return self.select(np.flatnonzero(~np.isin(self.links.receiver, rows))) if len(rows) else self
+    @cached_property
+    def _given(self) -> list[Link]:
+        return [_link(each) for each in self.one_way]
 
-    def append(self, others: Links) -> FormationArrays:
-        """Append links that do not change and are always present."""
-        same = NewTargets.unchanged(len(others))
-        changes = tuple(replace(change, to=NewTargets.joined([change.to, same])) for change in self.changes)
-        presence = None if self.presence is None else self.presence.padded(len(others))
-        return FormationArrays(self.links.append(others), changes, presence)
+    def targets_at(self, elapsed: float) -> list[Link]:
+        """Targets of the links `elapsed` [s] after the common start."""
+        found = [_link(each) for each in self.one_way]
+        if self.changes:
+            for link, given, targets in zip(found, self._given, self.targets, strict=True):
+                change_target(link, given, self.changes, targets, elapsed)
+        return found
 
-    def repeated(self, times: int, rows: int) -> FormationArrays:
-        """The same in `times` copies of an experiment of `rows` robots, one copy behind the other."""
-        many = self.select(np.tile(np.arange(len(self.links)), times))
-        return replace(many, links=self.links.repeated(times, rows))
+    def at(self, elapsed: float) -> Links:
+        """The links with their targets `elapsed` [s] after the common start."""
+        ends = zip(self.links.receiver.tolist(), self.links.sender.tolist(), strict=True)
+        return linked(self.targets_at(elapsed), list(ends))
 
     def stages(self) -> list[Links]:
         """The links with their targets at the beginning, and after each change."""
-        count, ends = len(self.links), [change.at + change.over + 1.0 for change in self.changes]
-        later = (changed_targets(self.links, self.changes[: k + 1], np.full(count, end)) for k, end in enumerate(ends))
-        return [self.links, *later]
+        ends = [change.at + change.over for change in self.changes]
+        return [self.links, *(self._after(k + 1).at(end + 1.0) for k, end in enumerate(ends))]
+
+    def _after(self, count: int) -> Pattern:
+        """The same with the first `count` changes alone."""
+        return Pattern(self.links, self.one_way, self.changes[:count], tuple(each[:count] for each in self.targets))
+
+    def planned_at(self, elapsed: float) -> Mask:
+        """Links (E,) that exist at a time [s] whatever the distance of the robots."""
+        return np.array([planned_at(each.since, each.until, each.reach, elapsed) for each in self.one_way], dtype=bool)
 
     def present(self, time: Array, position: Array) -> Mask | None:
         """Presence of links (T, E) along true positions (T, N, 3) at times (T,); None if all are always present."""
-        if self.presence is None:
+        if not self.bounded:
             return None
-        reshaping = Reshaping(self.links, (), self.presence)
-        there = np.empty((len(time), len(self.links)), dtype=bool)
-        for k, t in enumerate(time.tolist()):
-            reshaping.advance(np.full(position.shape[1], t), position[k], position[k, self.links.sender])
-            there[k] = reshaping.present
+        apart = norm(position[:, self.links.receiver] - position[:, self.links.sender])
+        there = np.empty(apart.shape, dtype=bool)
+        for number, link in enumerate(self.one_way):
+            now = planned_at(link.since, link.until, link.reach, 0.0)
+            for k, (t, far) in enumerate(zip(time.tolist(), apart[:, number].tolist(), strict=True)):
+                there[k, number] = now = exists(link.since, link.until, link.release if now else link.reach, t, far)
         return there
 
 
-def errors_over_time(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
+def linked(targets: Sequence[Link], ends: Sequence[tuple[int, int]]) -> Links:
+    """Links as arrays from their targets and (receiver, sender) rows."""
+    both = np.array(ends, dtype=np.intp).reshape(-1, 2)
+    wants = np.array([link.wants for link in targets], dtype=np.intp)
+    plain = bool((wants == BY_DISTANCE).all())
+    return Links(
+        both[:, 0],
+        both[:, 1],
+        np.array([link.distance for link in targets], dtype=float),
+        np.array([link.gain for link in targets], dtype=float),
+        None if plain else vectors([link.relative for link in targets]),
+        None if plain else vectors([link.bearing for link in targets]),
+        None if plain else wants,
+    )
+
+
+def unlinked(links: Links) -> list[Link]:
+    """Targets of links, one by one."""
+    count = len(links)
+    blank = [(math.nan,) * 3] * count
+    relative = blank if links.relative is None else [tuple(each) for each in links.relative.tolist()]
+    bearing = blank if links.bearing is None else [tuple(each) for each in links.bearing.tolist()]
+    wants = [BY_DISTANCE] * count if links.wants is None else links.wants.tolist()
+    return [
+        Link(*each) for each in zip(links.distance.tolist(), links.gain.tolist(), relative, bearing, wants, strict=True)
+    ]
+
+
+def law_offsets(law: Gradient, position: Array, received: Array, links: Links) -> Array:
+    """Offset u (N, 3) [m] of robots at `position` (N, 3) with the `received` positions of the senders (E, 3) [m]."""
+    offset = np.zeros_like(position)
+    apart = (position[links.receiver] - received).tolist()
+    for row, link, away in zip(links.receiver.tolist(), unlinked(links), apart, strict=True):
+        offset[row] += law.pull(tuple(away), link)
+    return offset
+
+
+def law_errors(law: Gradient, position: Array, received: Array, links: Links) -> Array:
+    """Error of each link (E,) [m], of robots at `position` (N, 3) that received senders at `received` (E, 3) [m]."""
+    apart = (position[links.receiver] - received).tolist()
+    return np.array([law.error(tuple(away), link) for away, link in zip(apart, unlinked(links), strict=True)])
+
+
+def anchor_offsets(held: Sequence[tuple[int, anchors.Anchor]], position: Array) -> Array:
+    """Offset (N, 3) [m] by which anchors, each with its row, pull robots at `position` (N, 3) [m]."""
+    offset = np.zeros_like(position)
+    for row, anchor in held:
+        offset[row] += anchor.pull(tuple(position[row].tolist()))
+    return offset
+
+
+def anchor_errors(held: Sequence[tuple[int, anchors.Anchor]], position: Array) -> Array:
+    """Error of each anchor (T, A) [m] along positions (T, N, 3) [m]."""
+    found = [[anchor.error(tuple(place)) for place in position[:, row].tolist()] for row, anchor in held]
+    return np.array(found, dtype=float).reshape(len(held), len(position)).T
+
+
+def errors_over_time(law: Gradient, pattern: Pattern, time: Array, position: Array) -> Array:
     """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
 
     Args:
-        law: Its `error` is asked for all times at once.
         time: (T,) since the common start [s].
         position: (T, N, 3) true [m].
     """
     links = pattern.links
-    if isinstance(law, Distance) and not pattern.changes:
-        error = np.abs(norm(position[:, links.receiver] - position[:, links.sender]) - links.distance)
-    else:
+    if type(law) is Distance and not pattern.changes:
         step = max(1, AT_ONCE // max(1, len(links)))
-        begins = range(0, len(time), step)
-        parts = [_errors(law, pattern, time[k : k + step], position[k : k + step]) for k in begins]
+        parts = [
+            np.abs(norm(position[k : k + step, links.receiver] - position[k : k + step, links.sender]) - links.distance)
+            for k in range(0, len(time), step)
+        ]
         error = np.concatenate([np.zeros((0, len(links))), *parts])
+    else:
+        error = np.empty((len(time), len(links)))
+        targets = pattern.targets_at(0.0)
+        for k, t in enumerate(time.tolist()):
+            targets = pattern.targets_at(t) if pattern.changes else targets
+            apart = (position[k, links.receiver] - position[k, links.sender]).tolist()
+            error[k] = [law.error(tuple(away), link) for away, link in zip(apart, targets, strict=True)]
     there = pattern.present(time, position)
     return error if there is None else np.where(there, error, np.nan)
 
 
-def _errors(law: Law, pattern: FormationArrays, time: Array, position: Array) -> Array:
-    links, (count, rows) = pattern.links, position.shape[:2]
-    many = links.repeated(count, rows)
-    if pattern.changes:
-        all_of_them = np.tile(np.arange(len(links)), count)
-        changes = [replace(change, to=change.to.take(all_of_them)) for change in pattern.changes]
-        many = changed_targets(many, changes, np.repeat(time, len(links)))
-    flat = position.reshape(-1, 3)
-    return law.error(flat, flat[many.sender], many).reshape(count, len(links))
-
-
-def compile_anchors(experiment: Experiment, names: Sequence[str], only: Sequence[str] | None = None) -> Anchors | None:
-    """Anchors of these robots, or of some `only`, each once; None if there are none."""
+def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, ...]]:
+    """Anchors of each robot that has one."""
     formation = experiment.formation
-    anchored = formation.anchors if only is None else [name for name in formation.anchors if name in only]
-    there = [(row, formation.anchors[name]) for row, name in enumerate(names) if name in anchored]
-    if not there:
-        return None
-    anchors = [each if isinstance(each, Anchor) else Anchor(distance=each) for _, each in there]
     to_origin = 2.0 * formation.gain  # twice that of a link: as the authors' controllers pull to the origin
-    return Anchors(
-        row=np.array([row for row, _ in there], dtype=np.intp),
-        point=_vectors([_spatial(each.to) for each in anchors]),
-        axis=_vectors([_unit(each.along or each.across) for each in anchors]),
-        whole=np.array([0.0 if each.across is not None else 1.0 for each in anchors]),
-        along=np.array([float(each.across is not None) - float(each.along is not None) for each in anchors]),
-        distance=np.array([each.distance for each in anchors]),
-        gain=np.array([each.gain or (to_origin if each.distance > 0.0 else formation.stiffness) for each in anchors]),
-    )
+    found = {}
+    for name, given in formation.anchors.items():
+        each = given if isinstance(given, Anchor) else Anchor(distance=given)
+        gain = each.gain or (to_origin if each.distance > 0.0 else formation.stiffness)
+        found[name] = (anchors.Anchor(
+            point=_spatial(each.to),
+            axis=_unit(each.along or each.across),
+            whole=0.0 if each.across is not None else 1.0,
+            along=float(each.across is not None) - float(each.along is not None),
+            distance=each.distance,
+            gain=gain,
+        ),)  # fmt: skip
+    return found
 
 
-def _presence_of(one_way: Sequence[OneWay]) -> Presence | None:
-    columns = [(link.since, link.until, link.reach, link.release) for link in one_way]
-    table = np.array(columns, dtype=float).reshape(-1, 4)
-    if (table[:, 0] <= 0.0).all() and np.isinf(table[:, 1:]).all():
-        return None
-    return Presence(*table.T)
+def _link(one_way: OneWay) -> Link:
+    wanted = one_way.wanted
+    return Link(wanted.distance, one_way.gain, wanted.relative, wanted.bearing, wanted.wants)
 
 
-def _changes_of(experiment: Experiment, one_way: Sequence[OneWay]) -> tuple[Change, ...]:
-    rise = np.array([held_height(experiment, link.receiver) - held_height(experiment, link.sender) for link in one_way])
-    in_order = sorted(experiment.formation.changes, key=lambda each: each.at_s)
-    return tuple(_change(experiment, each, one_way, rise) for each in in_order)
-
-
-def _change(experiment: Experiment, described: Described, one_way: Sequence[OneWay], rise: Array) -> Change:
+def _targets(experiment: Experiment, described: Described, one_way: Sequence[OneWay]) -> list[Target]:
+    """Target of each link after a change."""
     new = {
         pair: link_target(experiment, text, given, pair[0])
         for text, given in described.links.items()
         for pair in link_pairs(text)
     }
-    then = [new.get((link.receiver, link.sender)) for link in one_way]
-    to = NewTargets(
-        np.array([math.nan if each is None else each.distance for each in then]),
-        _vectors([UNKNOWN if each is None else each.relative for each in then]),
-        _vectors([UNKNOWN if each is None else each.bearing for each in then]),
-        rise,
-    )
-    return Change(described.at_s, described.over_s, to, described.scale, described.rotate)
+    found = []
+    for link in one_way:
+        rise = held_height(experiment, link.receiver) - held_height(experiment, link.sender)
+        then = new.get((link.receiver, link.sender))
+        target = Target(rise=rise)
+        if then is not None:
+            target = replace(target, distance=then.distance, relative=then.relative, bearing=then.bearing)
+        found.append(target)
+    return found
 
 
 def _spatial(vector: Sequence[float] | None) -> tuple[float, float, float]:
@@ -186,5 +230,5 @@ def _unit(direction: Sequence[float] | None) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def _vectors(rows: Sequence[Sequence[float]]) -> Array:
-    return np.array(rows, dtype=float).reshape(-1, len(UNKNOWN))
+def vectors(rows: Sequence[Sequence[float]]) -> Array:
+    return np.array(rows, dtype=float).reshape(-1, 3)

@@ -10,20 +10,23 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from agents.arrays import Index, Mask
+from agents.arrays import Index
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
-from agents.formation.graph import Links, links
+from agents.decision.neighbours import Incoming
+from agents.formation.anchors import Anchor
+from agents.formation.graph import Links
+from agents.formation.link import Link
 from agents.plugins import registry
 from agents.plugins.avoidance import Avoidance
 from agents.plugins.laws import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
-from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, hover_heights, kinds, start_poses
+from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, kinds, start_poses
 from experiments.definition.experiment import Experiment, Hybrid
-from experiments.definition.formation import FormationArrays, compile_anchors
+from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.links import OneWay, one_way_links
 
 
@@ -70,8 +73,7 @@ class Plan:
         """Extrapolation between two transmissions: as the experiment says, else as its trigger needs it."""
         chosen = self.experiment.prediction
         if chosen is None:
-            trigger = registry.struct(registry.TRIGGERS, registry.split(self.experiment.trigger)[0])
-            chosen = getattr(trigger, "prediction", "hold")
+            chosen = registry.struct(registry.TRIGGERS, registry.split(self.experiment.trigger)[0]).PREDICTION
         built: Predictor = registry.build(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
@@ -94,9 +96,14 @@ class Plan:
         return tuple(one_way_links(self.experiment, self.law))
 
     @cached_property
-    def formation(self) -> FormationArrays:
-        """The links as arrays, with changes and presence."""
-        return FormationArrays.compiled(self.experiment, self.one_way_links)
+    def formation(self) -> Pattern:
+        """The links with their changes and presence."""
+        return Pattern.compiled(self.experiment, self.one_way_links)
+
+    @cached_property
+    def anchors(self) -> dict[str, tuple[Anchor, ...]]:
+        """Anchors of each robot that has one."""
+        return compile_anchors(self.experiment)
 
     @property
     def links(self) -> Links:
@@ -104,30 +111,43 @@ class Plan:
         return self.formation.links
 
     @cached_property
-    def avoidance_links(self) -> Links:
-        """Links that only avoidance needs: between all robots that no law links, if it needs all; else from neighbours.
+    def avoidance_senders(self) -> dict[str, tuple[str, ...]]:
+        """Robots whose poses a robot receives for its avoidance alone, by receiver.
 
-        Robots that the centre guides have no law of their own.
+        These are all robots that no law links, if it needs all; else neighbours of robots that the centre guides, which
+        have no law of their own.
         """
-        avoidance, none, centrally = self.avoidance, links([], [], []), set(self.guided)
+        avoidance, centrally = self.avoidance, set(self.guided)
         if avoidance is None or not (avoidance.hears == "all" or centrally):
-            return none
+            return {}
         linked = {(link.receiver, link.sender) for link in self.one_way_links}
         there = {(receiver, sender) for receiver, sender in linked if receiver not in centrally}
-        robots = list(enumerate(self.names))
-        listening = [(i, a) for i, a in robots if self.experiment.robots[a].avoids]
-        pairs = [
-            (i, j)
-            for i, a in listening
-            for j, b in robots
-            if i != j and (a, b) not in there and (avoidance.hears == "all" or (a, b) in linked)
-        ]
-        return links(pairs, [1.0] * len(pairs), [1.0] * len(pairs)) if pairs else none
+        return {
+            receiver: tuple(
+                sender
+                for sender in self.names
+                if sender != receiver
+                and (receiver, sender) not in there
+                and (avoidance.hears == "all" or (receiver, sender) in linked)
+            )
+            for receiver in self.names
+            if self.experiment.robots[receiver].avoids
+        }
 
     @cached_property
     def pose_links(self) -> Links:
-        """Every link on which robots receive poses: those for the formation, then those that only avoidance needs."""
-        return self.formation.without_receivers(self.rows(self.guided)).links.append(self.avoidance_links)
+        """Every link on which robots receive poses, receiver by receiver, those that only avoidance needs last."""
+        guided, row = set(self.guided), {name: number for number, name in enumerate(self.names)}
+        targets, ends = [], []
+        for receiver in self.names:
+            for link, target in zip(self.one_way_links, self.formation.targets_at(0.0), strict=True):
+                if link.receiver == receiver and receiver not in guided:
+                    targets.append(target)
+                    ends.append((row[receiver], row[link.sender]))
+            for sender in self.avoidance_senders.get(receiver, ()):
+                targets.append(Link())
+                ends.append((row[receiver], row[sender]))
+        return linked(targets, ends)
 
     @cached_property
     def guided(self) -> tuple[str, ...]:
@@ -181,13 +201,13 @@ class Plan:
     def rows(self, names: Sequence[str]) -> Index:
         return np.array([self.names.index(name) for name in names], dtype=np.intp)
 
-    def limits(self, names: Sequence[str], copies: int = 1) -> Limits:
-        """Limits of robots `names`, repeated `copies` times."""
+    def limits(self, name: str) -> Limits:
+        """Limits of a robot."""
         x, y, z = self.experiment.arena.size
         return Limits(
-            low=np.array([-x / 2, -y / 2, 0.0]),
-            high=np.array([x / 2, y / 2, z]),
-            hold_s=np.array([self._patience(name) for name in names] * copies),
+            low=(-x / 2, -y / 2, 0.0),
+            high=(x / 2, y / 2, z),
+            hold_s=self._patience(name),
             **msgspec.structs.asdict(self.experiment.safety),
         )
 
@@ -196,74 +216,73 @@ class Plan:
         experiment = self.experiment
         return experiment.world.patience_s if experiment.robots[name].body == WORLD else experiment.safety.blind_s
 
-    def assignment(self, names: Sequence[str] | None = None, copies: int = 1, *, centrally: bool = False) -> Assignment:
-        """The part of some robots, or of all; with `copies`, all robots side by side for as many repetitions.
+    def assignment(self, name: str, *, centrally: bool = False) -> Assignment:
+        """The part of a robot.
 
         Args:
-            centrally: The part of the central controller: links, anchors and plans are those of robots that it guides.
-
-        Raises:
-            ValueError: If copies are asked for but not of all robots: their links would point nowhere.
+            centrally: As the central controller has it: link targets, anchors and plan are those of a robot that it
+                guides, and there are none for one that decides for itself.
         """
-        experiment, all_names, guided = self.experiment, self.names, self.guided
-        names = all_names if names is None else names
-        if copies > 1 and tuple(names) != all_names:
-            raise ValueError("only the whole experiment can be repeated")
-        rows = self.rows(names)
-        others = [name for name in all_names if (name in guided) != centrally]
-        mine = [name for name in names if name not in others]
-        formation = self.formation.without_receivers(self.rows(others)).to_receivers(rows)
-        watched = links([], [], []) if centrally else self.avoidance_links.to_receivers(rows)
-        anchors = compile_anchors(experiment, names, only=mine)
-        only_watched = np.repeat([False, True], [len(formation.links), len(watched)])
-        planned = [
-            (row, self.legs_by_robot[name])
-            for row, name in enumerate(names)
-            if name in mine and name in self.legs_by_robot
-        ]
-        first_rows = np.arange(copies) * len(names)
-        if len(watched):
-            formation = formation.append(watched)
-        if copies > 1:
-            formation = formation.repeated(copies, len(names))
-            anchors = None if anchors is None else anchors.repeated(copies, len(names))
+        experiment, guided = self.experiment, name in self.guided
+        decides = guided == centrally  # for this robot, at this place
         rates, within = experiment.rates, experiment.safety.start_within
+        starts, _ = start_poses(experiment, self.names)
+        at = {robot: (float(x), float(y)) for robot, (x, y, _) in zip(self.names, starts, strict=True)}
+        kind = self.kinds[self.names.index(name)]
+        patient = experiment.start.missing != "go-on"
         return Assignment(
-            names=tuple(names) * copies,
-            kinds=kinds(experiment, names) * copies,
-            hover=np.tile(hover_heights(experiment, names), copies),
-            robots=all_names * copies,
-            links=formation.links,
-            changes=formation.changes,
-            presence=formation.presence,
-            anchors=anchors,
+            name=name,
+            kind=kind,
+            hover=experiment.robots[name].hover or math.nan,
+            neighbours=self._incoming(name, in_law=decides, avoidance=not centrally),
             law=self.law,
             trigger=self.trigger,
             predictor=self.predictor,
             update=self.update,
             clamp=experiment.formation.clamp,
             tracking_gain=experiment.formation.tracking_gain,
-            legs=tuple((row + first_rows, own) for row, own in planned),
-            limits=self.limits(names, copies),
+            legs=self.legs_by_robot.get(name, ()) if decides else (),
+            anchors=self.anchors.get(name, ()) if decides else (),
+            changes=self.formation.changes,
+            limits=self.limits(name),
             avoidance=None if centrally else self.avoidance,
-            robot_kinds=self.kinds * copies,
-            avoidance_only=np.tile(only_watched, copies) if len(watched) else None,
-            avoids=np.array([experiment.robots[name].avoids for name in names] * copies),
+            avoids=experiment.robots[name].avoids,
             body_hz=rates.body_hz,
             pose_every=round(rates.body_hz / rates.pose_hz),
             decide_every=round(rates.body_hz / rates.coordination_hz),
             duration=experiment.duration_s,
-            patience_s=experiment.start.deadline_s if experiment.start.missing == "go-on" else None,
-            guided=np.array([name in guided for name in names] * copies) if guided else None,
-            awaited=self._waited_for(formation.links, copies),
-            start=np.tile(start_poses(experiment, names)[0][:, :2], (copies, 1)) if within else None,
+            patience_s=None if patient else experiment.start.deadline_s,
+            start=at[name] if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,
-            all_starts=start_poses(experiment, all_names)[0][:, :2]
-            if within and not experiment.start.scatter
-            else None,
+            other_starts=self._other_starts(name, at) if within and not experiment.start.scatter else (),
+            guided=guided,
         )
 
-    def _waited_for(self, links: Links, copies: int) -> Mask | None:
-        """Links (E,) from robots that are not on standby; None if no robot is."""
-        standby = np.array([robot.standby for robot in self.experiment.robots.values()] * copies)
-        return ~standby[links.sender] if standby.any() else None
+    def _incoming(self, name: str, *, in_law: bool, avoidance: bool) -> tuple[Incoming, ...]:
+        """Links on which a robot receives: those of its law, then those that only its avoidance needs."""
+        row = {robot: number for number, robot in enumerate(self.names)}
+        standby = {robot for robot, given in self.experiment.robots.items() if given.standby}
+        found = []
+        if in_law:
+            for link, targets in zip(self.one_way_links, self.formation.targets, strict=True):
+                if link.receiver == name:
+                    wanted = link.wanted
+                    found.append(Incoming(
+                        row[link.sender], link.sender, self.kinds[row[link.sender]], wanted.distance, link.gain,
+                        wanted.relative, wanted.bearing, wanted.wants, True, link.sender not in standby,
+                        targets, link.since, link.until, link.reach, link.release,
+                    ))  # fmt: skip
+        if avoidance:
+            for sender in self.avoidance_senders.get(name, ()):
+                found.append(Incoming(
+                    row[sender], sender, self.kinds[row[sender]], math.nan, in_law=False,
+                    awaited=sender not in standby,
+                ))  # fmt: skip
+        return tuple(found)
+
+    def _other_starts(
+        self, name: str, at: dict[str, tuple[float, float]]
+    ) -> tuple[tuple[str, float, float, float], ...]:
+        """Other robots, and where they begin."""
+        others = zip(self.names, self.kinds, strict=True)
+        return tuple((other, *at[other], kind.radius) for other, kind in others if other != name)

@@ -4,64 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from math import nan
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
-from agents.agent import Agent
-from agents.arrays import Array, Index, PoseTable, no_poses
-from agents.body.interface import BodyState
+from agents.arrays import Index, PoseTable
 from agents.decision.centralised import Centre
-from agents.decision.transmission import Transmission
-from agents.formation.graph import Links, links
-from agents.network import channel_model, messages
-from experiments.definition import link_conditions
+from agents.network import messages
+from agents.network.channel_model import Channel
+from agents.robot import Robot
+from agents.vectors import UNKNOWN, Vector
 from experiments.definition.experiment import Experiment
-from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE
+from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 
+NOTHING: Final[Vector] = UNKNOWN
 
-class VirtualChannel(channel_model.Channel):
-    """The modelled channel for the links of all repetitions, each with random numbers of its own."""
 
-    def __init__(self, experiment: Experiment, links: Links, seeds: Sequence[int], *, stream: str = "") -> None:
-        """`links` of all repetitions, those of the first seed first; each `stream` has random numbers of its own."""
-        super().__init__(link_conditions.virtual_conditions(experiment, links, seeds, stream=stream))
-        self._sender, self._rows = links.sender, len(experiment.robots) * len(seeds)
-        self._names = tuple(experiment.robots)
-        self._encoding: messages.Encoding = experiment.network.encoding
+class Sample(NamedTuple):
+    """Pose, or goal of the central controller, on its way."""
 
-    def transmit(self, t: float, poses: PoseTable, start: float) -> None:
-        """Transmits poses at `t` [s], whose `link` is the row of the sender.
+    row: int  # of the robot that sent it; of a goal, that it is for
+    seq: int
+    stamp: float  # [s]
+    position: Vector  # [m]
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad]
+    pose: float = nan  # of a goal: stamp of the pose on which it rests [s]
 
-        `start` is the common start [s]; NaN or infinity as long as it is not known: nothing is lost before.
-        """
-        place = np.full(self._rows, -1)
-        place[poses.link] = np.arange(len(poses.link))
-        which = place[self._sender]
-        at = np.flatnonzero(which >= 0)
-        if not len(at):
-            return
-        if self.limited:
-            poses = replace(poses, bytes=self._sizes(EPOCH + (t - start if t >= start else 0.0), poses))
-        self.send(replace(poses.take(which[at]), link=at), start=start)
 
-    def _sizes(self, stamp: float, poses: PoseTable) -> Index:
-        """(K,) bytes of the payloads of poses, as a real network carries them."""
-        assert poses.yaw is not None
-        columns = (poses.link, poses.seq, poses.position, poses.velocity, poses.yaw)
-        found = []
-        for row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
-            pose = messages.pose(self._names[row % len(self._names)], seq, stamp, position, velocity, yaw)
-            found.append(len(messages.encode(pose, self._encoding)))
-        return np.array(found, dtype=np.intp)
+Arrived = tuple[int, float, Sample]  # link or row, arrival [s]
 
 
 @dataclass(frozen=True)
 class CentreLog:
-    """Messages between robots and the central controller in all repetitions, in the time of the experiment [s].
+    """Messages between robots and the central controller, in the time of the experiment [s].
 
     `link` is the row of the robot in each table.
     """
@@ -69,156 +48,167 @@ class CentreLog:
     sent: PoseTable  # goals; `extra` is the stamp of the pose on which each rests
     followed: PoseTable  # goals that robots acted on (`arrival`), with the same `extra`
     received: PoseTable  # poses, as the central controller received them
-    lost_poses: Index  # (R,) of each robot, from the common start to the end of the experiment
+    lost_poses: Index  # (N,) of each robot, from the common start to the end of the experiment
 
 
 class VirtualCentre:
-    """The central controllers of all repetitions. Their poses and goals take as long and are lost as often as poses
-    between robots.
+    """The central controller. Its poses and goals take as long and are lost as often as poses between robots.
 
     Phases and the common start are the conductor's, and known at once, as they are to the robots.
     """
 
-    def __init__(self, experiment: Experiment, seeds: Sequence[int]) -> None:
-        self.centre = Centre(Plan(experiment).assignment(copies=len(seeds), centrally=True))
-        self.centre.mark_alive(self.centre.needed)  # all robots are there from the beginning
-        self._sent: list[PoseTable] = []
-        self._followed: list[PoseTable] = []
-        self._received: list[PoseTable] = []
-        rows = len(self.centre.guided)
-        guided = np.flatnonzero(self.centre.guided)
-        ends = [[(row, row) for row in group.tolist()] for group in (self.centre.needed, guided)]
+    def __init__(self, experiment: Experiment, plan: Plan, robots: Sequence[Robot], seed: int) -> None:
+        names = plan.names
+        self.centre = Centre([plan.assignment(name, centrally=True) for name in names])
+        self._robots, self._needed = robots, self.centre.needed
+        for row in self._needed:
+            self.centre.mark_alive(row)  # all robots are there from the beginning
+        self._guided = [row for row, robot in enumerate(robots) if robot.guidance is not None]
         self._poses, self._goals = (
-            VirtualChannel(experiment, links(pairs), seeds, stream=stream)
-            for pairs, stream in zip(ends, (TO_CENTRE, FROM_CENTRE), strict=True)
+            Channel(conditions_of(experiment, [(names[row], names[row]) for row in rows], seed, stream=stream))
+            for rows, stream in ((self._needed, TO_CENTRE), (self._guided, FROM_CENTRE))
         )
-        self._poses_of, self._goals_of = (np.array([row for row, _ in pairs], dtype=np.intp) for pairs in ends)
-        self._seq: Index = np.zeros(rows, dtype=np.intp)
+        self._link_of = {row: link for link, row in enumerate(self._needed)}
+        self._goal_link = {row: link for link, row in enumerate(self._guided)}
+        self._seq = [0] * len(robots)
+        self._sent: list[Arrived] = []
+        self._followed: list[Arrived] = []
+        self._received: list[Arrived] = []
+        self._sizes = _Sizes(experiment, names)
 
-    def transmit(self, t: float, poses: PoseTable, start: float) -> None:
-        """Robots transmit their poses to the central controller; see `VirtualChannel.transmit`."""
-        self._poses.transmit(t, poses, start)
+    def transmit(self, sample: Sample, start: float, size: int) -> None:
+        """A robot transmits its pose to the central controller; see `VirtualNetwork.transmit`."""
+        if (link := self._link_of.get(sample.row)) is not None:
+            self._poses.send(link, sample, sample.seq, sample.stamp, start=start, size=size)
 
-    def deliver(self, t: float, agent: Agent) -> None:
+    def deliver(self, t: float) -> None:
         """Delivers at `t` [s]: poses to the central controller, goals to the robots."""
-        if (arrived := self._poses.due(t)) is not None:
-            rows = self._poses_of[arrived.link]
-            self.centre.receive(replace(arrived, link=rows))
-            self._received.append(_bare(rows, arrived.seq, arrived.stamp, arrived.arrival))
-        if (arrived := self._goals.due(t)) is not None:
-            # of several for one robot the newest counts
-            arrived = arrived.take(np.argsort(arrived.stamp, kind="stable"))
-            _, last = np.unique(arrived.link[::-1], return_index=True)
-            arrived = arrived.take(len(arrived.link) - 1 - last)
-            rows = self._goals_of[arrived.link]
-            assert agent.guidance is not None
-            assert arrived.yaw is not None
-            news = agent.guidance.receive(rows, arrived.position, arrived.yaw, arrived.stamp)
-            if news.any():
-                accepted = _bare(rows, arrived.seq, arrived.stamp, np.full(len(rows), t), arrived.extra)
-                self._followed.append(accepted.take(news))
+        for link, arrival, sample in self._poses.due(t):
+            row = self._needed[link]
+            self.centre.receive(row, sample.position, sample.velocity, sample.yaw, sample.stamp, arrival)
+            self._received.append((row, arrival, sample))
+        newest = {link: sample for link, _, sample in sorted(self._goals.due(t), key=lambda each: each[2].stamp)}
+        for link, sample in sorted(newest.items()):  # of several for one robot the newest counts
+            row = self._guided[link]
+            guidance = self._robots[row].guidance
+            assert guidance is not None
+            if guidance.receive(sample.position, sample.yaw, sample.stamp):
+                self._followed.append((row, t, sample))
 
-    def decide(self, t: float, agent: Agent) -> None:
+    def decide(self, t: float) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
-        goals = self.centre.decide(t, agent.lifecycle.phase, agent.lifecycle.start_at)
-        rows = goals.rows
-        if not len(rows):
-            return
-        self._seq[rows] += 1
-        now, start = np.full(len(rows), t), float(agent.lifecycle.start_at.min())
-        sent = PoseTable(
-            rows, self._seq[rows], now, now, goals.goal, np.zeros((len(rows), 3)), goals.yaw,
-            extra=goals.pose_stamp[:, None],
-        )  # fmt: skip
-        self._goals.transmit(t, sent, start)
-        self._sent.append(replace(sent, velocity=np.zeros((len(rows), 0))))
+        lives = [robot.lifecycle for robot in self._robots]
+        starts = [life.start_at for life in lives]
+        for goal in self.centre.decide(t, [life.phase for life in lives], starts):
+            row = goal.row
+            self._seq[row] += 1
+            sample = Sample(row, self._seq[row], t, goal.goal, (0.0, 0.0, 0.0), goal.yaw, goal.pose_stamp)
+            size = self._sizes.of(sample, min(starts)) if self._goals.limited else 0
+            self._goals.send(self._goal_link[row], sample, sample.seq, t, start=min(starts), size=size)
+            self._sent.append((row, t, sample))
+
+    @property
+    def instant(self) -> bool:
+        return self._goals.instant
 
     def logged(self, begin: float) -> CentreLog:
         """The log, with times since the common start at `begin` [s]."""
         lost = np.zeros(len(self._seq), dtype=np.intp)
-        lost[self._poses_of] = self._poses.dropped
+        lost[self._needed] = self._poses.dropped
         return CentreLog(
-            sent=_goals(self._sent, begin),
-            followed=_goals(self._followed, begin),
-            received=_joined(self._received, begin),
+            sent=_table(self._sent, begin, goals=True),
+            followed=_table(self._followed, begin, bare=True, goals=True),
+            received=_table(self._received, begin, bare=True),
             lost_poses=lost,
         )
 
 
-def _bare(link: Index, seq: Index, stamp: Array, arrival: Array, extra: Array | None = None) -> PoseTable:
-    """Poses of which only numbers and times are kept."""
-    nothing = np.zeros((len(link), 0))
-    return PoseTable(link, seq, stamp, arrival, nothing, nothing, extra=extra)
+class _Sizes:
+    """Sizes of payloads, as a real network carries them."""
+
+    def __init__(self, experiment: Experiment, names: Sequence[str]) -> None:
+        self._names, self._encoding = names, experiment.network.encoding
+
+    def of(self, sample: Sample, start: float) -> int:
+        """Bytes of a pose; `start` is the common start [s]."""
+        stamp = EPOCH + (sample.stamp - start if sample.stamp >= start else 0.0)
+        pose = messages.pose(self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity, sample.yaw)
+        return len(messages.encode(pose, self._encoding))
 
 
-def _joined(tables: list[PoseTable], begin: float) -> PoseTable:
-    """A single table, with times since the common start at `begin` [s]."""
-    return (PoseTable.joined(tables) if tables else no_poses()).since(begin)
-
-
-def _goals(tables: list[PoseTable], begin: float) -> PoseTable:
-    found = _joined(tables, begin)
-    return replace(found, extra=np.zeros((0, 1)) if found.extra is None else found.extra - begin)
+def _table(arrived: Sequence[Arrived], begin: float, *, bare: bool = False, goals: bool = False) -> PoseTable:
+    """A table of samples, with times since the common start at `begin` [s]; `bare`: numbers and times alone."""
+    samples = [sample for _, _, sample in arrived]
+    count = len(samples)
+    return PoseTable(
+        np.array([link for link, _, _ in arrived], dtype=np.intp),
+        np.array([sample.seq for sample in samples], dtype=np.intp),
+        np.array([sample.stamp for sample in samples], dtype=float) - begin,
+        np.array([arrival for _, arrival, _ in arrived], dtype=float) - begin,
+        np.zeros((count, 0)) if bare else np.array([each.position for each in samples], dtype=float).reshape(-1, 3),
+        np.zeros((count, 0)) if bare else np.array([each.velocity for each in samples], dtype=float).reshape(-1, 3),
+        None if bare else np.array([each.yaw for each in samples], dtype=float),
+        extra=np.array([[each.pose - begin] for each in samples], dtype=float).reshape(-1, 1) if goals else None,
+    )
 
 
 class VirtualNetwork:
     """Carries poses between robots, and poses and goals between them and their centre, if they have one."""
 
-    def __init__(self, experiment: Experiment, agent: Agent, seeds: Sequence[int], *, lean: bool) -> None:
-        """Network of all repetitions; `lean` as for `experiments.virtual_time.simulation.simulate`."""
-        assignment, rows = agent.assignment, len(agent.assignment.names)
-        self._agent, self._lean = agent, lean
-        self._channel = VirtualChannel(experiment, assignment.links, seeds)
-        self._centre = None if assignment.guided is None else VirtualCentre(experiment, seeds)
-        self._seq: Index = np.zeros(rows, dtype=np.intp)
-        agent.neighbours.mark_alive(np.arange(len(assignment.links)))  # all robots are there from the beginning
-        self._sent: list[PoseTable] = []
-        self._received: list[PoseTable] = []
+    def __init__(self, experiment: Experiment, plan: Plan, robots: Sequence[Robot], seed: int, *, lean: bool) -> None:
+        """Network of all robots; `lean` as for `experiments.virtual_time.simulation.simulate`."""
+        self._robots, self._lean = robots, lean
+        names = plan.names
+        ends = [(sender.name, robot.assignment.name) for robot in robots for sender in robot.neighbours.all]
+        self._channel = Channel(conditions_of(experiment, ends, seed))
+        # by link: the robot that receives on it, and the number among its links
+        self._receivers = [(robot, k) for robot in robots for k in range(len(robot.neighbours.all))]
+        self._links: list[list[int]] = [[] for _ in robots]  # on which each robot is the sender
+        for link, (robot, k) in enumerate(self._receivers):
+            self._links[robot.neighbours.all[k].sender].append(link)
+            robot.neighbours.mark_alive(k)  # all robots are there from the beginning
+        guided = any(robot.guidance is not None for robot in robots)
+        self.centre = VirtualCentre(experiment, plan, robots, seed) if guided else None
+        self._seq = [0] * len(robots)
+        self._sizes = _Sizes(experiment, names)
+        self._sent: list[Arrived] = []
+        self._received: list[Arrived] = []
 
-    def carry(self, t: float, state: BodyState) -> Transmission:
-        """The first half of the tick at `t` [s]: robots receive, then transmit.
+    @property
+    def instant(self) -> bool:
+        """Whether poses that are transmitted are received within the tick."""
+        return self._channel.instant
 
-        Without any delay, poses are received before the second half; and so are the goals that follow.
-        """
-        agent, centre, instant = self._agent, self._centre, self._channel.instant
-        self._deliver(t)
-        transmission = agent.transmit(t, state)
-        if len(transmission.rows):
-            self._transmit(t, transmission, state.yaw)
-            if instant:
-                self._deliver(t)
-        if centre is not None and agent.decision_due:
-            centre.decide(t, agent)
-            if instant:
-                centre.deliver(t, agent)
-        return transmission
+    def transmit(self, row: int, robot: Robot, t: float, yaw: float, start: float) -> None:
+        """A robot transmits its pose at `t` [s]. Before the common start at `start` [s] nothing is lost."""
+        self._seq[row] += 1
+        seq, channel = self._seq[row], self._channel
+        sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw)
+        self._sent.append((row, t, sample))
+        size = self._sizes.of(sample, start) if channel.limited else 0
+        for link in self._links[row]:
+            channel.send(link, sample, seq, t, start=start, size=size)
+        if self.centre is not None:
+            self.centre.transmit(sample, start, size)
 
-    def _transmit(self, t: float, transmission: Transmission, yaw: Array) -> None:
-        """Transmits poses. Before the common start nothing is lost."""
-        rows, start = transmission.rows, float(self._agent.lifecycle.start_at.min())
-        self._seq[rows] += 1
-        now = np.full(len(rows), t)
-        position, velocity = transmission.position[rows], transmission.velocity[rows]
-        poses = PoseTable(rows, self._seq[rows], now, now, position, velocity, yaw[rows])
-        self._sent.append(_bare(rows, poses.seq, now, now) if self._lean else poses)
-        self._channel.transmit(t, poses, start)
-        if self._centre is not None:
-            self._centre.transmit(t, poses, start)
-
-    def _deliver(self, t: float) -> None:
-        """Delivers poses and goals that have arrived."""
-        if (received := self._channel.due(t)) is not None:
-            self._agent.neighbours.receive(received)
+    def deliver(self, t: float) -> None:
+        """Delivers poses and goals that have arrived by `t` [s]."""
+        for link, arrival, sample in self._channel.due(t):
+            robot, k = self._receivers[link]
+            robot.neighbours.receive(k, sample.position, sample.velocity, sample.stamp, arrival)
             if not self._lean:
-                self._received.append(replace(received, yaw=None, bytes=None))
-        if self._centre is not None:
-            self._centre.deliver(t, self._agent)
+                self._received.append((link, arrival, sample))
+        if self.centre is not None:
+            self.centre.deliver(t)
 
     def logged(self, begin: float) -> dict[str, Any]:
         """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
+        received = _table(self._received, begin)
         return {
-            "sent": _joined(self._sent, begin),
-            "received": _joined(self._received, begin),
-            "lost": self._channel.dropped,
-            "centre": None if self._centre is None else self._centre.logged(begin),
+            "sent": _table(self._sent, begin, bare=self._lean),
+            "received": PoseTable(
+                received.link, received.seq, received.stamp, received.arrival, received.position, received.velocity
+            ),
+            "lost": np.array(self._channel.dropped, dtype=np.intp),
+            "centre": None if self.centre is None else self.centre.logged(begin),
         }

@@ -1,9 +1,7 @@
 """The virtual clock: the whole experiment in one process, without sleeping, reproducible to the bit from its seed.
 
-The decision is `agents.Agent` with all rows, the bodies are the twins, the network is
-`experiments.virtual_time.network`; this file is only the loop. Several seeds run side by side as more rows, each with
-the result that it would have alone (unless a lossy network makes one so much later ready that the others get their
-orders at another multiple of `ORDERS_S`).
+The decision is `agents.robot`, the bodies are the twins, the network is `experiments.virtual_time.network`; this file
+is only the loop.
 """
 
 from __future__ import annotations
@@ -14,10 +12,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.agent import Agent
-from agents.arrays import Array, Index, Mask, PoseTable, some
+from agents.arrays import Array, Index, PoseTable
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
+from agents.plugins.calls import blamed
+from agents.robot import Robot
 from agents.safety.hazards import Incident
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
@@ -28,45 +27,44 @@ from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
 
 STATE: Final = ("position", "velocity", "yaw", "true_position", "true_yaw")  # columns from the state of the bodies
-OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that exist in all samples or in none
+OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that are left out where nothing is known
 
 
 @dataclass(frozen=True)
 class Log:
-    """Everything recorded of a virtual run; times since the common start [s], arrays over samples (K) and rows (R)."""
+    """Everything recorded of a virtual run; times since the common start [s], arrays over samples (K), robots (N)."""
 
-    names: tuple[str, ...]  # (N) robots of one repetition
-    seeds: tuple[int, ...]  # one per repetition; R = N × repetitions, the rows of the first seed first
+    names: tuple[str, ...]  # (N)
+    seed: int
     lean: bool  # only `true_position`, and of poses only numbers and times, are kept
     time: Array  # (K,) at state_hz, from before take-off (negative) to the end
-    phase: Index  # (K, R) `agents.decision.lifecycle.Phase`
-    position: Array  # (K, R, 3) [m] measured
-    velocity: Array  # (K, R, 3) [m/s] measured
-    yaw: Array  # (K, R) [rad] measured
-    true_position: Array  # (K, R, 3) [m]
-    true_yaw: Array  # (K, R) [rad]
-    goal: Array  # (K, R, 3) [m]
-    setpoint: Array  # (K, R, 4)
-    error: Array  # (K, R) [m]
+    phase: Index  # (K, N) `agents.decision.lifecycle.Phase`
+    position: Array  # (K, N, 3) [m] measured
+    velocity: Array  # (K, N, 3) [m/s] measured
+    yaw: Array  # (K, N) [rad] measured
+    true_position: Array  # (K, N, 3) [m]
+    true_yaw: Array  # (K, N) [rad]
+    goal: Array  # (K, N, 3) [m]
+    setpoint: Array  # (K, N, 4)
+    error: Array  # (K, N) [m]
     sent: PoseTable  # poses of all robots; `link` is the row
-    received: PoseTable  # poses on all links, those of the first repetition first
-    lost: Index  # (E,) samples lost on each link of all repetitions, from the common start to the landing
-    decisions: int  # coordination decisions of each row
-    updates: Index  # (R,) goals computed anew
-    interventions: Index  # (R,) ticks on which safety changed the decision, from the common start on
-    avoided: Index  # (R,) ticks on which avoidance changed the decision, from the common start on
+    received: PoseTable  # poses on all links
+    lost: Index  # (E,) samples lost on each link, from the common start to the landing
+    decisions: int  # coordination decisions of each robot
+    updates: Index  # (N,) goals computed anew
+    interventions: Index  # (N,) ticks on which safety changed the decision, from the common start on
+    avoided: Index  # (N,) ticks on which avoidance changed the decision, from the common start on
     touches: tuple[Touch, ...]  # contacts, by their beginning
     ticks: int  # ticks from the common start to the end
     airborne: float  # [s] all robots were up (negative)
     ended: float  # [s] all robots were done
-    attitude: Array | None  # (K, R, 4) unit quaternions w, x, y, z from robot to room; None if the engine has none
-    obstacles: Array  # (K, repetitions, M, 3) x, y [m], yaw [rad] of each
-    # (K, R, 3) of the twins beside the robots, NaN for rows without one; None if there is none
+    attitude: Array | None  # (K, N, 4) unit quaternions w, x, y, z from robot to room; None if the engine has none
+    obstacles: Array  # (K, M, 3) x, y [m], yaw [rad] of each
+    # (K, N, 3) of the twins beside the robots, NaN for robots without one; None if there is none
     shadow_position: Array | None
-    shadow_yaw: Array | None  # (K, R) of those twins
-    waited: Mask  # (repetitions,) that got an order later than alone, because another one was late
+    shadow_yaw: Array | None  # (K, N) of those twins
     centre: CentreLog | None = None  # None if each robot decides for itself
-    incidents: tuple[Incident, ...] = ()  # hazards of robots
+    incidents: tuple[tuple[int, Incident], ...] = ()  # hazards, each with the row of its robot, in order of time
 
 
 @dataclass(frozen=True)
@@ -75,26 +73,26 @@ class Instant:
 
     time: float  # [s] since the common start; NaN before it is known
     now: float  # [s] of the clock of the decision
-    agent: Agent
-    state: BodyState
+    robots: Sequence[Robot]
+    states: Sequence[BodyState]  # of their bodies
     engine: Engine  # of the bodies
 
 
 def simulate(
     experiment: Experiment,
-    seeds: Sequence[int],
+    seed: int,
     *,
-    quiet: int = 0,
+    quiet: bool = False,
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
     watch: Callable[[Instant], object] = lambda _: None,
 ) -> Log:
-    """Flies one case of an experiment once for each seed.
+    """Flies one case of an experiment.
 
     Args:
-        seeds: One for each repetition.
-        quiet: Number of repetitions, the first ones, that are flown without noise.
+        seed: Of all that is random.
+        quiet: Fly without noise.
         lean: Keep `true_position`, and of the poses sent numbers and times: a seventh of the memory, for sweeps. The
             other columns are empty, and so is the table of received poses.
         landing: Let the robots land; else the log ends with the run.
@@ -103,78 +101,126 @@ def simulate(
 
     Raises:
         Stuck: If robots do not become ready, airborne or done.
+        PluginError: If a plug-in fails; the error names it.
     """
-    names = tuple(experiment.robots)
-    assignment = Plan(experiment).assignment(names, copies=len(seeds))
-    agent = Agent(assignment)
-    request = bodies.body_request(experiment, names, seeds, quiet=quiet)
-    request = replace(request, external=(False,) * len(request.names))  # no motion capture in virtual time
-    twin = TwinBody(request, bodies.shared_world(experiment, names, len(seeds)))
-    body = shadowed(twin, request, bodies.shadow_periods(experiment, names, len(seeds)))
-    network = VirtualNetwork(experiment, agent, seeds, lean=lean)
-    rows = len(assignment.names)
-    dt = 1.0 / assignment.body_hz
-    log_every = round(assignment.body_hz / experiment.rates.state_hz)
-    interventions, avoided = np.zeros(rows, dtype=np.intp), np.zeros(rows, dtype=np.intp)
-    touches: list[Touch] = []
-    samples: dict[str, list[Any]] = {}
-    conductor = VirtualConductor(agent, names)
-    nothing = np.zeros((rows, 0))
-    tick = 0
-    while not conductor.over:
-        t = tick * dt
-        state = body.read(t)
-        sent = network.carry(t, state)
-        actions = agent.act(t, state, sent)
-        if actions.commands is not None:
-            body.takeoff(actions.commands.takeoff, assignment.hover[actions.commands.takeoff])
-            body.land(actions.commands.land)
-            body.stop(actions.commands.stop)
-        body.command(actions.setpoint)
-        if agent.decisions:
-            if some(actions.changed):
-                interventions += actions.changed
-            if some(actions.avoided):
-                avoided += actions.avoided
-        touches += twin.touches()
-        if (agent.tick - 1) % log_every == 0:  # the agent's count begins anew at the common start
-            progress(t - conductor.start_at)
-            watch(Instant(t - conductor.start_at, t, agent, state, twin.engine))
-            sample = {
-                **{what: getattr(state, what) for what in (*STATE, *OPTIONAL)},
-                "phase": agent.lifecycle.phase.copy(),
-                "goal": agent.goal,
-                "setpoint": actions.setpoint,
-                "error": agent.error,
-                "obstacles": np.array(twin.engine.obstacles),
-            }
-            if lean:
-                kept = {**dict.fromkeys(OPTIONAL), "true_position": state.true_position}
-                sample = dict.fromkeys(sample, nothing) | kept
-            for what, value in {**sample, "time": t}.items():
-                samples.setdefault(what, []).append(value)
-        if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
-            break
-        conductor.give_orders(t, dt)
-        twin.begun_at = conductor.start_at
-        tick += 1
-    begin = conductor.start_at
-    columns: dict[str, Any] = {what: None if each[0] is None else np.array(each) for what, each in samples.items()}
-    columns["time"] = columns["time"] - begin
-    return Log(
-        names=names,
-        seeds=tuple(seeds),
-        lean=lean,
-        decisions=agent.decisions,
-        updates=agent.updates,
-        interventions=interventions,
-        avoided=avoided,
-        touches=tuple(replace(touch, time=touch.time - begin) for touch in touches),
-        ticks=round(experiment.duration_s / dt),
-        airborne=conductor.airborne_at - begin,
-        ended=tick * dt - begin,
-        waited=conductor.waited,
-        incidents=tuple(each._replace(time=each.time - begin) for each in agent.hazards.incidents),
-        **network.logged(begin),
-        **columns,
-    )
+    flight = Flight(experiment, seed, quiet=quiet, lean=lean)
+    with blamed():
+        flight.fly(landing=landing, progress=progress, watch=watch)
+    return flight.log()
+
+
+class Flight:
+    """A run in virtual time."""
+
+    def __init__(self, experiment: Experiment, seed: int, *, quiet: bool, lean: bool) -> None:
+        plan = Plan(experiment)
+        self._experiment, self._seed, self._lean = experiment, seed, lean
+        self.names = names = plan.names
+        self.robots = [Robot(plan.assignment(name)) for name in names]
+        request = bodies.body_request(experiment, names, seed, quiet=quiet)
+        request = replace(request, external=(False,) * len(names))  # no motion capture in virtual time
+        self._twin = TwinBody(request, bodies.shared_world(experiment, names))
+        self._body = shadowed(self._twin, request, bodies.shadow_periods(experiment, names))
+        self._network = VirtualNetwork(experiment, plan, self.robots, seed, lean=lean)
+        self._conductor = VirtualConductor(self.robots)
+        self._dt = 1.0 / experiment.rates.body_hz
+        self._tick = 0
+        self._samples: list[dict[str, Any]] = []
+        self._interventions, self._avoided = [0] * len(names), [0] * len(names)
+        self._touches: list[Touch] = []
+
+    def fly(self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Instant], object]) -> None:
+        """Flies until all robots are done, or to the end of the run without `landing`."""
+        experiment, robots, conductor, dt = self._experiment, self.robots, self._conductor, self._dt
+        log_every = round(experiment.rates.body_hz / experiment.rates.state_hz)
+        first = robots[0]
+        while not conductor.over:
+            t = self._tick * dt
+            states = self.step(t)
+            if (first.tick - 1) % log_every == 0:  # the robots' count begins anew at the common start
+                progress(t - conductor.start_at)
+                watch(Instant(t - conductor.start_at, t, robots, states, self._twin.engine))
+                self._sample(t, states)
+            if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
+                return
+            conductor.give_orders(t, dt)
+            self._twin.begun_at = conductor.start_at
+            self._tick += 1
+
+    def step(self, t: float) -> Sequence[BodyState]:
+        """One tick at `t` [s]; returns the states of the bodies."""
+        robots, network, body = self.robots, self._network, self._body
+        states = body.read(t)
+        network.deliver(t)
+        start, sent = self._conductor.start_at, False
+        for row, robot in enumerate(robots):
+            if robot.transmit(t, states[row]):
+                network.transmit(row, robot, t, states[row].yaw, start)
+                sent = True
+        if sent and network.instant:
+            network.deliver(t)
+        if network.centre is not None and robots[0].decision_due:
+            network.centre.decide(t)
+            if network.centre.instant:
+                network.centre.deliver(t)
+        begun = robots[0].begun
+        for row, robot in enumerate(robots):
+            robot.act(t)
+            if robot.takes_off:
+                body.takeoff((row,), (robot.assignment.hover,))
+            if robot.lands:
+                body.land((row,))
+            if robot.stops:
+                body.stop((row,))
+            if begun:
+                self._interventions[row] += robot.changed
+                self._avoided[row] += robot.avoided
+        body.command([robot.setpoint for robot in robots])
+        if touches := self._twin.touches():
+            self._touches += touches
+        return states
+
+    def _sample(self, t: float, states: Sequence[BodyState]) -> None:
+        sample: dict[str, Any] = {"time": t, "true_position": [state.true_position for state in states]}
+        if not self._lean:
+            for what in (*STATE, *OPTIONAL):
+                sample[what] = [getattr(state, what) for state in states]
+            sample["phase"] = [robot.lifecycle.phase for robot in self.robots]
+            for what in ("goal", "setpoint", "error"):
+                sample[what] = [getattr(robot, what) for robot in self.robots]
+            sample["obstacles"] = [tuple(each) for each in self._twin.engine.obstacles]
+        self._samples.append(sample)
+
+    def log(self) -> Log:
+        """Everything recorded so far."""
+        conductor, names = self._conductor, self.names
+        begin, count = conductor.start_at, len(self._samples)
+        columns: dict[str, Any] = {}
+        for what in (*STATE, *OPTIONAL, "phase", "goal", "setpoint", "error", "obstacles"):
+            if self._lean and what != "true_position":
+                columns[what] = None if what in OPTIONAL else np.zeros((count, len(names), 0))
+                continue
+            columns[what] = np.array([sample[what] for sample in self._samples])
+            if what in OPTIONAL and np.isnan(columns[what]).all():
+                columns[what] = None
+        incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]
+        return Log(
+            names=names,
+            seed=self._seed,
+            lean=self._lean,
+            time=np.array([sample["time"] for sample in self._samples]) - begin,
+            decisions=max(robot.decisions for robot in self.robots),
+            updates=np.array([robot.updates for robot in self.robots], dtype=np.intp),
+            interventions=np.array(self._interventions, dtype=np.intp),
+            avoided=np.array(self._avoided, dtype=np.intp),
+            touches=tuple(replace(touch, time=touch.time - begin) for touch in self._touches),
+            ticks=round(self._experiment.duration_s / self._dt),
+            airborne=conductor.airborne_at - begin,
+            ended=self._tick * self._dt - begin,
+            incidents=tuple(
+                (row, each._replace(time=each.time - begin))
+                for row, each in sorted(incidents, key=lambda pair: pair[1].time)
+            ),
+            **self._network.logged(begin),
+            **columns,
+        )
