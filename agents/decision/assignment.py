@@ -43,8 +43,8 @@ class Assignment:
     changes: tuple[Change, ...] = ()  # of the targets of all links
     start: tuple[float, float] | None = None  # where it begins [m]; None: anywhere
     start_within: float = 0.0  # farthest from there that it may take off [m]
-    # other robots: name, x and y where they begin [m], radius [m]; empty where that is not known
-    other_starts: tuple[tuple[str, float, float, float], ...] = ()
+    # all robots: name, x and y where they begin [m], radius [m]; empty where that is not known
+    starts: tuple[tuple[str, float, float, float], ...] = ()
     # goals come from a central controller; then links of the law, anchors and legs are empty
     guided: bool = False
 

@@ -6,7 +6,7 @@ guides from that robot's last received pose. `errors`, `law_offset` and `decide`
 
 from __future__ import annotations
 
-from math import nan
+from math import isfinite, nan
 
 from agents.decision.assignment import Assignment
 from agents.decision.control_updates import ControlUpdates
@@ -202,6 +202,6 @@ class StationKeeping:
 
     def hold(self, held: bool, position: Vector) -> None:
         """Begin, go on or end a hold; a robot without a position stays at the first known one."""
-        if held and (not self.held or not self.at[0] == self.at[0]):
+        if held and (not self.held or not isfinite(self.at[0])):
             self.at = (position[0], position[1], self.ground) if is_finite(position) else UNKNOWN
         self.held = held

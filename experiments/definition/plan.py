@@ -135,15 +135,31 @@ class Plan:
         }
 
     @cached_property
+    def _links_to(self) -> dict[str, list[int]]:
+        """Numbers of the links to each receiver."""
+        found: dict[str, list[int]] = {}
+        for number, link in enumerate(self.one_way_links):
+            found.setdefault(link.receiver, []).append(number)
+        return found
+
+    @cached_property
+    def starts(self) -> tuple[tuple[str, float, float, float], ...]:
+        """Name of each robot, x and y where it begins [m], and its radius [m]."""
+        starts, _ = start_poses(self.experiment, self.names)
+        return tuple(
+            (name, float(x), float(y), kind.radius)
+            for name, (x, y, _), kind in zip(self.names, starts.tolist(), self.kinds, strict=True)
+        )
+
+    @cached_property
     def pose_links(self) -> Links:
         """Every link on which robots receive poses, receiver by receiver, those that only avoidance needs last."""
-        guided, row = set(self.guided), {name: number for number, name in enumerate(self.names)}
-        targets, ends = [], []
+        guided, row = set(self.guided), self._row
+        targets, ends, given = [], [], self.formation.targets_at(0.0)
         for receiver in self.names:
-            for link, target in zip(self.one_way_links, self.formation.targets_at(0.0), strict=True):
-                if link.receiver == receiver and receiver not in guided:
-                    targets.append(target)
-                    ends.append((row[receiver], row[link.sender]))
+            for number in () if receiver in guided else self._links_to.get(receiver, ()):
+                targets.append(given[number])
+                ends.append((row[receiver], row[self.one_way_links[number].sender]))
             for sender in self.avoidance_senders.get(receiver, ()):
                 targets.append(Link())
                 ends.append((row[receiver], row[sender]))
@@ -226,13 +242,11 @@ class Plan:
         experiment, guided = self.experiment, name in self.guided
         decides = guided == centrally  # for this robot, at this place
         rates, within = experiment.rates, experiment.safety.start_within
-        starts, _ = start_poses(experiment, self.names)
-        at = {robot: (float(x), float(y)) for robot, (x, y, _) in zip(self.names, starts, strict=True)}
-        kind = self.kinds[self.names.index(name)]
+        row = self._row[name]
         patient = experiment.start.missing != "go-on"
         return Assignment(
             name=name,
-            kind=kind,
+            kind=self.kinds[row],
             hover=experiment.robots[name].hover or math.nan,
             neighbours=self._incoming(name, in_law=decides, avoidance=not centrally),
             law=self.law,
@@ -252,37 +266,36 @@ class Plan:
             decide_every=round(rates.body_hz / rates.coordination_hz),
             duration=experiment.duration_s,
             patience_s=None if patient else experiment.start.deadline_s,
-            start=at[name] if within else None,
+            start=self.starts[row][1:3] if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,
-            other_starts=self._other_starts(name, at) if within and not experiment.start.scatter else (),
+            starts=self.starts if within and not experiment.start.scatter else (),
             guided=guided,
         )
 
     def _incoming(self, name: str, *, in_law: bool, avoidance: bool) -> tuple[Incoming, ...]:
         """Links on which a robot receives: those of its law, then those that only its avoidance needs."""
-        row = {robot: number for number, robot in enumerate(self.names)}
-        standby = {robot for robot, given in self.experiment.robots.items() if given.standby}
+        robots, kinds = self.experiment.robots, self._kind_of
         found = []
-        if in_law:
-            for link, targets in zip(self.one_way_links, self.formation.targets, strict=True):
-                if link.receiver == name:
-                    wanted = link.wanted
-                    found.append(Incoming(
-                        row[link.sender], link.sender, self.kinds[row[link.sender]], wanted.distance, link.gain,
-                        wanted.relative, wanted.bearing, wanted.wants, True, link.sender not in standby,
-                        targets, link.since, link.until, link.reach, link.release,
-                    ))  # fmt: skip
-        if avoidance:
-            for sender in self.avoidance_senders.get(name, ()):
-                found.append(Incoming(
-                    row[sender], sender, self.kinds[row[sender]], math.nan, in_law=False,
-                    awaited=sender not in standby,
-                ))  # fmt: skip
-        return tuple(found)
+        for number in self._links_to.get(name, ()) if in_law else ():
+            link = self.one_way_links[number]
+            wanted, sender = link.wanted, link.sender
+            found.append(Incoming(
+                self._row[sender], sender, kinds[sender], wanted.distance, link.gain, wanted.relative, wanted.bearing,
+                wanted.wants, True, not robots[sender].standby, self.formation.targets[number],
+                link.since, link.until, link.reach, link.release,
+            ))  # fmt: skip
+        only_seen = self.avoidance_senders.get(name, ()) if avoidance else ()
+        return (*found, *(
+            Incoming(
+                self._row[sender], sender, kinds[sender], math.nan, in_law=False, awaited=not robots[sender].standby
+            )
+            for sender in only_seen
+        ))  # fmt: skip
 
-    def _other_starts(
-        self, name: str, at: dict[str, tuple[float, float]]
-    ) -> tuple[tuple[str, float, float, float], ...]:
-        """Other robots, and where they begin."""
-        others = zip(self.names, self.kinds, strict=True)
-        return tuple((other, *at[other], kind.radius) for other, kind in others if other != name)
+    @cached_property
+    def _row(self) -> dict[str, int]:
+        return {name: number for number, name in enumerate(self.names)}
+
+    @cached_property
+    def _kind_of(self) -> dict[str, Kind]:
+        return dict(zip(self.names, self.kinds, strict=True))
