@@ -2,88 +2,134 @@
 
 An avoidance is a frozen struct of its parameters, found by the entry-point group `zenpark.avoidances`. It may act at
 two levels: `deviate` shifts a goal (individual level; the potential of the paper), `restrain` limits the setpoint
-after all other limits (safety level; the barrier).
+after all other limits (safety level; the barrier). Both are quiet.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from math import inf, sqrt
+from typing import Annotated, Final, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Columns, Index, Mask, NotNegative, Positive, every, norm
+from agents.vectors import ZERO, NotNegative, Positive, Setpoint, Vector
 
-COINCIDENT = 1e-6  # [m] axes nearer than this have no direction
-TOUCHING = 1e-3  # [m] smallest gap in a force: forces stay finite
-LAYER = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
-ASIDE = 0.1  # of the pull against a push: the step aside
+COINCIDENT: Final = 1e-6  # [m] axes nearer than this have no direction
+TOUCHING: Final = 1e-3  # [m] smallest gap in a force: forces stay finite
+LAYER: Final = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
+ASIDE: Final = 0.1  # of the pull against a push: the step aside
 
 
-class Nearby(Columns, frozen=True):
-    """Things near rows, one entry per thing and row that knows it (K).
+class Thing:
+    """Thing near a robot: an upright cylinder, a robot whose pose was received or the end of a range reading.
 
-    Things are upright cylinders: a robot whose pose was received, or the point (radius 0) where a range reading ended.
+    What follows `lag` is for avoidances to write on.
     """
 
-    row: Index  # (K,) row that knows the thing
-    position: Array  # (K, 2) believed now [m]
-    velocity: Array  # (K, 2) believed [m/s]; 0 for range readings
-    radius: Array  # (K,) [m]
-    low: Array  # (K,) lower end [m]
-    high: Array  # (K,) upper end [m]
-    is_robot: Mask  # (K,) robot of this experiment, which may avoid as well; else a range reading
-    lag: Array  # (K,) time constant of its velocity [s]; 0 for range readings
+    __slots__ = (
+        "away_x", "away_y", "bound", "counts", "excess", "gap", "high", "is_robot", "lag", "low", "radius",
+        "velocity_x", "velocity_y", "x", "y",
+    )  # fmt: skip
 
-    def append(self, others: Nearby) -> Nearby:
-        """These things and others."""
-        if not len(others):
-            return self
-        return Nearby.joined([self, others]) if len(self) else others
+    x: float  # believed now [m]
+    y: float
+    velocity_x: float  # believed [m/s]; 0 for range readings
+    velocity_y: float
+    radius: float  # [m]; 0 for range readings
+    low: float  # lower end [m]
+    high: float  # upper end [m]
+    is_robot: bool  # robot of this experiment, which may avoid as well; else a range reading
+    lag: float  # time constant of its velocity [s]; 0 for range readings
+    away_x: float  # unit vector from the thing to the robot
+    away_y: float
+    gap: float  # between surfaces once both have stopped closing in [m]
+    bound: float  # [m/s]
+    excess: float  # [m/s]
+    counts: bool
 
-    def bearing(self, own: OwnState) -> tuple[Array, Array]:
-        """Unit vectors (K, 2) from each thing to the row that knows it, and the distances (K,) of their axes [m].
-
-        Two axes in one place, which only wrong measurements can give, are separated along x.
-        """
-        away = own.position[self.row, :2] - self.position
-        distance = norm(away)
-        some_way = distance > COINCIDENT
-        if not every(some_way):
-            away[~some_way], distance = (COINCIDENT, 0.0), np.maximum(distance, COINCIDENT)
-        return away / distance[:, None], distance
-
-    def gaps(self, own: OwnState) -> tuple[Array, Array]:
-        """Unit vectors (K, 2) as `bearing`, and gaps (K,) between surfaces once both have stopped closing in [m].
-
-        A velocity fades with its time constant, so that a robot moves on by the product of both.
-        """
-        away, distance = self.bearing(own)
-        coming = np.maximum(np.vecdot(away, self.velocity), 0.0)
-        going = np.maximum(-np.vecdot(away, own.velocity[self.row, :2]), 0.0)
-        way = own.lag[self.row] * going + self.lag * coming
-        return away, distance - own.radius[self.row] - self.radius - way
+    def __init__(self) -> None:
+        self.x = self.y = self.velocity_x = self.velocity_y = self.radius = self.low = self.high = self.lag = 0.0
+        self.away_x = self.away_y = self.gap = self.bound = self.excess = 0.0
+        self.is_robot = self.counts = False
 
 
-@dataclass(frozen=True)
+class Plane:
+    """Half-plane a·u ≤ b of velocities u."""
+
+    __slots__ = ("b", "x", "y")
+
+    x: float  # unit vector a
+    y: float
+    b: float  # [m/s]
+
+    def __init__(self) -> None:
+        self.x = self.y = self.b = 0.0
+
+
+class Nearby:
+    """Things near a robot: the first `count` of `things`."""
+
+    __slots__ = ("count", "planes", "things")
+
+    count: int
+    things: list[Thing]
+    planes: list[Plane]  # for avoidances to write on
+
+    def __init__(self, planes: int = 9) -> None:
+        self.count, self.things, self.planes = 0, [], [Plane() for _ in range(planes)]
+
+    def add(self) -> Thing:
+        """One more thing, to be filled in."""
+        if self.count == len(self.things):
+            self.things.append(Thing())
+        self.count += 1
+        return self.things[self.count - 1]
+
+
 class OwnState:
-    """State and properties of rows (N)."""
+    """State and properties of a robot."""
 
-    position: Array  # (N, 3) measured [m]
-    velocity: Array  # (N, 3) measured or estimated, 0 where unknown [m/s]
-    yaw: Array  # (N,) measured [rad]
-    radius: Array  # (N,) [m]
-    height: Array  # (N,) vertical size, from the position up [m]
-    speed: Array  # (N,) limit [m/s]
-    turn_rate: Array  # (N,) limit [rad/s]
-    response: Array  # (N,) rate at which a body that takes positions closes a position error [1/s]
-    lag: Array  # (N,) time constant from commanded to true velocity [s]
-    takes: tuple[str, ...]  # (N,) "position", "velocity" or "twist"
-    by_position: Mask  # (N,) takes a position
-    by_twist: Mask  # (N,) takes a twist
-    flies: Mask  # (N,)
+    __slots__ = (
+        "by_position", "by_twist", "flies", "height", "lag", "position", "radius", "response", "speed", "turn_rate",
+        "velocity", "yaw",
+    )  # fmt: skip
+
+    position: Vector  # measured [m]
+    velocity: Vector  # measured or estimated, 0 where unknown [m/s]
+    yaw: float  # measured [rad]
+    radius: float  # [m]
+    height: float  # vertical size, from the position up [m]
+    speed: float  # limit [m/s]
+    turn_rate: float  # limit [rad/s]
+    response: float  # rate at which a body that takes positions closes a position error [1/s]
+    lag: float  # time constant from commanded to true velocity [s]
+    by_position: bool  # takes a position
+    by_twist: bool  # takes a twist
+    flies: bool
+
+    def __init__(self) -> None:
+        self.position = self.velocity = ZERO
+        self.yaw = self.radius = self.height = self.lag = 0.0
+        self.speed = self.turn_rate = self.response = 1.0
+        self.by_position = self.by_twist = self.flies = False
+
+
+def measure(own: OwnState, thing: Thing) -> None:
+    """Set `away` and `gap` of a thing.
+
+    Two axes in one place, which only wrong measurements can give, are separated along x. A velocity fades with its time
+    constant, so that a robot moves on by the product of both.
+    """
+    x, y = own.position[0] - thing.x, own.position[1] - thing.y
+    apart = sqrt(x * x + y * y)
+    if not apart > COINCIDENT:
+        x, y, apart = COINCIDENT, 0.0, max(apart, COINCIDENT)
+    x, y = x / apart, y / apart
+    coming = max(x * thing.velocity_x + y * thing.velocity_y, 0.0)
+    going = max(-(x * own.velocity[0] + y * own.velocity[1]), 0.0)
+    thing.away_x, thing.away_y = x, y
+    thing.gap = apart - own.radius - thing.radius - (own.lag * going + thing.lag * coming)
 
 
 class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,14 +144,14 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Meta(description="things farther above or below than this are ignored [m]; more against downwash"),
     ] = 0.1
 
-    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """Goals (N, 3) [m] to pursue in place of `goal` (N, 3); called every `period` [s]."""
+    def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
+        """Goal [m] to pursue in place of `goal` [m]; called every `period` [s]."""
         return goal
 
-    def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
-        """Setpoints (N, 4) to send in place of `setpoint` (N, 4), in the meaning of each row's kind.
+    def restrain(self, setpoint: Setpoint, own: OwnState, near: Nearby) -> Setpoint:
+        """Setpoint to send in place of `setpoint`, in the meaning of the robot's kind.
 
-        Changes are held to the limits of speed and arena; rows without a valid pose keep theirs.
+        Changes are held to the limits of speed and arena; a robot without a valid pose keeps its own.
         """
         return setpoint
 
@@ -123,38 +169,38 @@ class Potential(Avoidance, frozen=True):
 
     reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
     strength: Annotated[Positive, Meta(description="η [N m³], of all forces alike")] = 1.5e-4
-    velocity: Annotated[Positive | None, Meta(description="v [m/s]; left out: the robot's limit of speed")] = None
-    period_s: Annotated[Positive | None, Meta(description="h [s]; left out: 1/response of the robot's kind")] = None
+    velocity: Annotated[Positive, Meta(description="v [m/s]; inf: the robot's limit of speed")] = inf
+    period_s: Annotated[NotNegative, Meta(description="h [s]; 0: 1/response of the robot's kind")] = 0.0
 
-    def force(self, own: OwnState, near: Nearby) -> Array:
-        """F (N, 2) of eq. (3), summed over near things; zero where there are none."""
-        away, gap = near.gaps(own)
-        gap = np.maximum(gap, TOUCHING)
-        push = self.strength * np.maximum(1.0 / gap - 1.0 / self.reach, 0.0) / gap**2
-        total = np.zeros((len(own.yaw), 2))
-        np.add.at(total, near.row, push[:, None] * away)
-        return total
+    def push(self, gap: float) -> float:
+        """Force of a thing at a distance of `gap` [m] between surfaces [N]."""
+        gap = max(gap, TOUCHING)
+        return self.strength * max(1.0 / gap - 1.0 / self.reach, 0.0) / (gap * gap)
 
-    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """Shift goals by eq. (4)."""
-        if not len(near):
+    def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
+        """Shift a goal by eq. (4)."""
+        force_x = force_y = 0.0
+        for k in range(near.count):
+            thing = near.things[k]
+            measure(own, thing)
+            push = self.push(thing.gap)
+            force_x, force_y = force_x + push * thing.away_x, force_y + push * thing.away_y
+        strength = sqrt(force_x * force_x + force_y * force_y)
+        x, y, z = goal
+        if not (strength > 0.0 and abs(x) < inf and abs(y) < inf):
             return goal
-        force = self.force(own, near)
-        strength = norm(force)
-        rows = np.flatnonzero((strength > 0.0) & np.isfinite(goal[:, :2]).all(axis=1))
-        if not len(rows):
-            return goal
-        here, limit, response = own.position[rows, :2], own.speed[rows], own.response[rows]
-        way = goal[rows, :2] - here
-        way *= np.minimum(1.0, limit / response / np.maximum(norm(way), TOUCHING))[:, None]
-        v = limit if self.velocity is None else self.velocity
-        h = 1.0 / response if self.period_s is None else self.period_s
-        away = force[rows] / strength[rows, None]
-        right = np.column_stack([-away[:, 1], away[:, 0]])  # of one that looks against the push
-        against, across = np.maximum(-(way * away).sum(axis=1), 0.0), (way * right).sum(axis=1)
-        aside = np.where(across >= -0.5 * ASIDE * against, ASIDE, -ASIDE) * against
+        here_x, here_y, _ = own.position
+        way_x, way_y = x - here_x, y - here_y
+        length = sqrt(way_x * way_x + way_y * way_y)
+        shorter = min(1.0, own.speed / own.response / max(length, TOUCHING))
+        way_x, way_y = way_x * shorter, way_y * shorter
+        v = self.velocity if self.velocity < inf else own.speed
+        h = self.period_s if self.period_s > 0.0 else 1.0 / own.response
+        away_x, away_y = force_x / strength, force_y / strength
+        right_x, right_y = -away_y, away_x  # of one that looks against the push
+        against, across = max(-(way_x * away_x + way_y * away_y), 0.0), way_x * right_x + way_y * right_y
+        aside = (ASIDE if across >= -0.5 * ASIDE * against else -ASIDE) * against
         inner = self.reach - min(LAYER, 0.5 * self.reach)
-        share = np.minimum(1.0, strength[rows] / (self.strength * (1.0 / inner - 1.0 / self.reach) / inner**2))
-        shifted = goal.copy()
-        shifted[rows, :2] = here + way + (share * h * v)[:, None] * away + (share * aside)[:, None] * right
-        return shifted
+        share = min(1.0, strength / (self.strength * (1.0 / inner - 1.0 / self.reach) / (inner * inner)))
+        out, side = share * h * v, share * aside
+        return here_x + way_x + out * away_x + side * right_x, here_y + way_y + out * away_y + side * right_y, z

@@ -1,20 +1,26 @@
-"""A control barrier function: the least change of the commanded velocities that keeps robots from touching things."""
+"""A control barrier function: the least change of the commanded velocity that keeps a robot from touching things.
+
+All of it is quiet.
+"""
 
 from __future__ import annotations
 
+from math import atan2, copysign, cos, floor, inf, pi, sin, sqrt
 from typing import Annotated, Final
 
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, NotNegative, Positive, clamp, every, norm, some
-from agents.plugins.avoidance import Avoidance, Nearby, OwnState
+from agents.plugins.avoidance import Avoidance, Nearby, OwnState, Thing, measure
+from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
 SECTORS: Final = 8  # of what surrounds a robot; the tightest half-plane of each takes part in the exact solution
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
 PARALLEL: Final = 1e-9  # sine of the angle below which two half-planes have no corner
 SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (its cosine) from broadside
 LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
+
+Planar = tuple[float, float]  # x, y
+Candidate = tuple[float, float, float]  # x, y, and the square of the distance from what is wanted; infinite: none
 
 
 class Barrier(Avoidance, frozen=True):
@@ -56,208 +62,216 @@ class Barrier(Avoidance, frozen=True):
         NotNegative, Meta(description="share of the barred velocity that is driven to the right instead")
     ] = 1.0
 
-    def bounds(self, own: OwnState, near: Nearby, share: Array | float = 1.0) -> tuple[Array, Array]:
-        """The half-planes a·u ≤ b that the commanded velocities must obey: unit vectors a (K, 2), b (K,) [m/s].
-
-        `share` (K,) of α is used.
-        """
-        away, gap = near.gaps(own)
-        left = gap - self.margin
-        coming = np.maximum(np.vecdot(away, near.velocity), 0.0)
+    def bound(self, thing: Thing, share: float) -> float:
+        """b [m/s] of the half-plane −n·u ≤ b that a measured thing asks of the velocity, if this `share` of α is used."""
+        left = thing.gap - self.margin
+        coming = max(thing.away_x * thing.velocity_x + thing.away_y * thing.velocity_y, 0.0)
         used = self.alpha * share * left
-        return -away, np.minimum(np.where(left > 0.0, 0.5 * used, used), used - coming)
+        return min(0.5 * used if left > 0.0 else used, used - coming)
 
-    def deviate(self, goal: Array, own: OwnState, near: Nearby, period: float) -> Array:
-        """Steer robots that cannot move sideways."""
-        if not len(near):
+    def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
+        """Steer a robot that cannot move sideways."""
+        if near.count == 0 or not own.by_twist:
             return goal
-        mine = own.by_twist[near.row]
-        if not some(mine):
+        here_x, here_y, _ = own.position
+        wanted_x, wanted_y = own.response * (goal[0] - here_x), own.response * (goal[1] - here_y)
+        share = min(1.0, own.speed / max(sqrt(wanted_x * wanted_x + wanted_y * wanted_y), SLACK))
+        wanted_x, wanted_y = wanted_x * share, wanted_y * share
+        for k in range(near.count):
+            thing = near.things[k]
+            measure(own, thing)
+            thing.bound = self.bound(thing, self.steering if thing.is_robot else 1.0)
+        if not barred(wanted_x, wanted_y, near):
             return goal
-        near = near if every(mine) else near.take(mine)
-        here, response = own.position[:, :2], own.response[:, None]
-        wanted = response * (goal[:, :2] - here)
-        wanted *= np.minimum(1.0, own.speed / np.maximum(norm(wanted), SLACK))[:, None]
-        share = np.where(near.is_robot, self.steering, 1.0)
-        rows, allowed = self._nearest(wanted, own, near, *self.bounds(own, near, share))
-        if not len(rows):
-            return goal
-        steered = goal.copy()
-        steered[rows, :2] = here[rows] + allowed / response[rows]
-        return steered
+        x, y = self.nearest(wanted_x, wanted_y, own, near)
+        return here_x + x / own.response, here_y + y / own.response, goal[2]
 
-    def restrain(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
-        if not len(near):
+    def restrain(self, setpoint: Setpoint, own: OwnState, near: Nearby) -> Setpoint:
+        if near.count == 0:
             return setpoint
-        twist = own.by_twist[near.row]
-        driving = some(twist)
-        if driving and every(twist):
-            return self._along_heading(setpoint, own, near)
-        others = near.take(~twist) if driving else near
-        restrained = self._along_heading(setpoint, own, near.take(twist)) if driving else setpoint
-        response, here = own.response[:, None], own.position[:, :2]
-        aims = own.by_position[:, None]
-        wanted = np.where(aims, response * (setpoint[:, :2] - here), setpoint[:, :2])
-        rows, allowed = self._nearest(wanted, own, others, *self.bounds(own, others))
-        if len(rows):
-            restrained = restrained.copy() if restrained is setpoint else restrained
-            restrained[rows, :2] = np.where(aims[rows], here[rows] + allowed / response[rows], allowed)
-        return restrained
+        for k in range(near.count):
+            measure(own, near.things[k])
+            near.things[k].bound = self.bound(near.things[k], 1.0)
+        a, b, c, d = setpoint
+        if own.by_twist:
+            return along_heading(a, own, near), b, c, d
+        here_x, here_y, _ = own.position
+        wanted_x, wanted_y = a, b
+        if own.by_position:
+            wanted_x, wanted_y = own.response * (a - here_x), own.response * (b - here_y)
+        if not barred(wanted_x, wanted_y, near):
+            return setpoint
+        x, y = self.nearest(wanted_x, wanted_y, own, near)
+        if own.by_position:
+            x, y = here_x + x / own.response, here_y + y / own.response
+        return x, y, c, d
 
-    def _nearest(self, wanted: Array, own: OwnState, near: Nearby, normal: Array, bound: Array) -> tuple[Index, Array]:
-        """Rows (M,) whose `wanted` velocity (N, 2) the half-planes do not allow, and what they do (M, 2) [m/s]."""
-        excess = np.vecdot(normal, wanted[near.row]) - bound
-        barred = excess > SLACK
-        if not some(barred):
-            return near.row[:0], wanted[:0]
-        rows = np.unique(near.row[barred])
-        matters = np.zeros(len(wanted), dtype=bool)
-        matters[rows] = True
-        limit = own.speed[near.row]
-        taking = matters[near.row] & ((bound < limit) | barred)
-        aside = self._evasion(own, near, normal)[taking]
-        normal, bound, excess, of = normal[taking], bound[taking], excess[taking], near.row[taking]
-        place = np.searchsorted(rows, of)
-        order = np.lexsort((-excess, place))
-        worst = order[np.flatnonzero(np.diff(place[order], prepend=-1))]  # what bars each row most
-        velocity = wanted[rows] + np.clip(excess, 0.0, limit[taking])[worst, None] * aside[worst]
-        chosen, tightest = _tightest(normal, bound, place, len(rows))
-        velocity = _closest(velocity, chosen, tightest)
-        return rows, _scaled(velocity, own.speed[rows], normal, bound, place)
+    def nearest(self, x: float, y: float, own: OwnState, near: Nearby) -> Planar:
+        """The velocity nearest to a wanted one x, y [m/s] that the half-planes of the things allow, which bar it."""
+        worst = -1
+        for k in range(near.count):
+            thing = near.things[k]
+            thing.counts = thing.bound < own.speed or thing.excess > SLACK
+            if thing.counts and (worst < 0 or thing.excess > near.things[worst].excess):
+                worst = k
+        thing = near.things[worst]  # what bars most
+        side_x, side_y = self.evasion(thing, own)
+        give = clamp(thing.excess, 0.0, own.speed)
+        x, y = x + give * side_x, y + give * side_y
+        x, y = closest(x, y, near, tightest(near))
+        return scaled(x, y, own.speed, near)
 
-    def _evasion(self, own: OwnState, near: Nearby, normal: Array) -> Array:
-        """Evasion of each row, per m/s that a thing bars (K, 2): to its right, seen toward the thing.
+    def evasion(self, thing: Thing, own: OwnState) -> Planar:
+        """Evasion per m/s that a thing bars: to the right, seen toward the thing.
 
-        One that comes faster than the row can flee will not mind it: there it is the side of its way where the row is.
+        One that comes faster than the robot can flee will not mind it: there it is the side of its way where the robot
+        is.
         """
-        x, y = normal[:, 0], normal[:, 1]
-        share = np.full(len(x), self.right)
-        fast = np.vecdot(normal, near.velocity) < -own.speed[near.row]
-        if some(fast):
-            off = x * near.velocity[:, 1] - y * near.velocity[:, 0]  # > 0: the row is left of its way
-            share[fast & (off < 0.0)] = -1.0
-            share[fast & (off > 0.0)] = 1.0
-        return share[:, None] * np.stack([y, -x], axis=1)
+        x, y, share = -thing.away_x, -thing.away_y, self.right
+        if x * thing.velocity_x + y * thing.velocity_y < -own.speed:
+            off = x * thing.velocity_y - y * thing.velocity_x  # > 0: the robot is left of its way
+            if off < 0.0:
+                share = -1.0
+            elif off > 0.0:
+                share = 1.0
+        return share * y, -share * x
 
-    def _along_heading(self, setpoint: Array, own: OwnState, near: Nearby) -> Array:
-        """The speeds of twists (N, 4) within the interval that all half-planes leave along the heading."""
-        row = near.row
-        normal, bound = self.bounds(own, near)
-        heading = np.stack([np.cos(own.yaw), np.sin(own.yaw)], axis=1)
-        gain = np.vecdot(normal, heading[row])
-        barred = gain * setpoint[row, 0] > bound + SLACK
-        if not some(barred):
-            return setpoint
+
+def barred(x: float, y: float, near: Nearby) -> bool:
+    """Whether a half-plane bars the velocity x, y [m/s]; sets `excess` of the things."""
+    any_bars = False
+    for k in range(near.count):
+        thing = near.things[k]
+        thing.excess = -(thing.away_x * x + thing.away_y * y) - thing.bound
+        any_bars = any_bars or thing.excess > SLACK
+    return any_bars
+
+
+def along_heading(v: float, own: OwnState, near: Nearby) -> float:
+    """The speed nearest to v [m/s] in the interval that all half-planes leave along the heading."""
+    head_x, head_y = cos(own.yaw), sin(own.yaw)
+    high, low, any_bars = inf, -inf, False
+    for k in range(near.count):
+        thing = near.things[k]
+        bound, gain = thing.bound, -(thing.away_x * head_x + thing.away_y * head_y)
+        any_bars = any_bars or gain * v > bound + SLACK
         # where standing still is allowed the limit is exact; where it is not, a robot that stands broadside to what it
         # should flee from must not be driven at full speed for next to nothing
-        stands = bound >= 0.0
-        safe = np.copysign(np.maximum(np.abs(gain), LEAST), gain)
-        limit = np.where(stands, bound / safe, bound * gain / (gain**2 + SKEW**2))
-        high, low = np.full(len(own.yaw), np.inf), np.full(len(own.yaw), -np.inf)
-        ahead, behind = gain > 0.0, gain < 0.0
-        np.minimum.at(high, row[ahead], limit[ahead])
-        np.maximum.at(low, row[behind], limit[behind])
-        v = clamp(setpoint[:, 0], low, high)
-        torn = low > high  # it should go both ways: only as far as what is not touched yet allows
-        if some(torn):
-            v = np.where(torn, np.where(high >= 0.0, high, np.where(low <= 0.0, low, 0.0)), v)
-        rows = np.unique(row[barred])
-        restrained = setpoint.copy()
-        restrained[rows, 0] = clamp(v[rows], -own.speed[rows], own.speed[rows])
-        return restrained
+        limit = bound * gain / (gain * gain + SKEW * SKEW)
+        if bound >= 0.0:
+            limit = bound / copysign(max(abs(gain), LEAST), gain)
+        if gain > 0.0:
+            high = min(high, limit)
+        elif gain < 0.0:
+            low = max(low, limit)
+    if not any_bars:
+        return v
+    if low > high:  # it should go both ways: only as far as what is not touched yet allows
+        v = high if high >= 0.0 else low if low <= 0.0 else 0.0
+    else:
+        v = clamp(v, low, high)
+    return clamp(v, -own.speed, own.speed)
 
 
-def _tightest(normal: Array, bound: Array, place: Index, rows: int) -> tuple[Array, Array]:
-    """The half-plane of the smallest bound in each sector of each row: (M, L, 2) and (M, L), filled up with 0·u ≤ 0."""
-    sector = np.floor((np.arctan2(normal[:, 1], normal[:, 0]) / np.pi + 1.0) * (0.5 * SECTORS)).astype(np.intp)
-    key = place * (SECTORS + 1) + sector  # exactly π falls into a sector of its own
-    order = np.lexsort((bound, key))
-    first = order[np.flatnonzero(np.diff(key[order], prepend=-1))]
-    of = place[first]
-    begin = np.searchsorted(of, np.arange(rows))
-    slot = np.arange(len(of)) - begin[of]
-    width = int(slot.max(initial=0)) + 1
-    chosen, tightest = np.zeros((rows, width, 2)), np.zeros((rows, width))
-    chosen[of, slot], tightest[of, slot] = normal[first], bound[first]
-    return chosen, tightest
+def tightest(near: Nearby) -> int:
+    """Set `planes` to the half-plane of the smallest bound in each sector; returns how many there are."""
+    count = 0
+    for sector in range(SECTORS + 1):  # exactly π falls into a sector of its own
+        best = -1
+        for k in range(near.count):
+            thing = near.things[k]
+            if thing.counts and sector_of(thing) == sector and (best < 0 or thing.bound < near.things[best].bound):
+                best = k
+        if best >= 0:
+            plane, thing = near.planes[count], near.things[best]
+            plane.x, plane.y, plane.b = -thing.away_x, -thing.away_y, thing.bound
+            count += 1
+    return count
 
 
-def _closest(wanted: Array, normal: Array, bound: Array) -> Array:
-    """The points (M, 2) nearest to `wanted` (M, 2) with a_k·u ≤ b_k for all of normal (M, L, 2), bound (M, L).
+def sector_of(thing: Thing) -> int:
+    return floor((atan2(-thing.away_y, -thing.away_x) / pi + 1.0) * (0.5 * SECTORS))
 
-    The solution of this quadratic program is `wanted` itself, or its projection onto one line, or a corner of two: all
-    are tried. Where no point obeys all, the bounds are raised together by as little as makes one do.
+
+def closest(x: float, y: float, near: Nearby, count: int) -> Planar:
+    """The point nearest to x, y with a·u ≤ b for the first `count` planes.
+
+    The solution of this quadratic program is x, y itself, or its projection onto one line, or a corner of two: all are
+    tried. Where no point obeys all, the bounds are raised together by as little as makes one do.
     """
-    nearest, solved = _candidate(wanted, normal, bound)
-    if not every(solved):
-        rows = np.flatnonzero(~solved)
-        nearest[rows] = _least_violation(wanted[rows], normal[rows], bound[rows])
-    return nearest
+    found = candidate(x, y, near, count, 0.0)
+    if found[2] < inf:
+        return found[0], found[1]
+    found = candidate(x, y, near, count, least_violation(near, count) + SLACK)
+    if found[2] < inf:
+        return found[0], found[1]
+    return 0.0, 0.0  # two that nearly face each other may have no corner in reach
 
 
-def _candidate(wanted: Array, normal: Array, bound: Array) -> tuple[Array, Mask]:
-    """As `_closest`; rows whose half-planes have nothing in common are not solved (M,)."""
-    over = np.vecdot(normal, wanted[:, None]) - bound
-    onto = wanted[:, None] - np.maximum(over, 0.0)[..., None] * normal
-    tried = [wanted[:, None], onto]
-    apart = np.ones((len(wanted), 1 + onto.shape[1]), dtype=bool)
-    if onto.shape[1] > 1:
-        sides = np.arange(onto.shape[1])
-        i, j = np.nonzero(sides[:, None] < sides)
-        x, y = normal[..., 0], normal[..., 1]
-        sine = x[:, i] * y[:, j] - y[:, i] * x[:, j]
-        crosses = np.abs(sine) > PARALLEL
-        sine = np.where(crosses, sine, 1.0)
-        corner_x = (bound[:, i] * y[:, j] - bound[:, j] * y[:, i]) / sine
-        corner_y = (x[:, i] * bound[:, j] - x[:, j] * bound[:, i]) / sine
-        tried.append(np.stack([corner_x, corner_y], axis=2))
-        apart = np.concatenate([apart, crosses], axis=1)
-    points = np.concatenate(tried, axis=1)  # (M, C, 2)
-    # written out: a matrix product would round by how many there are
-    reached = points[:, :, None, 0] * normal[:, None, :, 0] + points[:, :, None, 1] * normal[:, None, :, 1]
-    obeys = (reached <= bound[:, None] + SLACK).all(axis=2) & apart
-    change = points - wanted[:, None]
-    cost = np.where(obeys, np.vecdot(change, change), np.inf)
-    best = cost.argmin(axis=1)
-    every_row = np.arange(len(wanted))
-    return points[every_row, best], np.isfinite(cost[every_row, best])
+def candidate(x: float, y: float, near: Nearby, count: int, raised: float) -> Candidate:
+    """As `closest`, with all bounds `raised` [m/s]."""
+    planes = near.planes
+    best = better((x, y, inf), x, y, x, y, near, count, raised)
+    for k in range(count):
+        plane = planes[k]
+        over = max(plane.x * x + plane.y * y - (plane.b + raised), 0.0)
+        best = better(best, x - over * plane.x, y - over * plane.y, x, y, near, count, raised)
+    for i in range(count):
+        for j in range(i + 1, count):
+            first, second = planes[i], planes[j]
+            sine = first.x * second.y - first.y * second.x
+            if abs(sine) > PARALLEL:
+                b, c = first.b + raised, second.b + raised
+                corner_x, corner_y = (b * second.y - c * first.y) / sine, (first.x * c - second.x * b) / sine
+                best = better(best, corner_x, corner_y, x, y, near, count, raised)
+    return best
 
 
-def _least_violation(wanted: Array, normal: Array, bound: Array) -> Array:
-    """The points (M, 2) that violate the most violated half-plane as little as can be.
+def better(
+    best: Candidate, x: float, y: float, wanted_x: float, wanted_y: float, near: Nearby, count: int, raised: float
+) -> Candidate:
+    """The point x, y in place of the `best` so far if it obeys all planes and is nearer to what is wanted."""
+    off_x, off_y = x - wanted_x, y - wanted_y
+    cost = off_x * off_x + off_y * off_y
+    if not cost < best[2]:
+        return best
+    for k in range(count):
+        plane = near.planes[k]
+        if not x * plane.x + y * plane.y <= plane.b + raised + SLACK:
+            return best
+    return x, y, cost
 
-    By Helly's theorem three half-planes settle how far all bounds must be raised: by −Σ λ b, where λ ≥ 0 are the
-    weights (Σ λ = 1) with which their normals cancel out; or two that face each other.
+
+def least_violation(near: Nearby, count: int) -> float:
+    """How far all bounds must be raised so that a point obeys all of the first `count` planes [m/s].
+
+    By Helly's theorem three half-planes settle that: by −Σ λ b, where λ ≥ 0 are the weights (Σ λ = 1) with which their
+    normals cancel out; or two that face each other.
     """
-    sides = np.arange(normal.shape[1])
-    i, j = np.nonzero(sides[:, None] < sides)
-    x, y = normal[..., 0], normal[..., 1]
-    sine, cosine = x[:, i] * y[:, j] - y[:, i] * x[:, j], x[:, i] * x[:, j] + y[:, i] * y[:, j]
-    facing = (np.abs(sine) <= PARALLEL) & (cosine < 0.0)
-    raised = np.where(facing, -0.5 * (bound[:, i] + bound[:, j]), 0.0).max(axis=1, initial=0.0)  # one alone: no pair
-    i, j, k = np.nonzero((sides[:, None, None] < sides[:, None]) & (sides[:, None] < sides))
-    if len(i):
-        weights = np.stack(
-            [
-                x[:, j] * y[:, k] - y[:, j] * x[:, k],
-                x[:, k] * y[:, i] - y[:, k] * x[:, i],
-                x[:, i] * y[:, j] - y[:, i] * x[:, j],
-            ]
-        )
-        total = weights[0] + weights[1] + weights[2]
-        cancel = ((weights >= 0.0).all(axis=0) | (weights <= 0.0).all(axis=0)) & (np.abs(total) > PARALLEL)
-        sums = weights[0] * bound[:, i] + weights[1] * bound[:, j] + weights[2] * bound[:, k]
-        violation = np.where(cancel, -sums / np.where(cancel, total, 1.0), 0.0)
-        raised = np.maximum(raised, violation.max(axis=1))
-    nearest, solved = _candidate(wanted, normal, bound + (raised + SLACK)[:, None])
-    return np.where(solved[:, None], nearest, 0.0)  # two that nearly face each other may have no corner in reach
+    raised, planes = 0.0, near.planes
+    for i in range(count):
+        for j in range(i + 1, count):
+            p, q = planes[i], planes[j]
+            sine, cosine = p.x * q.y - p.y * q.x, p.x * q.x + p.y * q.y
+            if abs(sine) <= PARALLEL and cosine < 0.0:
+                raised = max(raised, -0.5 * (p.b + q.b))
+            for k in range(j + 1, count):
+                r = planes[k]
+                first, second = q.x * r.y - q.y * r.x, r.x * p.y - r.y * p.x
+                total = first + second + sine
+                agree = first >= 0.0 and second >= 0.0 and sine >= 0.0
+                agree = agree or (first <= 0.0 and second <= 0.0 and sine <= 0.0)
+                if agree and abs(total) > PARALLEL:
+                    raised = max(raised, -(first * p.b + second * q.b + sine * r.b) / total)
+    return raised
 
 
-def _scaled(velocity: Array, speed: Array, normal: Array, bound: Array, place: Index) -> Array:
-    """Velocities (M, 2) made so much smaller that none breaks a limit, or a half-plane that standing still obeys."""
-    share = np.minimum(1.0, speed / np.maximum(norm(velocity), SLACK))
-    reached = np.vecdot(normal, velocity[place]) * share[place]
-    over = (reached > bound + SLACK) & (bound >= 0.0)
-    if some(over):
-        np.minimum.at(share, place[over], (share[place] * bound / np.where(over, reached, 1.0))[over])
-    return velocity * share[:, None]
+def scaled(x: float, y: float, speed: float, near: Nearby) -> Planar:
+    """Velocity made so much smaller that it breaks no limit, and no half-plane that standing still obeys."""
+    share = least = min(1.0, speed / max(sqrt(x * x + y * y), SLACK))
+    for k in range(near.count):
+        thing = near.things[k]
+        reached = -(thing.away_x * x + thing.away_y * y) * share
+        if thing.counts and reached > thing.bound + SLACK and thing.bound >= 0.0:
+            least = min(least, share * thing.bound / reached)
+    return x * least, y * least
