@@ -1,4 +1,4 @@
-"""The robot process: a deadline loop around the decision. Here is the I/O; `agents.agent` decides.
+"""The robot process: a deadline loop around the decision. Here is the I/O; `agents.robot` decides.
 
 One plain loop on the clock `uptime`, no asyncio, no callbacks: received samples wait in ring channels and are polled.
 """
@@ -11,24 +11,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from math import ceil, isfinite
+from math import ceil, inf, isfinite, isnan
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
 import zenoh
 
-from agents.agent import Actions, Agent
-from agents.arrays import Index, some
 from agents.body.external_pose import External
 from agents.body.interface import Body, BodyState, call_all, inspect
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import Clock, uptime
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import TOLD_TO_END, Phase
-from agents.decision.transmission import Transmission
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.access_control import Rights
@@ -37,16 +33,20 @@ from agents.network.keys import Keys
 from agents.network.name_ownership import ANSWER_S, NameTaken, OwnershipCheck, claim
 from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
+from agents.plugins.calls import explain
+from agents.plugins.registry import FAILURES
+from agents.robot import Robot
 from agents.runtime.command_line import on_termination
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
 from agents.runtime.lifeline import Lifeline
 from agents.runtime.orders import LAND, STOP, carry_out
 from agents.runtime.pose_inbox import PoseInbox
-from agents.runtime.range_inbox import RangeInbox, replace_rows
+from agents.runtime.range_inbox import RangeInbox
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, SILENCE_S, Watchdog
 from agents.safety.detection import SLOWEST
+from agents.safety.situation import ProcessHealth
 from agents.ticks import Ticks
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
@@ -64,15 +64,15 @@ class Setup:
     encoding: messages.Encoding  # of sent payloads
     state_hz: float  # [1/s] rate of telemetry
     lifeline: bool  # whether standard input is a lifeline
-    located: Sequence[bool]  # rows with a position measured from outside
+    located: Sequence[bool]  # robots with a position measured from outside
     # source of the range readings of each row: its body; the world, by the key `ranges` of the row ("world"); or that
     # key, received by the body itself ("far"). Left out: the bodies.
     ranging: Sequence[Ranging] = ()
     # located rows whose positions a simulation knows without noise: they may repeat. Left out: none
     exact: Sequence[bool] = ()
-    # effects of the modelled channel on received poses, by link; None: none
-    conditions: Conditions | None = None
-    goal_conditions: Conditions | None = None  # on received goals, by guided row
+    # effects of the modelled channel on received poses, for each robot by link; empty: none
+    conditions: Sequence[Sequence[Conditions]] = ()
+    goal_conditions: Sequence[Conditions] = ()  # on received goals, for each robot; empty: none
     clock: Clock = field(default_factory=Clock)  # of the experiment
     once: bool = False  # the process ends when its robots are down after an experiment
     rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
@@ -84,37 +84,40 @@ class Setup:
 class Runtime:
     """Drives the robots of one process through an experiment."""
 
-    def __init__(self, assignment: Assignment, body: Body, setup: Setup) -> None:
-        self.agent = Agent(assignment)
-        self._assignment, self._body, self._setup = assignment, body, setup
-        self._names = assignment.names
+    def __init__(self, assignments: Sequence[Assignment], body: Body, setup: Setup) -> None:
+        self.health = ProcessHealth()
+        self.robots = [Robot(assignment, self.health) for assignment in assignments]
+        self._body, self._setup = body, setup
+        self._names = tuple(assignment.name for assignment in assignments)
+        common = assignments[0]  # rates, limits and duration are those of the experiment
+        self._limits, self._duration = common.limits, common.duration
         self._mime = messages.MIME[setup.encoding]
-        self._dt = 1.0 / assignment.body_hz
-        self._state_every = round(assignment.body_hz / setup.state_hz)
+        self._dt = 1.0 / common.body_hz
+        self._state_every = round(common.body_hz / setup.state_hz)
         self._counts = Counts(len(self._names))
         self._state_slot = 0
         self._stopping: str | None = None
         self._leaving: set[int] = set()  # rows that were ordered to leave the run
         self._retired: set[int] = set()  # rows that land, or have landed, while the run goes on
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
-        self._estimator = External(len(self._names))
-        self._state: BodyState | None = None  # last reading of the body
+        self._estimators = [External() for _ in self._names]
+        self._states: Sequence[BodyState] = ()  # last reading of the body
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._opened = self._joined = False
-        self._ticks = Ticks(assignment.body_hz, clock=uptime)
+        self._ticks = Ticks(common.body_hz, clock=uptime)
         self._utc = 0.0
-        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in assignment.names], network.ROBOT_LEASE_S)
+        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in self._names], network.ROBOT_LEASE_S)
         self._hands_off = False  # another process drives the bodies, or may do so
         self._reason_to_end: Callable[[], str | None] = lambda: None
-        self._reach = validation.reach_of(assignment.limits.low, assignment.limits.high)
-        self._everyone = np.arange(len(self._names))
-        self._on_wheels = np.flatnonzero([not kind.flies for kind in assignment.kinds])
+        self._reach = validation.reach_of(common.limits.low, common.limits.high)
+        self._everyone = tuple(range(len(self._names)))
+        self._on_wheels = tuple(row for row, each in enumerate(assignments) if not each.kind.flies)
         self._began = setup.clock.utc()
         self._owned: list[zenoh.LivelinessToken] = []
         self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows that are alive for their neighbours
         self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
         self._coming_down = False  # the loop is over
-        ceiling = float(assignment.limits.high[2]) if any(kind.flies for kind in assignment.kinds) else 0.0
+        ceiling = common.limits.high[2] if any(each.kind.flies for each in assignments) else 0.0
         self._descent_s = ceiling / SLOWEST  # [s] longest landing: what still descends after a limit would fall
         self._watchdog = Watchdog(
             body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s,
@@ -173,7 +176,9 @@ class Runtime:
         self._coming_down = True
         self._watchdog.start()
         failures: list[Exception] = []
-        if self._in_the_air(failures) and (self.agent.lifecycle.phase < Phase.DONE).any():  # else it was stopped
+        if self._in_the_air(failures) and any(
+            robot.lifecycle.phase < Phase.DONE for robot in self.robots
+        ):  # else it was stopped
             error = sys.exception()
             why = (
                 "it did not land in time"
@@ -185,7 +190,7 @@ class Runtime:
         if failures:
             raise failures[0]
 
-    def _order_down(self, order: Callable[[Index], object], limit_s: float) -> None:
+    def _order_down(self, order: Callable[[Sequence[int]], object], limit_s: float) -> None:
         """Repeats an order until it succeeds and no row flies any more, for at most `limit_s` [s].
 
         A body that cannot be read gets all of that time if it flew before. The first error is raised at the end.
@@ -193,7 +198,7 @@ class Runtime:
         if self._hands_off:
             return
         failures: list[Exception] = []
-        begin, again, obeyed = self._ticks.elapsed(), -np.inf, False
+        begin, again, obeyed = self._ticks.elapsed(), -inf, False
         while True:
             self._watchdog.beat()
             self._await_ownership()
@@ -212,7 +217,8 @@ class Runtime:
     def _in_the_air(self, failures: list[Exception]) -> bool:
         """Whether a row flies, by the last successful reading of its body; an error is noted."""
         with _noted(failures):
-            self._airborne = some(self._body.read(max(self._ticks.t, self._ticks.elapsed())).flying)
+            states = self._body.read(max(self._ticks.t, self._ticks.elapsed()))
+            self._airborne = any(state.flying for state in states)
         return self._airborne
 
     # ------------------------------------------------------------------ the network
@@ -253,7 +259,7 @@ class Runtime:
         """
         if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
-        limits, drives = self._assignment.limits, self._on_wheels
+        limits, drives = self._limits, self._on_wheels
         woke, self._hands_off = uptime(), True
         self._ownership.begin(self._session)
         while not self._owns_names():
@@ -261,9 +267,9 @@ class Runtime:
             if waited > limits.offline_s or (waited > ANSWER_S and self._reason_to_end() is not None):
                 self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
                 break
-            if len(drives) and waited > limits.link_silence_s:
+            if drives and waited > limits.link_silence_s:
                 self._body.land(drives)
-                drives = drives[:0]
+                drives = ()
             self._watchdog.beat()
             time.sleep(self._dt)
         self._ownership.stood_still()
@@ -278,15 +284,15 @@ class Runtime:
         self._opened = True
         keys, names = self._setup.keys, self._names
         self._session = session
-        self._router_due, self._silent_since = -np.inf, np.inf
+        self._router_due, self._silent_since = -inf, inf
         self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
         self._last = [pubsub.LastValue(session, keys.pose(name), self._mime) for name in names]
         self._orders = [pubsub.Orders(session, keys.order(name), messages.Order) for name in names]
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
-        located = np.flatnonzero(self._setup.located).tolist()
-        exact = np.flatnonzero(self._setup.exact).tolist()
-        silence_s = self.agent.assignment.limits.own_silence_s
+        located = [row for row, there in enumerate(self._setup.located) if there]
+        exact = [row for row, there in enumerate(self._setup.exact) if there]
+        silence_s = self._limits.own_silence_s
         self._located = (
             MeasuredPositions(session, keys, names, located, self._reach, exact=exact, silence_s=silence_s)
             if located
@@ -294,21 +300,19 @@ class Runtime:
         )
         ranging = tuple(self._setup.ranging) or ("body",) * len(names)
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
-        self._from_world = np.array(seen_by_world, dtype=np.intp)
         self._ranges = RangeInbox(session, keys, names, seen_by_world) if seen_by_world else None
         self._neighbours = neighbours = PoseInbox(
-            session, keys, self.agent, reach=self._reach, conditions=self._setup.conditions
+            session, keys, self.robots, reach=self._reach, conditions=self._setup.conditions
         )
-        guidance = self.agent.guidance
         self._goals = None
-        if guidance is not None:
+        if any(robot.guidance is not None for robot in self.robots):
             of_goals = self._setup.goal_conditions
-            self._goals = GoalInbox(session, keys, self.agent, guidance, reach=self._reach, conditions=of_goals)
+            self._goals = GoalInbox(session, keys, self.robots, reach=self._reach, conditions=of_goals)
         self._telemetry = Telemetry(
             session,
             keys,
             self._setup.encoding,
-            agent=self.agent,
+            robots=self.robots,
             neighbours=neighbours,
             counts=self._counts,
             malformed=self._malformed,
@@ -337,22 +341,22 @@ class Runtime:
 
     def _recover(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""
-        for row in np.flatnonzero(self.agent.lifecycle.active).tolist():
-            self.agent.lifecycle.land(row, why)
-        self.agent.landing.land_in_place()  # the body lands by other means
+        for robot in self.robots:
+            if robot.lifecycle.active:
+                robot.lifecycle.land(why)
+            robot.landing.land_in_place()  # the body lands by other means
         self._declare_tokens()
 
     def _hold_after_suspend(self, slept: float) -> None:
         """Holds position until neighbour poses are fresh again, after the loop was suspended for `slept` [s]."""
-        self.agent.health.mark_resumed(self._ticks.t, slept)
+        self.health.mark_resumed(self._ticks.t, slept)
         print(f"{', '.join(self._names)}: stood still for {slept:.1f} s; holding", flush=True)
 
     def _receive(self, t: float) -> None:
-        agent = self.agent
-        health = agent.health
+        health = self.health
         health.offline_since = self._cut_off_since(t)
         for _, there in self._conductor.changes() if self._conductor.waiting else ():
-            health.conductor_lost_since = np.inf if there else min(health.conductor_lost_since, t)
+            health.conductor_lost_since = inf if there else min(health.conductor_lost_since, t)
         self._neighbours.deliver(t, self._utc)
         if self._goals is not None:
             self._goals.receive(t, self._utc)
@@ -360,8 +364,9 @@ class Runtime:
             self._apply_stops()
         if (located := self._located) is not None:
             for row, taken, position, yaw in located.receive(self._utc, t):
-                if agent.believes(row, taken, position):
-                    self._body.locate(row, taken, position, agent.believed_yaw(row, taken, yaw))
+                robot = self.robots[row]
+                if robot.believes(taken, position):
+                    self._body.locate(row, taken, position, robot.believed_yaw(taken, yaw))
         for row, orders in enumerate(self._orders):
             for query, order in orders.read() if orders.waiting else ():
                 self._obey(row, query, order, t)
@@ -374,7 +379,7 @@ class Runtime:
         if t >= self._router_due:  # a check of the router costs as much as a law
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
-            if before < np.inf and self._silent_since == np.inf:
+            if before < inf and self._silent_since == inf:
                 self._ownership.begin(self._session)  # it was cut off
             self._owns_names()
         return self._silent_since
@@ -392,8 +397,8 @@ class Runtime:
         """Ends the lifecycle of all rows after an emergency stop, see `_cut`."""
         for stop in network.received(self._estop):
             self._cut_off = False  # the phases hold it from now on
-            for row in range(len(self._names)):
-                self.agent.lifecycle.stop(row, stop.words)
+            for robot in self.robots:
+                robot.lifecycle.stop(stop.words)
 
     def _malformed(self) -> int:
         """Payloads that were refused, of all kinds but poses."""
@@ -407,13 +412,14 @@ class Runtime:
     def _obey(self, row: int, query: zenoh.Query, order: messages.Order, t: float) -> None:
         key = self._setup.keys.order(self._names[row])
         with query:
-            waits = self.agent.lifecycle.phase[row] == Phase.AIRBORNE
-            slept = self.agent.health.suspended_s
+            robot = self.robots[row]
+            waits = robot.lifecycle.phase == Phase.AIRBORNE
+            slept = self.health.suspended_s
             # the conductor has given up waiting
-            if order.order == "takeoff" and slept > ASK_S and self.agent.health.just_resumed(t):
+            if order.order == "takeoff" and slept > ASK_S and self.health.just_resumed(t):
                 refusal, value = f"the process stood still for {slept:.1f} s; ask again", None
             else:
-                refusal, value = carry_out(self.agent, row, order, t, self._utc)
+                refusal, value = carry_out(robot, order, t, self._utc)
             self._counts.refused += bool(refusal)
             if order.order == "leave":
                 self._leaving.add(row)
@@ -422,20 +428,21 @@ class Runtime:
             ):  # a running robot keeps its ticks
                 self._ticks.align(order.at - self._utc)  # robots that start together decide together
                 self._telemetry.due = t  # the central controller must know the start in time
-            phase = Phase(self.agent.lifecycle.phase[row]).word
+            phase = Phase(robot.lifecycle.phase).word
             found = self._inspect(row, t) if order.order == "inspect" else None
             reply = messages.Reply(self._names[row], not refusal, phase, refusal, value, found)
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
 
     def _inspect(self, row: int, t: float) -> messages.Inspection:
-        known, state = inspect(self._body, row), self._state
-        if state is None:
+        known = inspect(self._body, row)
+        if not self._states:
             return known
+        state = self._states[row]
         return msgspec.structs.replace(
             known,
-            flying=bool(state.flying[row]),
-            age_s=messages.number(t - float(state.time[row])),
-            ahead_s=None if state.ahead is None else messages.number(float(state.ahead[row])),
+            flying=state.flying,
+            age_s=messages.number(t - state.time),
+            ahead_s=None if isnan(state.ahead) else messages.number(state.ahead),
         )
 
     # ------------------------------------------------------------------ the loop
@@ -452,7 +459,7 @@ class Runtime:
         self._run_ticks(stopping)
 
     def _run_ticks(self, stopping: Callable[[], str | None]) -> None:
-        ticks, counts, farewell = self._ticks, self._counts, np.inf
+        ticks, counts, farewell = self._ticks, self._counts, inf
         while True:
             self._watchdog.beat()
             if self._watchdog.tripped:
@@ -465,19 +472,19 @@ class Runtime:
             missed = ticks.begin()
             counts.missed += missed
             counts.late_s = max(counts.late_s, ticks.late_s)
-            self.agent.skip_ticks(missed)
+            self._skip_ticks(missed)
             if missed * self._dt > self._setup.loop_silence_s:
                 self._hold_after_suspend(missed * self._dt)
             t = ticks.t
             ticks.zero -= self._setup.clock.slew(self._dt)
             self._tick(t)
-            if farewell == np.inf and (reason := stopping()) is not None:
+            if farewell == inf and (reason := stopping()) is not None:
                 farewell = t + max(FAREWELL_S, self._descent_s)
                 self._stopping = reason
-                for row in range(len(self._names)):
-                    self.agent.lifecycle.land(row, reason)
+                for robot in self.robots:
+                    robot.lifecycle.land(reason)
             if (self._stopping is not None or self._setup.once) and (
-                t > farewell or (self.agent.lifecycle.phase == Phase.DONE).all()
+                t > farewell or all(robot.lifecycle.phase == Phase.DONE for robot in self.robots)
             ):
                 self._telemetry.send_statuses(t, everything=True)
                 return
@@ -486,57 +493,78 @@ class Runtime:
         """Sleeps, so that other processes get the CPU to stop their motors."""
         ticks = ceil(STOP_YIELD_S / self._dt)
         self._ticks.next += ticks * self._dt
-        self.agent.tick += ticks
+        for robot in self.robots:
+            robot.tick += ticks
         time.sleep(STOP_YIELD_S)
 
+    def _skip_ticks(self, ticks: int) -> None:
+        """Count a tick after `ticks` that are too late, mostly 0."""
+        self.health.count_tick(ticks, self._dt)
+        if ticks:
+            for robot in self.robots:
+                robot.skip_ticks(ticks)
+
     def _tick(self, t: float) -> None:
-        begun = self.agent.decisions > 0
         self._receive(t)
-        state = self._body.read(t)
-        self._airborne = some(state.flying)
-        if not isfinite(state.velocity.sum()):
-            self._estimator.estimate(t, state)
-        if (located := self._located) is not None:
-            located.annotate(state, t)
-        self._state = state
-        if self._ranges is not None:
-            state = replace(state, rays=replace_rows(state.rays, self._ranges.read(self._utc, t), self._from_world))
-        transmission = self.agent.transmit(t, state)
-        for row in transmission.rows.tolist():
-            if row not in self._retired:
-                self._send_pose(row, transmission, float(state.yaw[row]), t)
-        actions = self.agent.act(t, state, transmission)
-        self._act(actions)
-        if self._retired or not self.agent.lifecycle.all_running:
+        states = self._states = self._read(t)
+        try:
+            running = self._decide(t, states)
+        except FAILURES as error:
+            raise explain(error, self.robots[0].assignment.plugins) from error
+        if self._retired or not running:
             self._retire(t)
-        counts, telemetry = self._counts, self._telemetry
-        if not begun and self.agent.decisions:
-            counts.begin()
-        counts.ticks += 1
-        if some(actions.changed):
-            counts.interventions += actions.changed
-        if some(actions.avoided):
-            counts.avoided += actions.avoided
-        slot = (self.agent.tick - 1) // self._state_every
+        self._counts.ticks += 1
+        slot = (self.robots[0].tick - 1) // self._state_every
+        telemetry = self._telemetry
         if slot != self._state_slot:
             self._state_slot = slot
-            telemetry.send_states(self.agent.state, actions, t)
-            telemetry.send_ranges(state)
-        telemetry.send_statuses(t, everything=t >= telemetry.due, state=state, changed=self._neighbours.changed)
+            telemetry.send_states(t)
+            telemetry.send_ranges(states)
+        telemetry.send_statuses(t, everything=t >= telemetry.due, states=states, changed=self._neighbours.changed)
         self._neighbours.changed = False
+
+    def _read(self, t: float) -> Sequence[BodyState]:
+        """States of the bodies, completed by what others measure."""
+        states = self._body.read(t)
+        self._airborne = any([state.flying for state in states])
+        for row, state in enumerate(states):
+            if isnan(state.velocity[0]):
+                self._estimators[row].estimate(t, state)
+        if self._located is not None:
+            self._located.annotate(states, t)
+        if self._ranges is not None:
+            self._ranges.replace_scans(states, self._utc, t)
+        return states
+
+    def _decide(self, t: float, states: Sequence[BodyState]) -> bool:
+        """Let all robots decide, transmit and act; returns whether all are running, as before."""
+        counts, running, begun = self._counts, True, self.robots[0].decisions > 0
+        for row, robot in enumerate(self.robots):
+            if robot.transmit(t, states[row]) and row not in self._retired:
+                self._send_pose(row, robot, states[row].yaw, t)
+        for row, robot in enumerate(self.robots):
+            robot.act(t)
+            running = running and robot.lifecycle.phase == Phase.RUNNING
+            counts.interventions[row] += robot.changed
+            counts.avoided[row] += robot.avoided
+        self._act()
+        if not begun and self.robots[0].decisions:
+            counts.begin()
+        return running
 
     def _retire(self, t: float) -> None:
         """Undeclares the tokens of rows that leave, or land unasked, and silences them: no neighbour must follow them.
 
         The latter declare theirs again after the experiment; rows that were ordered to land keep theirs.
         """
-        life = self.agent.lifecycle
-        during = np.isfinite(life.start_at) & (t < life.start_at + self._assignment.duration)
-        # support processes without a launcher end with the last token (`agents.network.shutdown`)
-        down = self.agent.descending if self._stopping is None else life.phase == Phase.DONE
-        for row in np.flatnonzero(down).tolist():
-            unasked = during[row] and not life.reason[row].startswith((messages.EMERGENCY, LAND, STOP))
-            if (unasked or row in self._leaving) and row not in self._retired:
+        during = []
+        for row, robot in enumerate(self.robots):
+            life = robot.lifecycle
+            during.append(isfinite(life.start_at) and t < life.start_at + self._duration)
+            # support processes without a launcher end with the last token (`agents.network.shutdown`)
+            down = robot.descending if self._stopping is None else life.phase == Phase.DONE
+            unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
+            if down and (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
                 with self._tokens_lock:
                     token = self._tokens.pop(row, None)
@@ -546,34 +574,31 @@ class Runtime:
             self._retired.difference_update(back)
             self._declare_tokens()
 
-    def _act(self, actions: Actions) -> None:
+    def _act(self) -> None:
         """Commands the body, motors-off first."""
-        commands = actions.commands
+        robots, body = self.robots, self._body
         stale = self._await_ownership()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
-        if commands is not None:
-            orders = ((self._body.stop, commands.stop), (self._body.land, commands.land))
-            call_all(partial(order, rows) for order, rows in orders if len(rows))
+        stops = [row for row, robot in enumerate(robots) if robot.stops]
+        lands = [row for row, robot in enumerate(robots) if robot.lands]
+        if stops or lands:
+            call_all(partial(order, rows) for order, rows in ((body.stop, stops), (body.land, lands)) if rows)
+        if rises := [row for row, robot in enumerate(robots) if robot.takes_off]:
             if stale:  # the order is old now
-                for row in commands.takeoff.tolist():
-                    self.agent.lifecycle.land(row, "its process stood still at its take-off")
-            elif len(commands.takeoff) and not overruled:
+                for row in rises:
+                    robots[row].lifecycle.land("its process stood still at its take-off")
+            elif not overruled:
                 self._airborne = True
-                self._body.takeoff(commands.takeoff, self._assignment.hover[commands.takeoff])
+                body.takeoff(rises, [robots[row].assignment.hover for row in rises])
         if not overruled and not stale:
-            self._body.command(actions.setpoint)
+            body.command([robot.setpoint for robot in robots])
         if self._cut_off and not overruled:  # the stop came in between: it has the last word
-            self._body.stop(self._everyone)
+            body.stop(self._everyone)
 
-    def _send_pose(self, row: int, transmission: Transmission, yaw: float, t: float) -> None:
+    def _send_pose(self, row: int, robot: Robot, yaw: float, t: float) -> None:
         self._counts.sent[row] += 1
         pose = messages.pose(
-            self._names[row],
-            self._counts.sent[row],
-            self._utc + t,
-            transmission.position[row].tolist(),
-            transmission.velocity[row].tolist(),
-            yaw,
+            self._names[row], self._counts.sent[row], self._utc + t, robot.sent_position, robot.sent_velocity, yaw
         )
         payload = messages.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)

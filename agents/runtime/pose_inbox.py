@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
-from math import inf, nan
-from typing import Final
+from math import inf
+from typing import Final, Protocol
 
 import msgspec
-import numpy as np
 import zenoh
 
-from agents.agent import Agent
-from agents.arrays import Array, Index, PoseTable
-from agents.decision.centralised import Centre
-from agents.decision.neighbours import NeighbourStates
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
+from agents.robot import Robot
 from agents.runtime.pose_order import News, PoseOrder
 
 LATE_S: Final = 3.0  # longest delay of a pose in a network: Zenoh holds one back for 2 s behind a missing one
@@ -54,19 +50,18 @@ class NeighbourSubscription:
         session: zenoh.Session,
         keys: Keys,
         name: str,
-        links: Index,
+        links: Sequence[int],
         *,
         reach: messages.Vector,
         rate: float,
         depth: int = pubsub.POSES,
     ) -> None:
-        """Subscribes to the robot `name`, the sender on `links` (K,).
+        """Subscribes to the robot `name`, the sender on `links`.
 
         `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s], and
         `depth` of them may wait.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
-        self.numbers: list[int] = links.tolist()
         self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
@@ -160,6 +155,19 @@ class NeighbourSubscription:
 NEWS: Final = 20_000  # poses that wait for telemetry, which empties them several times a second: 10 MB
 
 
+class Knowledge(Protocol):
+    """Recipient of what an inbox learns of the senders on its links."""
+
+    def mark_alive(self, link: int) -> None: ...
+
+    def mark_lost(self, link: int, t: float) -> None: ...
+
+    def discard_pose(self, link: int) -> None: ...
+
+
+Arrived = tuple[int, float, ReceivedPose]  # link, arrival [s], pose
+
+
 class ModelledInbox:
     """Poses of several robots through the modelled channel, and their liveliness; polled."""
 
@@ -167,9 +175,9 @@ class ModelledInbox:
         self,
         session: zenoh.Session,
         keys: Keys,
-        links: Mapping[str, Index],  # links of each sender
-        conditions: Conditions,  # effects of the modelled channel on each link (E)
-        states: NeighbourStates | Centre,
+        links: Mapping[str, Sequence[int]],  # links of each sender
+        conditions: Sequence[Conditions],  # effects of the modelled channel on each link
+        knowledge: Knowledge,
         *,
         reach: messages.Vector,
         rate: float,
@@ -180,37 +188,37 @@ class ModelledInbox:
 
         `counted` tells whether a pose of that stamp [s] matters, so that those lost before it count.
         """
-        self._states, self._channel, self._counted = states, Channel(conditions), counted
+        self._knowledge, self._channel, self._counted = knowledge, Channel(conditions), counted
         self.senders = [
             NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth)
             for name, mine in links.items()
         ]
-        self.dropped: Index = self._channel.dropped  # (E,) samples that the channel dropped
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
         self.changed = False  # a sender appeared or vanished since the caller reset this
         self._doubted = [False] * len(self.senders)
 
     @property
+    def dropped(self) -> list[int]:
+        """Samples that the channel dropped on each link."""
+        return self._channel.dropped
+
+    @property
     def malformed(self) -> int:
         return sum(sender.malformed for sender in self.senders)
 
-    def receive(self, t: float, utc: float, start: Callable[[], Array], own: Collection[str] = ()) -> PoseTable | None:
-        """Poses that got through until `t` [s] of a clock that was 0 at `utc` [s]; None without any.
+    def receive(
+        self, t: float, utc: float, start: Callable[[int], float], own: Collection[str] = ()
+    ) -> Sequence[Arrived]:
+        """Poses that got through until `t` [s] of a clock that was 0 at `utc` [s].
 
-        `start` tells a modelled channel the common start (E,) [s], `own` are robots of this process. `extra` of the
-        poses is the time of measurement, see `ReceivedPose.measured`, on that clock.
+        `start` tells a modelled channel the common start of the receiver on a link [s], `own` are robots of this
+        process.
         """
         for sender in self.senders:
             for change in sender.token_changes() if sender.tokens else ():
                 self.changed = True
-                if change is TokenChange.APPEARED:
-                    self._states.mark_alive(sender.links)
-                elif change is TokenChange.NEW_SESSION:
-                    self._begin(sender)
-                else:
-                    self._channel.forget(sender.links)
-                    self._states.mark_lost(sender.links, t)
-        now, arrived = utc + t, list[tuple[int, ReceivedPose]]()
+                self._note_change(sender, change, t)
+        now, arrived = utc + t, list[Arrived]()
         for sender in self.senders:
             for received in sender.new_poses(now):
                 if received.missed and self._counted(received.pose.stamp - utc):
@@ -218,105 +226,130 @@ class ModelledInbox:
                 self.arrived += sender.name not in own
                 if received.anew:
                     self._begin(sender)
-                    arrived = [(link, before) for link, before in arrived if link not in sender.links]
-                arrived += [(link, received) for link in sender.numbers]
+                    arrived = [each for each in arrived if each[0] not in sender.links]
+                arrived += [(link, t, received) for link in sender.links]
         self._follow_doubts(t)
-        if arrived:
-            poses = _table(arrived, t, utc)
-            if self._channel.ideal:
-                return poses
-            begun = start()
-            for at in range(len(arrived)):  # the queue of a link counts one sample after the other
-                one = poses.take(np.array([at]))
-                self._channel.send(one, start=begun[one.link], now=t)
-        return self._channel.due(t)
+        channel = self._channel
+        if channel.ideal:
+            return arrived
+        for link, _, received in arrived:
+            pose = received.pose
+            channel.send(link, received, pose.seq, pose.stamp - utc, start=start(link), size=received.size, now=t)
+        return channel.due(t)
+
+    def _note_change(self, sender: NeighbourSubscription, change: TokenChange, t: float) -> None:
+        if change is TokenChange.NEW_SESSION:
+            self._begin(sender)
+            return
+        for link in sender.links:
+            if change is TokenChange.APPEARED:
+                self._knowledge.mark_alive(link)
+            else:
+                self._channel.forget(link)
+                self._knowledge.mark_lost(link, t)
 
     def _follow_doubts(self, t: float) -> None:
         """A sender of which no pose can be believed is lost, although its token stands."""
         if (doubted := [bool(sender.doubt) for sender in self.senders]) == self._doubted:
             return
         for sender, doubt, before in zip(self.senders, doubted, self._doubted, strict=True):
-            if doubt and not before:
-                self._states.mark_lost(sender.links, t)
-            elif before and not doubt and sender.alive:
-                self._states.mark_alive(sender.links)
+            for link in sender.links:
+                if doubt and not before:
+                    self._knowledge.mark_lost(link, t)
+                elif before and not doubt and sender.alive:
+                    self._knowledge.mark_alive(link)
         self._doubted, self.changed = doubted, True
 
     def _begin(self, sender: NeighbourSubscription) -> None:
         """Forgets a sender that has a new session."""
-        self._channel.forget(sender.links)
-        self._states.discard_poses(sender.links)
-
-
-def _table(arrived: list[tuple[int, ReceivedPose]], t: float, utc: float) -> PoseTable:
-    """Poses that arrived at `t` [s], each with its link; times on the clock that was 0 at `utc` [s]."""
-    whole = np.array([(link, received.pose.seq, received.size) for link, received in arrived])
-    real = np.array([
-        (
-            received.pose.stamp - utc, t, *received.pose.position, *(received.pose.velocity or messages.STILL),
-            nan if received.pose.yaw is None else received.pose.yaw, received.measured - utc,
-        )
-        for _, received in arrived
-    ])  # fmt: skip
-    return PoseTable(
-        whole[:, 0], whole[:, 1], real[:, 0], real[:, 1], real[:, 2:5], real[:, 5:8], real[:, 8], whole[:, 2],
-        real[:, 9:],
-    )  # fmt: skip
+        for link in sender.links:
+            self._channel.forget(link)
+            self._knowledge.discard_pose(link)
 
 
 class PoseInbox(ModelledInbox):
-    """Poses of all neighbours of the rows of a process."""
+    """Poses of all neighbours of the robots of a process."""
 
     def __init__(
         self,
         session: zenoh.Session,
         keys: Keys,
-        agent: Agent,
+        robots: Sequence[Robot],
         *,
         reach: messages.Vector,
-        conditions: Conditions | None = None,
+        conditions: Sequence[Sequence[Conditions]] = (),
     ) -> None:
-        """Subscribes to the neighbours of the rows of `agent`, which gets poses and losses.
+        """Subscribes to the neighbours of `robots`, which get poses and losses.
 
-        `reach` as of `NeighbourSubscription`; `conditions` of each link, None: an ideal network.
+        `reach` as of `NeighbourSubscription`; `conditions` of each link of each robot, empty: an ideal network.
         """
-        self._assignment, self._neighbours, self._lifecycle = agent.assignment, agent.neighbours, agent.lifecycle
-        links, names = agent.assignment.links, agent.assignment.robots
-        senders = [names[sender] for sender in links.sender.tolist()]
-        self._ends = list(zip(links.receiver.tolist(), senders, strict=True))
+        self._robots = robots
+        self._own = {robot.assignment.name for robot in robots}
+        # of each link: row of the robot that receives on it, and its number among that robot's links
+        self._ends = [(row, k) for row, robot in enumerate(robots) for k in range(len(robot.neighbours.all))]
+        links: dict[str, list[int]] = {}
+        for link, (row, k) in enumerate(self._ends):
+            links.setdefault(robots[row].neighbours.all[k].name, []).append(link)
+        ideal = [Conditions()] * len(self._ends)
+        first = robots[0].assignment
         super().__init__(
-            session, keys, links.by_sender(names),
-            conditions or Conditions.ideal(len(links)), agent.neighbours,
-            reach=reach, rate=agent.assignment.body_hz / agent.assignment.pose_every,
+            session, keys, links, [each for own in conditions for each in own] or ideal, self,
+            reach=reach, rate=first.body_hz / first.pose_every,
         )  # fmt: skip
-        # (n) newest received poses of each row, for telemetry, which empties them
-        self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in agent.assignment.names]
-        self.received = [0] * len(agent.assignment.names)  # (n) received poses of each row
+        # (n) newest received poses of each robot, for telemetry, which empties them
+        self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in robots]
+        self.received = [0] * len(robots)  # (n) received poses of each robot
         self._marks = [(0.0, "", 0)] * len(self.senders)
 
+    def mark_alive(self, link: int) -> None:
+        row, k = self._ends[link]
+        self._robots[row].neighbours.mark_alive(k)
+
+    def mark_lost(self, link: int, t: float) -> None:
+        row, k = self._ends[link]
+        self._robots[row].neighbours.mark_lost(k, t)
+
+    def discard_pose(self, link: int) -> None:
+        row, k = self._ends[link]
+        self._robots[row].neighbours.discard_pose(k)
+
+    def senders_of(self, row: int) -> list[NeighbourSubscription]:
+        """Subscriptions of a robot."""
+        return [sender for sender in self.senders if any(self._ends[link][0] == row for link in sender.links)]
+
+    def dropped_of(self, row: int) -> dict[str, int]:
+        """Samples that the modelled channel dropped on their way to a robot, by sender."""
+        found = {}
+        for (receiver, k), count in zip(self._ends, self.dropped, strict=True):
+            if receiver == row and count:
+                found[self._robots[row].neighbours.all[k].name] = count
+        return found
+
     def deliver(self, t: float, utc: float) -> None:
-        """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the agent and to telemetry."""
-        got = self.receive(t, utc, self._start, self._assignment.names)
+        """Passes all poses until `t` [s] of a clock that was 0 at `utc` [s] to the robots and to telemetry."""
+        got = self.receive(t, utc, self._start, self._own)
         if (marks := [(sender.behind, sender.doubt, sender.foreign) for sender in self.senders]) != self._marks:
-            for sender, (_, _, foreign) in zip(self.senders, self._marks, strict=True):
-                self._neighbours.mark_clock_lag(sender.links, sender.behind)
-                self._neighbours.mark_refused(sender.numbers, sender.doubt)
-                if sender.foreign > foreign:
-                    self._neighbours.mark_foreign(sender.numbers, sender.foreign, t)
-            self._marks = marks
-        if got is None:
-            return
-        assert got.extra is not None  # the recorded pose keeps its own stamp
-        self._neighbours.receive(msgspec.structs.replace(got, stamp=got.extra[:, 0]))
-        for link, seq, stamp, arrival, position, velocity in zip(
-            got.link.tolist(), got.seq.tolist(), got.stamp.tolist(), got.arrival.tolist(), got.position.tolist(),
-            got.velocity.tolist(), strict=True,
-        ):  # fmt: skip
-            row, name = self._ends[link]
+            self._mark(marks, t)
+        for link, arrival, received in got:
+            pose = received.pose
+            (row, k), velocity = self._ends[link], pose.velocity or messages.STILL
+            self._robots[row].neighbours.receive(k, pose.position, velocity, received.measured - utc, arrival)
             self.news[row].append(
-                messages.PoseReceipt(name, seq, utc + stamp, utc + arrival, tuple(position), tuple(velocity))
+                messages.PoseReceipt(pose.robot, pose.seq, pose.stamp, utc + arrival, pose.position, velocity)
             )
             self.received[row] += 1
 
-    def _start(self) -> Array:
-        return self._lifecycle.start_at[self._assignment.links.receiver]
+    def _mark(self, marks: list[tuple[float, str, int]], t: float) -> None:
+        """Tell the robots what is wrong with poses of their neighbours."""
+        for sender, (_, _, foreign) in zip(self.senders, self._marks, strict=True):
+            for link in sender.links:
+                row, k = self._ends[link]
+                neighbours = self._robots[row].neighbours
+                neighbours.mark_clock_lag(k, sender.behind)
+                neighbours.mark_refused(k, sender.doubt)
+                if sender.foreign > foreign:
+                    neighbours.mark_foreign(k, sender.foreign, t)
+        self._marks = marks
+
+    def _start(self, link: int) -> float:
+        return self._robots[self._ends[link][0]].lifecycle.start_at
