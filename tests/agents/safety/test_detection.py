@@ -1,533 +1,440 @@
-"""Detection of hazards: causes as robots meet them, and whatever happens a robot ends up stopped or landed."""
+"""Detection of hazards: each cause, when it is present, and its extent in words."""
 
 import math
-from dataclasses import replace
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.interface import BodyState, Rays
-from agents.body.limits import Safety
-from agents.decision.lifecycle import AIRBORNE, DONE, LANDING, READY, RUNNING
-from agents.safety.detection import SLOWEST, Descent, tilt_angle, tilted
-from agents.safety.hazards import Outcome
-from agents.safety.landing import PATIENCE_S
+from agents.body.interface import RangeScan
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.decision.neighbours import Incoming, Neighbours
+from agents.plugins.predictors import HOLD
+from agents.safety.detection import (
+    FOREIGN_S,
+    SLOWEST,
+    Descent,
+    clock_off,
+    clock_text,
+    nearest_robot,
+    separation,
+    tilt_angle,
+    tilted,
+)
+from agents.safety.hazards import Cause, Outcome
 from agents.safety.situation import LATE_SHARE, ProcessHealth
-from experiments.definition.experiment import Formation, Robot
-from tests.agents.few import drone, pair, triangle
-from tests.agents.swarm import Swarm
-from tests.agents.things import poses
+from tests.agents.safety.watched import DT, NAN, Watched
 
-DT = 0.01
-
-
-def happened(swarm):
-    """Texts of hazards, by robot."""
-    return {
-        name: [each.text for each in group.agent.hazards.incidents if each.row == row]
-        for name, (group, row) in swarm.where.items()
-    }
-
-
-def spoiled(swarm, **values):
-    """From now on the bodies of the first group say this."""
-    group = swarm.groups[0]
-
-    def spoil(t, state):
-        for name, value in values.items():
-            was = getattr(state, name)
-            if isinstance(was, tuple):
-                setattr(state, name, value)
-            elif was is None:
-                setattr(state, name, np.tile(np.asarray(value, dtype=float), (len(state.yaw), 1)))
-            else:
-                was = was.copy()
-                was[:] = value
-                setattr(state, name, was)
-        return state
-
-    group.spoil = spoil
+UNKNOWN = (NAN, NAN, NAN)
 
 
 def leant(angle):
-    return [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
+    return math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0
 
 
-UNSAFE = {
-    "tipped": ({"attitude": leant(1.3)}, "cut: it has tipped over: it leans 74° (limit 69°)", DONE, 12),
-    "level enough": ({"attitude": leant(1.1)}, None, RUNNING, 300),
-    "unknown": ({"attitude": [np.nan] * 4}, None, RUNNING, 300),
-    "empty": ({"battery": 0.09}, "land: its battery is low: 9% (limit 10%)", LANDING, 102),
-    "no gauge": ({"battery": np.nan}, None, RUNNING, 300),
-    "too fast": ({"velocity": [0.0, 4.4, 0.0]}, "hold: it moves faster than it can: 4.40 m/s", LANDING, 102),
-    "fast": ({"velocity": [0.0, 4.2, 0.0]}, None, RUNNING, 300),
-    "outside": ({"position": [2.3, 0.0, 0.5]}, "land: it left the arena: 0.30 m outside (limit 0.25 m)", LANDING, 2),
-    "flown": ({"position": [2.8, 0.0, 0.5]}, "cut: it flies away: 0.80 m outside (limit 0.75 m)", DONE, 13),
-    "beyond": ({"position": [2.1, 0.0, 0.5]}, "warn: it is beyond a wall of the arena: 0.10 m outside", RUNNING, 50),
-    "sinks": (
-        {"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.2]},
-        "land: it comes down by itself: 0.20 m below its goal, and sinks at 0.20 m/s",
-        LANDING,
-        13,
-    ),
-    "low": ({"position": [0.0, 0.0, 0.3], "velocity": [0.0, 0.0, -0.1]}, None, RUNNING, 150),
-    "dips": ({"position": [0.0, 0.0, 0.4], "velocity": [0.0, 0.0, -0.2]}, None, RUNNING, 300),
-    "down": ({"flying": False}, "land: it came down by itself: its motors are off", LANDING, 2),
+BODY = {  # values of the body: causes of a drone that cruises at 0.5 m, and the extent of the first
+    "tipped": ({"attitude": leant(1.3)}, {Cause.TILT}, "it leans 74° (limit 69°)"),
+    "level enough": ({"attitude": leant(1.1)}, set(), ""),
+    "empty": ({"battery": 0.09}, {Cause.BATTERY}, "9% (limit 10%)"),
+    "no gauge": ({"battery": NAN}, set(), ""),
+    "down": ({"flying": False}, {Cause.FALLEN}, "its motors are off"),
+    "silent": ({"heard": 0.4}, {Cause.UNREACHABLE}, "for 0.6 s"),
+    "no device": ({"heard": NAN}, set(), ""),
+    "ahead": ({"ahead": 0.11}, {Cause.CLOCK}, "positions of A are stamped 0.11 s ahead"),
+    "behind": ({"ahead": -0.3}, {Cause.CLOCK}, "positions of A are stamped 0.3 s behind"),
+    "late": ({"ahead": -0.2}, set(), ""),
 }
 
 
-@pytest.mark.parametrize("what", UNSAFE)
-def test_a_drone_that(what):
-    values, text, phase, ticks = UNSAFE[what]
-    swarm = drone().running().run(0.3)
-    swarm.agent("F").resume(0)  # it is put there: no jump
-    spoiled(swarm, **values)
-    swarm.run(0.01)
-    assert swarm.phase("F") in (RUNNING, LANDING, phase)
-    for _ in range(ticks - 1):
-        swarm.step()
-        if swarm.phase("F") >= phase > RUNNING:
-            break
-    assert swarm.phase("F") == phase
-    told = happened(swarm)["F"]
-    assert any(each.startswith(text) for each in told) if text else told == []
+@pytest.mark.parametrize("what", BODY)
+def test_causes_of_a_body(what):
+    values, causes, extent = BODY[what]
+    robot = Watched()
+    robot.values |= values
+    assert robot.step().found == causes
+    assert [robot.words(cause) for cause in causes] == [extent][: len(causes)]
 
 
-@pytest.mark.parametrize(("samples", "phase"), [(1, RUNNING), (2, DONE)])
-def test_a_lean_takes_two_samples(samples, phase):
-    swarm = drone().running().run(0.3)
-    for sample in range(samples):  # telemetry that stops with the last one
-        spoiled(swarm, attitude=leant(1.4), time=swarm.t + 0.01 * sample)
-        swarm.step()
-    swarm.run(0.3)
-    assert swarm.phase("F") == phase
+MOTION = {  # height and velocity
+    "too fast": (0.5, (0.0, 4.4, 0.0), {Cause.OVERSPEED}, "4.40 m/s (limit 4.33 m/s)"),
+    "fast": (0.5, (0.0, 4.3, 0.0), set(), ""),
+    "unknown": (0.5, UNKNOWN, set(), ""),
+    "sinks": (0.3, (0.0, 0.0, -0.2), {Cause.SINKING}, "0.20 m below its goal, and sinks at 0.20 m/s"),
+    "low": (0.3, (0.0, 0.0, -0.1), set(), ""),
+    "dips": (0.4, (0.0, 0.0, -0.2), set(), ""),
+}
 
 
-def test_wheels_whose_yaw_jumps_stand():
-    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.3)
-    group = swarm.groups[0]
-    group.spoil = lambda t, state: replace(state, yaw=state.yaw + 1.2)
-    swarm.run(0.5)
-    assert any("its yaw jumped by 1.2" in text for text in happened(swarm)["A"])
-    place = group.state.true_position.copy()
-    swarm.run(1.0)
-    assert group.state.true_position == pytest.approx(place, abs=1e-3)
-    assert swarm.agent("A").start(0, swarm.t) == ""
-    swarm.run(0.1)
-    assert not swarm.agent("A").hazards.held[0]
+@pytest.mark.parametrize("what", MOTION)
+def test_causes_of_motion(what):
+    height, velocity, causes, extent = MOTION[what]
+    robot = Watched()
+    robot.position, robot.velocity = (0.0, 0.0, height), velocity
+    assert robot.step().found == causes
+    assert [robot.words(cause) for cause in causes] == [extent][: len(causes)]
 
 
-def test_wheels_whose_position_is_old_know_no_error():
-    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(0.3)
-    assert np.isfinite(swarm.agent("A").error).all()
-    spoiled(swarm, time=swarm.t)
-    swarm.run(0.4)
-    assert np.isfinite(swarm.agent("A").error).all()
-    swarm.run(0.3)
-    assert np.isnan(swarm.agent("A").error).all()
-    assert np.isfinite(swarm.agent("B").error).all()
+PLACE = {
+    "beyond": ({"outside_wall": True, "excess": 0.1}, {Cause.MARGIN}, "0.10 m outside (limit 0 m)"),
+    "outside": (
+        {"outside_wall": True, "outside": True, "excess": 0.3},
+        {Cause.OUTSIDE},
+        "0.30 m outside (limit 0.25 m)",
+    ),
+    "flown": ({"outside": True, "flyaway": True, "excess": 0.8}, {Cause.OUTSIDE, Cause.FAR_OUTSIDE}, ""),
+    "flipped": ({"invalid": True, "jump": 0.7, "turned": 1.2}, {Cause.POSITION}, "its yaw jumped by 1.20 rad"),
+    "jumped": ({"invalid": True, "jump": 0.7}, {Cause.POSITION}, "it jumped by 0.70 m"),
+    "stale": ({"invalid": True}, {Cause.POSITION}, "the last is 0.00 s old"),
+}
 
 
-def test_a_drone_that_is_carried_aside_while_it_climbs_lands():
-    swarm = drone().run(0.1)
-    assert swarm.agent("F").lifecycle.takeoff(0) == ""
-    group, begin = swarm.groups[0], swarm.t
-
-    def carried(t, state):
-        state.position[:, 0] += 1.0 * (t - begin)
-        return state
-
-    group.spoil = carried
-    swarm.run(0.5)
-    assert not happened(swarm)["F"]
-    swarm.run(0.1)
-    assert happened(swarm)["F"] == ["land: it moves and is not told to: 0.57 m aside while it climbs"]
+@pytest.mark.parametrize("what", PLACE)
+def test_causes_of_a_place(what):
+    flags, causes, extent = PLACE[what]
+    robot = Watched()
+    robot.misplace(**flags)
+    assert robot.step().found == causes
+    assert not extent or robot.words(*causes) == extent
 
 
-@pytest.mark.parametrize(("kind", "patience_s"), [("crazyflie", 4.0), ("tello", 10.0)])
-def test_a_climb_lands_if_its_measured_height_stays(kind, patience_s):
-    robots = {"F": Robot(kind=kind, start=[0.1, 0.2], hover=0.5)}
-    swarm = Swarm(pair(robots=robots, formation=Formation())).run(0.1)
-    assert swarm.agent("F").lifecycle.takeoff(0) == ""
-    swarm.run(0.1)
-    noise = np.random.default_rng(1)
-
-    def fallen_markers(t, state):
-        state.position[0] = [0.1, 0.2, 0.02] + 5e-4 * noise.standard_normal(3)
-        state.velocity[0] = 0.0
-        return state
-
-    swarm.groups[0].spoil = fallen_markers
-    swarm.run(patience_s - 0.2)
-    assert not happened(swarm)["F"]
-    swarm.run(0.3)
-    assert happened(swarm)["F"] == ["land: it is told to move and does not: it does not rise"]
+def test_lost_positions_in_words():
+    robot = Watched()
+    robot.misplace(invalid=True)
+    robot.values["time"] = 1.3
+    robot.step()
+    assert robot.words(Cause.POSITION) == "it is stamped 0.3 s ahead"
+    robot.position = UNKNOWN
+    robot.step()
+    assert robot.words(Cause.POSITION) == "none"
 
 
-@pytest.mark.parametrize("ahead_s", [0.3, 100.0, np.inf])
-def test_a_silent_body_whose_clock_is_ahead_lands(ahead_s):
-    swarm = drone().running().run(0.3)
-    before = swarm.groups[0].state
-    spoiled(swarm, time=before.time + ahead_s, position=before.position, velocity=before.velocity)
-    swarm.run(1.5)
-    assert swarm.phase("F") >= LANDING
+def test_wheels_have_no_causes_of_flight():
+    robot = Watched(KHEPERA4, hover=NAN)
+    robot.position, robot.velocity = (0.0, 0.0, 0.0), (0.0, 0.0, -0.2)
+    robot.values |= {"attitude": leant(2.0), "flying": False}
+    robot.misplace(flyaway=True)
+    assert robot.step().found == set()
 
 
-def jumped(swarm, name, at, until, off=1.0):
-    """The measured position of a robot is `off` [m] from `at` [s] on, before `until`."""
-    group = next(group for group in swarm.groups if name in group.names)
-
-    def spoil(t, state):
-        if at <= t < until:
-            state.position[group.names.index(name), 1] += off
-        return state
-
-    group.spoil = spoil
+@pytest.mark.parametrize(("samples", "outcome"), [(1, Outcome.NONE), (2, Outcome.CUT)])
+def test_lean_takes_two_samples(samples, outcome):
+    robot = Watched().step()
+    for _ in range(samples):  # telemetry that stops with the last one
+        robot.values |= {"attitude": leant(1.4), "time": robot.t}
+        robot.step()
+    assert robot.step(0.3).hazards.outcome() == outcome
 
 
-@pytest.mark.parametrize(("lasts_s", "phase"), [(0.01, RUNNING), (0.25, RUNNING), (0.5, LANDING)])
-def test_a_drone_whose_position_jumps_lands_unless_it_is_back_at_once(lasts_s, phase):
-    swarm = drone().running().run(0.3)
-    place = swarm.row("F", "truth")
-    jumped(swarm, "F", swarm.t, swarm.t + lasts_s)
-    swarm.run(2.0)
-    assert swarm.phase("F") >= phase
-    assert swarm.phase("F") == RUNNING or phase == LANDING
-    first = happened(swarm)["F"][0]
-    assert first.startswith("hold: its own position is lost: it jumped by 1.0")
-    assert np.linalg.norm((swarm.row("F", "truth") - place)[:2]) < 0.1
+def test_orders():
+    robot = Watched()
+    robot.status.ordered = robot.status.not_finite = robot.status.unguided = True
+    assert robot.step().found == {Cause.ORDERED, Cause.SETPOINT, Cause.CENTRE}
+    assert robot.words(Cause.ORDERED) == "by an operator"
+    robot.status.cruising = False
+    assert robot.step().found == {Cause.ORDERED, Cause.CENTRE}
 
 
-@pytest.mark.parametrize("begins", ["climbing", "running", "landing"])
-def test_a_position_far_away_that_was_refused_cuts_no_motors(begins):
-    swarm = drone()
-    if begins == "climbing":
-        swarm.run(0.1)
-        while swarm.row("F", "truth")[2] < 0.2:
-            swarm.conduct()
-            swarm.step()
-    else:
-        swarm.running().run(0.3)
-    if begins == "landing":
-        swarm.agent("F").lifecycle.land(0, "by a test")
-        swarm.run(0.2)
-    jumped(swarm, "F", swarm.t, np.inf, off=1e5)
-    while swarm.phase("F") != DONE:
-        swarm.step()
-        assert np.isnan(swarm.agent("F").state.position[0]).all()
-    assert swarm.row("F", "truth")[2] < 0.05  # it has landed
-    assert not any("flies away" in text for text in happened(swarm)["F"])
+# ---------------------------------------------------------------- neighbours
 
 
-@pytest.mark.slow
-def test_wheels_whose_position_jumps_stand_and_lead_nobody_astray_until_they_are_ordered_to_start():
-    swarm = Swarm(pair(), [["A"], ["B"]]).running().run(10.0)
-    before = [swarm.row(name, "truth") for name in ("A", "B")]
-    jumped(swarm, "A", swarm.t, np.inf)
-    swarm.run(20.0)
-    after = [swarm.row(name, "truth") for name in ("A", "B")]
-    assert np.abs(np.array(after) - before).max() < 0.01
-    assert happened(swarm)["A"] == ["hold: its own position is lost: it jumped by 1.00 m"]
-    assert happened(swarm)["B"] == []
-    swarm.agent("A").resume(0)
-    swarm.run(2.0)
-    assert happened(swarm)["A"][-1].startswith("over: its own position is lost, after 19.9")
-    assert swarm.row("A", "setpoint").any()  # it believes its position
+def test_robots_too_near_hold_nearer_land():
+    robot = Watched(KHEPERA4, [("B", KHEPERA4), ("C", KHEPERA4)], hover=0.0, separation=0.3)
+    assert robot.step().found == set()
+    robot.hear(1, (0.25, 0.0, 0.0))
+    assert robot.step().found == {Cause.SEPARATION}
+    assert robot.words(Cause.SEPARATION) == "0.25 m from C (limit 0.3 m)"
+    robot.hear(1, (0.145, 0.0, 0.0))
+    assert robot.step().found == {Cause.SEPARATION, Cause.TOUCHING}
+    robot.position = UNKNOWN
+    assert robot.step().found == set()
 
 
-def test_two_that_come_too_near_hold_and_go_on_when_one_is_taken_away():
-    experiment = pair(formation=Formation(links={"A - B": 0.3}), safety=Safety(separation=0.5))
-    swarm = Swarm(experiment, [["A"], ["B"]]).running().run(12.0)
-    place = swarm.column("truth")
-    apart = np.linalg.norm(place[:, 0] - place[:, 1], axis=1)
-    assert apart[-1] > 0.45
-    assert np.ptp(place[-200:], axis=0).max() < 1e-3  # they stand
-    told = happened(swarm)
-    assert told["A"][0].startswith("hold: minimum separation: 0.50 m from B (limit 0.5 m)")
-    assert len(told["A"]) == len(told["B"]) == 1
-    agent = swarm.agent("A")
-    for k in range(80):  # B is somewhere else now
-        agent.neighbours.receive(
-            poses(np.array([0]), np.array([[1.5, 0.0, 0.0]]), np.zeros((1, 3)), *np.full((2, 1), 99.0 + k))
-        )
-        swarm.groups[0].by_speaker.clear()
-        swarm.step()
-    assert swarm.row("A", "setpoint").any()
+def test_touching_robots_land_beyond_half_the_separation():
+    robot = Watched(TURTLEBOT3, [("B", TURTLEBOT3)], hover=0.0, separation=0.3).step()
+    robot.hear(0, (0.2, 0.0, 0.0))
+    assert robot.step().found == {Cause.SEPARATION, Cause.TOUCHING}
 
 
-def test_two_that_nearly_touch_land():
-    experiment = pair(safety=Safety(separation=0.3))
-    swarm = Swarm(experiment, [["A"], ["B"]]).running().run(0.5)
-    here = swarm.row("A", "position") + np.array([0.14, 0.0, 0.0])
-    swarm.agent("A").neighbours.receive(
-        poses(np.array([0]), here[None], np.zeros((1, 3)), np.array([99.0]), np.array([99.0]))
-    )
-    swarm.step()
-    swarm.step()
-    assert swarm.phase("A") >= LANDING
-    assert swarm.agent("A").lifecycle.reason == ["far too near to another robot"]
-    assert swarm.phase("B") == RUNNING  # it knows better where it is itself
+def test_separation_from_senders():
+    neighbours = Neighbours([Incoming(1, "B", KHEPERA4, 0.5), Incoming(2, "C", KHEPERA4, 0.5)], 1.0)
+    sender, _ = neighbours.all
+    origin = (0.0, 0.0, 0.0)
+    assert nearest_robot(origin, neighbours, HOLD, 1.0) == (math.inf, "")
+    neighbours.receive(0, (0.3, 0.4, 0.0), origin, 1.0, 1.0)
+    assert separation(origin, sender, HOLD, 1.0, 1.0) == math.inf  # never alive
+    neighbours.mark_alive(0)
+    assert separation(origin, sender, HOLD, 1.0, 1.0) == 0.5
+    assert nearest_robot(origin, neighbours, HOLD, 1.0) == (0.5, "B")
+    assert separation(UNKNOWN, sender, HOLD, 1.0, 1.0) == math.inf
+    neighbours.mark_lost(0, 2.0)
+    assert separation(origin, sender, HOLD, 3.0, 1.0) == 0.5
+    assert separation(origin, sender, HOLD, 3.1, 1.0) == math.inf
 
 
-@pytest.mark.parametrize(
-    ("choice", "phase", "moves"), [("drop", RUNNING, True), ("hold", RUNNING, False), ("land", LANDING, False)]
-)
-def test_a_neighbour_that_is_lost(choice, phase, moves):
-    experiment = triangle(safety=Safety(lost_neighbour=choice))
-    swarm = Swarm(experiment, [["A"], ["B"], ["C"]]).running().run(0.5)
-    swarm.agent("A").neighbours.mark_lost(np.array([0]), swarm.t)
-    swarm.groups[0].by_speaker.pop("B")
-    swarm.run(1.0)
-    assert happened(swarm)["A"] == []
-    swarm.run(0.03)
-    assert happened(swarm)["A"] == [f"{'warn' if choice == 'drop' else choice}: a neighbour is lost: B"]
-    before = swarm.row("A", "truth")
-    swarm.run(1.0)
-    assert min(swarm.phase("A"), LANDING) == phase
-    assert (np.linalg.norm(swarm.row("A", "truth") - before) > 0.01) == moves
-    if choice == "hold":
-        swarm.agent("A").neighbours.mark_alive(np.array([0]))
-        swarm.run(1.2)
-        assert happened(swarm)["A"][-1].startswith("over: a neighbour is lost, after ")
+def test_lost_neighbours():
+    robot = Watched(KHEPERA4, [("B", KHEPERA4), ("C", KHEPERA4)], hover=0.0).step()
+    robot.neighbours.mark_lost(0, robot.t)
+    assert robot.step(1.0).found == set()
+    assert robot.step(0.03).found == {Cause.NEIGHBOUR}
+    assert robot.texts == ["warn: a neighbour is lost: B"]
+    robot.neighbours.mark_lost(1, robot.t - 2.0)
+    robot.status.alone = True
+    assert robot.step().found == {Cause.NEIGHBOUR, Cause.ALONE}
+    assert robot.words(Cause.ALONE) == "B, C"
+    robot.status.cruising = False
+    assert robot.step().found == set()
 
 
-def test_without_a_router_it_holds_and_then_lands():
-    swarm = drone(safety=Safety(offline_s=3.0)).running().run(0.2)
-    swarm.agent("F").health.offline_since = swarm.t
-    swarm.run(2.9)
-    assert happened(swarm)["F"] == ["hold: no connection to a router: for 1.0 s"]
-    assert swarm.phase("F") == RUNNING
-    swarm.run(0.15)
-    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (LANDING, ["no connection to a router"])
+def test_robot_without_received_neighbours_is_alone():
+    robot = Watched(KHEPERA4, [("B", KHEPERA4)], hover=0.0)
+    robot.neighbours.discard_pose(0)
+    robot.status.alone = True
+    assert robot.step().found == {Cause.ALONE}
+    assert robot.words(Cause.ALONE) == "none was received"
 
 
-@pytest.mark.parametrize(("choice", "phase"), [("finish", RUNNING), ("land", LANDING)])
-def test_without_a_conductor(choice, phase):
-    swarm = drone(safety=Safety(lost_conductor=choice)).running().run(0.2)
-    swarm.agent("F").health.conductor_lost_since = swarm.t
-    swarm.run(1.9)
-    assert happened(swarm)["F"] == []
-    swarm.run(0.2)
-    assert swarm.phase("F") == phase
-    assert "the conductor is gone: for 2.0 s" in happened(swarm)["F"][0]
+def test_poses_of_neighbours():
+    robot = Watched(KHEPERA4, [("B", KHEPERA4), ("C", KHEPERA4)], hover=0.0).step()
+    robot.neighbours.mark_clock_lag(1, 0.7)
+    robot.neighbours.mark_refused(0, "it is outside the arena")
+    robot.neighbours.mark_foreign(0, 3, robot.t)
+    assert robot.step().found == {Cause.BEHIND, Cause.REFUSED, Cause.FOREIGN}
+    assert robot.words(Cause.BEHIND) == "the poses of C are 0.7 s old when they arrive"
+    assert robot.words(Cause.REFUSED) == "B: it is outside the arena"
+    assert robot.words(Cause.FOREIGN) == "3 poses of B came from another source, and were not used"
+    robot.neighbours.mark_clock_lag(1, 0.0)
+    robot.neighbours.mark_refused(0, "")
+    assert robot.step().found == {Cause.FOREIGN}
+    assert robot.step(FOREIGN_S).found == set()
+
+
+# ---------------------------------------------------------------- process
+
+
+def test_lost_router_holds_then_lands():
+    robot = Watched(offline_s=3.0)
+    robot.health.offline_since = robot.t
+    robot.health.conductor_lost_since = robot.t
+    robot.step(2.9)
+    assert robot.texts == ["hold: no connection to a router: for 1.0 s"]
+    robot.step(0.15)
+    assert [each.outcome for each in robot.acts] == [Outcome.LAND]
+
+
+@pytest.mark.parametrize(("choice", "outcome"), [("finish", Outcome.WARN), ("land", Outcome.LAND)])
+def test_lost_conductor(choice, outcome):
+    robot = Watched(lost_conductor=choice)
+    robot.health.conductor_lost_since = robot.t
+    assert robot.step(1.9).texts == []
+    robot.step(0.2)
+    assert robot.hazards.outcome() == outcome
+    assert robot.texts[0].endswith("the conductor is gone: for 2.0 s")
+
+
+def test_unstarted_drone_lands():
+    robot = Watched(offline_s=3.0)
+    robot.status.unstarted = True
+    assert robot.step(3.0).found == set()
+    robot.health.conductor_lost_since = robot.t
+    robot.step(2.9)
+    assert robot.acts == []
+    robot.step(0.2)
+    assert [each.text for each in robot.acts] == ["land: nobody will start it: the conductor is gone for 3.0 s"]
+
+
+def test_failing_control_loop():
+    health = ProcessHealth()
+    for _ in range(500):
+        health.count_tick(4, DT)
+    assert health.missed_share == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
+    health.count_tick(500, DT)  # 5 s of nothing
+    assert health.missed_share > LATE_SHARE
+    for _ in range(20):
+        health.count_tick(0, DT)
+    assert health.missed_share < LATE_SHARE
+    for _ in range(2000):
+        health.count_tick(0, DT)
+    assert health.missed_share == 0.0
+    robot = Watched()
+    robot.health.missed_share = 0.95
+    assert robot.step().found == {Cause.LATE}
+    assert robot.words(Cause.LATE) == "95% of the last second's"
 
 
 @pytest.mark.parametrize("avoids", [True, False])
-def test_wheels_whose_range_sensor_dies_hold(avoids):
-    robots = {"A": Robot(kind="turtlebot3", start=[-1.0, 0.0])}
-    swarm = Swarm(
-        pair(robots=robots, formation=Formation(), **({"avoidance": "potential"} if avoids else {}))
-    ).running()
-    none = np.zeros(4)
-    scans = {"last": None}
-
-    def scanner(t, state):
-        if t < 3.0:
-            scans["last"] = Rays(none.astype(np.intp), none + t, np.linspace(0.0, 3.0, 4), none, none + np.nan)
-        state.rays = scans["last"] if t < 5.0 else None  # old ones are dropped
-        return state
-
-    swarm.groups[0].spoil = scanner
-    swarm.run(3.9 - swarm.t)
-    assert swarm.agent("A").go(0, (1.0, 0.0), swarm.t) == ""
-    assert not happened(swarm)["A"]
-    swarm.run(6.0)
-    assert happened(swarm)["A"] == (["hold: its range sensors are silent: for 1.0 s"] if avoids else [])
-    assert (swarm.row("A", "truth")[0] < -0.9) == avoids
+def test_range_sensors_that_fall_silent(avoids):
+    robot = Watched(TURTLEBOT3, hover=0.0, avoids=avoids)
+    assert robot.step(2.0).found == set()  # there was none yet
+    ray = (0.0,)
+    robot.values["scan"] = RangeScan(robot.t, ray, ray, ray)
+    assert robot.step(0.5).found == set()
+    robot.values["scan"] = RangeScan(robot.t, (), (), ())  # no reading
+    assert robot.step(0.5).found == set()
+    robot.values["scan"] = None
+    robot.step(0.02)
+    assert robot.texts == (["hold: its range sensors are silent: for 1.0 s"] if avoids else [])
 
 
-def test_a_drone_that_nobody_starts_lands():
-    swarm = drone(safety=Safety(offline_s=3.0)).run(0.1)
-    assert swarm.agent("F").lifecycle.takeoff(0) == ""
-    swarm.run(5.0)
-    assert swarm.phase("F") == AIRBORNE
-    swarm.agent("F").health.conductor_lost_since = swarm.t
-    swarm.run(2.9)
-    assert swarm.phase("F") == AIRBORNE
-    swarm.run(0.2)
-    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (LANDING, ["nobody will start it"])
+# ---------------------------------------------------------------- climbing, landing, obedience
 
 
-def test_a_control_loop_that_hardly_runs_holds_and_then_lands():
-    outside = ProcessHealth()
-    for _ in range(500):
-        outside.count_tick(4, DT)
-    assert outside.missed_share == pytest.approx(0.8)  # 20 Hz is slow, not hopeless
-    outside.count_tick(500, DT)  # 5 s of nothing
-    assert outside.missed_share > LATE_SHARE
-    for _ in range(20):
-        outside.count_tick(0, DT)
-    assert outside.missed_share < LATE_SHARE
-    for _ in range(2000):
-        outside.count_tick(0, DT)
-    assert outside.missed_share == 0.0
-    swarm = drone().running().run(0.2)
-    agent = swarm.agent("F")
-    for _ in range(30):
-        agent.health.count_tick(30, DT)
-        swarm.tick += 30
-        swarm.step()
-    assert swarm.phase("F") >= LANDING
-    assert agent.lifecycle.reason == ["its control loop misses its ticks"]
+def test_climb_that_is_carried_aside():
+    robot = Watched()
+    robot.status.cruising, robot.status.climbing = False, True
+    begin = robot.t
+
+    def carry(robot):
+        robot.position = (robot.t - begin, 0.0, 0.1 + robot.t - begin)
+
+    assert robot.step(0.55, carry).texts == []
+    robot.step(0.05, carry)
+    assert robot.texts == ["land: it moves and is not told to: 0.57 m aside while it climbs"]
+    robot.status.climbing = False
+    assert robot.step().found == set()
 
 
-def test_a_law_that_wants_nonsense_lands():
-    swarm = drone().running().run(0.2)
-    group = swarm.groups[0]
-    group.agent.goal_computer.decide = lambda *_, **__: pytest.fail("not asked")  # the goal stays what it is
-    group.agent._decide = lambda *_: group.agent.goal.__setitem__(slice(None), np.nan)
-    swarm.run(1.0)
-    assert happened(swarm)["F"][0] == "hold: what it wants is not a setpoint: not made of finite numbers"
-    assert swarm.agent("F").lifecycle.reason == ["what it wants is not a setpoint"]
-    assert swarm.phase("F") >= LANDING
+@pytest.mark.parametrize(("kind", "patience_s"), [(CRAZYFLIE, 4.0), (TELLO, 10.0)], ids=["crazyflie", "tello"])
+def test_climb_without_measured_height(kind, patience_s):
+    robot = Watched(kind)
+    robot.status.cruising, robot.status.climbing = False, True
+    robot.position = (0.0, 0.0, 0.02)
+    assert robot.step(patience_s).texts == []
+    assert robot.step(0.03).texts == ["land: it is told to move and does not: it does not rise"]
 
 
-def landing(**values):
-    """A drone that is told to land after 0.2 s, with `landing_s` 2, and whose body says this."""
-    swarm = drone(safety=Safety(landing_s=2.0)).running().run(0.2)
-    swarm.agent("F").lifecycle.land(0, "ordered to land")
-    spoiled(swarm, **values)
-    return swarm
+def lands(*, height=0.5, velocity=(0.0, 0.0, 0.0), **safety):
+    """A drone that begins to land."""
+    robot = Watched(landing_s=2.0, **safety)
+    robot.position, robot.velocity = (0.0, 0.0, height), velocity
+    robot.status.cruising, robot.status.landing = False, True
+    robot.active, robot.landing = False, True
+    return robot
 
 
 @pytest.mark.parametrize(
-    "values",
-    [{"flying": True}, {"flying": True, "position": np.nan}, {"flying": True, "velocity": [0.0, 0.0, 0.5]}],
-    ids=["on the floor", "blind", "climbs"],
+    ("height", "velocity", "seconds"),
+    [(0.02, (0.0, 0.0, 0.0), 2.0), (0.5, (0.0, 0.0, 0.5), 2.5), (NAN, (0.0, 0.0, 0.0), 2.5 / SLOWEST)],
+    ids=["on the floor", "climbs", "blind"],
 )
-def test_a_landing_drone_that_does_no_good_is_cut(values):
-    """Landings with motors that stay on, without a position, or that move and do not descend."""
-    swarm = landing(**values, **({"position": [0.0, 0.0, 0.5]} if "velocity" in values else {}))
-    swarm.run(1.9)
-    assert swarm.phase("F") == LANDING
-    # without a position it may be below the ceiling
-    swarm.run(5.0 if np.isfinite(values.get("position", 0.0)).all() else swarm.experiment.arena.size[2] / SLOWEST + 2.0)
-    assert (swarm.phase("F"), swarm.agent("F").lifecycle.reason) == (DONE, ["its landing takes too long"])
+def test_landing_that_does_no_good_is_cut(height, velocity, seconds):
+    robot = lands(height=height, velocity=velocity)
+    if math.isnan(height):
+        robot.misplace(invalid=True)
+    robot.step(seconds + 1.9)
+    assert robot.acts == []
+    robot.step(0.2)
+    assert [each.text for each in robot.acts] == ["cut: its landing takes too long: more than 2 s without a descent"]
 
 
-def test_a_blind_drone_gets_the_time_of_its_room():
-    descent, landing = Descent(1, 6.0), np.ones(1, dtype=bool)
-    blind = BodyState(*np.full((8, 1), np.nan))
-    blind.position = blind.velocity = np.full((1, 3), np.nan)
-    cut = [tick for tick in range(400) if descent.update(0.1 * tick, landing, ~landing, blind)[0].any()]
+def test_hovering_drone_is_never_cut():
+    robot = lands().step(30.0)
+    assert robot.texts == ["warn: it is told to land and hovers: at 0.50 m"]
+    robot.values["flying"] = False
+    assert robot.step().found == set()
+
+
+def test_slow_landing_is_given_its_time():
+    robot = lands(velocity=(0.0, 0.0, -0.03))
+
+    def sink(robot):
+        robot.position = (0.0, 0.0, robot.position[2] - 0.03 * DT)
+
+    assert robot.step(15.0, sink).texts == []
+
+
+def test_blind_drone_gets_the_time_of_its_room():
+    descent, cut = Descent(6.0), []
+    for tick in range(400):
+        descent.update(0.1 * tick, True, False, NAN, UNKNOWN)
+        cut += [tick] if descent.late else []
     assert cut[0] == 301  # 6 m at 0.2 m/s
 
 
-@pytest.mark.slow
-def test_a_landing_drone_that_hovers_is_never_cut():
-    swarm = landing(flying=True, position=[0.0, 0.0, 0.5], velocity=[0.0, 0.0, 0.0]).run(30.0)
-    assert swarm.phase("F") == LANDING
-    assert "warn: it is told to land and hovers: at 0.50 m" in happened(swarm)["F"]
+def test_robot_below_a_landing():
+    robot = lands()
+    robot.status.aside = True
+    assert robot.step().texts == ["warn: a robot is below it: B; it goes aside first"]
+    robot.status.landing = False
+    assert robot.step().found == set()
 
 
-@pytest.mark.slow
-def test_a_landing_that_takes_long_is_given_its_time():
-    swarm = landing(flying=True)
-    group = swarm.groups[0]
-    spoil, begin = group.spoil, swarm.t
+def test_disobedient_wheels():
+    robot = Watched(KHEPERA4, hover=0.0)
+    robot.status.setpoint = (0.2, 0.0, 0.0, 0.0)
+    robot.step(5.0)
+    assert robot.texts[0].startswith("warn: it is told to move and does not: told 0.")
+    robot = Watched(KHEPERA4, hover=0.0)
+    robot.status.setpoint = (0.0, 0.0, 0.0, 0.0)
 
-    def sinks(t, state):
-        state = spoil(t, state)
-        state.position[:, 2] = 1.0 - 0.03 * (t - begin)
-        state.velocity[:] = 0.0, 0.0, -0.03
-        return state
+    def run_away(robot):
+        robot.position = (robot.position[0] + 0.2 * DT, 0.0, 0.0)
 
-    group.spoil = sinks
-    swarm.run(30.0)
-    assert swarm.phase("F") == LANDING
-    assert not any("land" in text for text in happened(swarm)["F"])
+    robot.step(3.0, run_away)
+    assert [each.cause for each in robot.acts] == [Cause.STRAYING]
+
+
+# ---------------------------------------------------------------- one robot
 
 
 @pytest.mark.parametrize(
-    "attitude", [[1.0, 0.7, 0.0, 0.0], [10.0, 0.8, 0.0, 0.0], [0.0] * 4, [np.nan] * 4, [1e200] * 4]
+    "attitude", [(1.0, 0.7, 0.0, 0.0), (10.0, 0.8, 0.0, 0.0), (0.0,) * 4, (NAN,) * 4, (1e200,) * 4]
 )
-def test_what_is_no_rotation_is_no_tilt(attitude):
-    assert not tilted(np.array([attitude]), 1.2).any()
+def test_attitude_that_is_no_rotation(attitude):
+    assert not tilted(attitude, 1.2)
 
 
-def test_leaning_is_an_angle_to_the_vertical():
-    attitude = np.array([leant(0.5), [math.cos(0.6), 0.0, 0.0, math.sin(0.6)], [0.0, 1.0, 0.0, 0.0], [np.nan] * 4])
-    assert [round(tilt_angle(attitude, row), 6) for row in range(3)] == [0.5, 0.0, round(math.pi, 6)]
-    assert tilted(attitude, 0.49).tolist() == [True, False, True, False]
-
-
-# ---------------------------------------------------------------- whatever happens
-
-number = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([np.nan, 0.0, 9.0, 1e9]))
-SPOILT = st.fixed_dictionaries(
-    {},
-    optional={
-        "position": st.tuples(number, number, number),
-        "velocity": st.tuples(number, number, number),
-        "yaw": number,
-        "battery": st.one_of(st.floats(0.0, 1.0), st.just(np.nan)),
-        "attitude": st.sampled_from([leant(a) for a in (0.0, 1.0, 2.0)] + [[np.nan] * 4]),
-        "flying": st.booleans(),
-    },
+@pytest.mark.parametrize(
+    ("attitude", "angle"),
+    [(leant(0.5), 0.5), ((math.cos(0.6), 0.0, 0.0, math.sin(0.6)), 0.0), ((0.0, 1.0, 0.0, 0.0), math.pi)],
+    ids=["leant", "turned", "upside down"],
 )
-EVENTS = st.sampled_from(["lose", "find", "offline", "online", "unattended", "skip", "hold", "start", "nothing"])
+def test_tilt_is_an_angle_to_the_vertical(attitude, angle):
+    assert tilt_angle(attitude) == pytest.approx(angle)
+    assert tilted(attitude, 0.49) == (angle > 0.49)
 
 
-def occur(agent, event, t):
-    """Something happens around a decision."""
-    outside = agent.health
-    match event:
-        case "lose":
-            agent.neighbours.mark_lost(np.arange(2), t)
-        case "find":
-            agent.neighbours.mark_alive(np.arange(2))
-        case "offline" | "online":
-            outside.offline_since = t if event == "offline" else np.inf
-        case "unattended":
-            outside.conductor_lost_since = t
-        case "skip":
-            agent.skip_ticks(200)
-        case "hold":
-            agent.hold(0)
-        case "start":
-            agent.start(0, t)
+@pytest.mark.parametrize(("ahead", "off"), [(0.1, False), (0.2, True), (-0.25, False), (-0.26, True), (NAN, False)])
+def test_clocks_of_positions(ahead, off):
+    assert clock_off(ahead, 0.5) == off
 
 
-@pytest.mark.slow
-@settings(max_examples=10)
+def test_clock_errors_in_words():
+    assert clock_text("A", 12.345) == "positions of A are stamped 12.3 s ahead"
+    assert clock_text("A", -0.3) == "positions of A are stamped 0.3 s behind"
+
+
+number = st.one_of(st.floats(-3.0, 3.0), st.floats())
+vector = st.tuples(number, number, number)
+
+
+@settings(max_examples=40)
 @given(
-    st.lists(st.tuples(SPOILT, EVENTS, st.integers(1, 80)), max_size=8),
-    st.sampled_from(["drop", "hold", "land"]),
-    st.booleans(),
-)
-def test_whatever_happens_nobody_comes_up_again(story, lost, early):
-    robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])}
-    safety = Safety(lost_neighbour=lost, separation=0.4, offline_s=2.0)
-    swarm = Swarm(pair(robots=robots, formation=Formation(links={"F - G": 0.8}), safety=safety, duration_s=20.0))
-    swarm.until(READY if early else RUNNING)
-    (group,) = swarm.groups
-    agent = group.agent
-    if early:
-        agent.lifecycle.takeoff(0), agent.lifecycle.takeoff(1)
-    before, lands = agent.lifecycle.phase.copy(), swarm.t
-    for values, event, ticks in story:
-        spoiled(swarm, **values)
-        occur(agent, event, swarm.t)
-        for _ in range(ticks):
-            swarm.step()
-            phase, setpoint = agent.lifecycle.phase, group.actions.setpoint
-            down = before >= LANDING
-            lands = swarm.t if phase[0] < LANDING else lands
-            assert (phase[down] >= before[down]).all()
-            assert np.isnan(setpoint[0]).all() or np.isfinite(setpoint[0]).all()
-            assert np.isfinite(setpoint[1]).all()
-            for row in range(2):
-                if agent.hazards.outcome(row) >= Outcome.LAND:
-                    assert phase[row] >= LANDING
-                    assert agent.lifecycle.reason[row]
-            ended = (phase < AIRBORNE) | (phase >= LANDING)
-            assert not setpoint[1].any() or not ended[1]
-            aside = swarm.t <= lands + PATIENCE_S + DT  # who comes down beside a robot goes there at its height
-            assert np.isnan(setpoint[0]).all() or not ended[0] or (phase[0] == LANDING and aside)
-            before = phase.copy()
-    spoiled(swarm, position=np.nan)  # and now nothing is known any more
-    swarm.run(3.0)
-    assert agent.lifecycle.phase[0] in (LANDING, DONE) or agent.lifecycle.phase[0] <= READY
-    assert not group.actions.setpoint[1].any()
+    st.sampled_from([CRAZYFLIE, TELLO, KHEPERA4]),
+    st.lists(
+        st.fixed_dictionaries(
+            {},
+            optional={
+                "position": vector, "velocity": vector, "yaw": number, "setpoint": st.tuples(*[number] * 4),
+                "attitude": st.tuples(*[number] * 4), "battery": number, "time": number, "ahead": number,
+                "heard": number, "flying": st.booleans(), "flags": st.booleans(), "status": st.booleans(),
+            },
+        ),
+        max_size=6,
+    ),
+)  # fmt: skip
+def test_any_numbers_are_judged_and_worded(kind, story):
+    robot = Watched(kind, [("B", KHEPERA4)], separation=0.4)
+    for values in story:
+        robot.position = values.get("position", robot.position)
+        robot.velocity = values.get("velocity", robot.velocity)
+        robot.yaw = values.get("yaw", robot.yaw)
+        robot.status.setpoint = values.get("setpoint", robot.status.setpoint)
+        for name in ("ordered", "climbing", "landing", "unguided", "not_finite", "alone"):
+            setattr(robot.status, name, values.get("status", False))
+        flags = {"invalid": values.get("flags", False), "outside": values.get("flags", False)}
+        robot.misplace(**flags)
+        names = ("attitude", "battery", "time", "ahead", "heard", "flying")
+        robot.values |= {name: values[name] for name in names if name in values}
+        robot.step(0.35)
+        assert all(isinstance(robot.words(cause), str) for cause in robot.found)
+        assert robot.hazards.under_way or not robot.hazards.worst()
