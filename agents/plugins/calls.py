@@ -29,10 +29,9 @@ def explain(error: Exception, plugins: Iterable[tuple[str, object]]) -> Exceptio
     frames = list(walk_tb(error.__traceback__))
     known = list(plugins)
     for frame, _ in reversed(frames):
-        first = frame.f_code.co_varnames[:1]
-        owner = frame.f_locals.get(first[0]) if first else None
         for what, plugin in known:
-            if owner is plugin and plugin is not None:
+            method = getattr(type(plugin), frame.f_code.co_name, None)
+            if getattr(method, "__code__", None) is frame.f_code:
                 return failure(what, plugin, error)
     if frames and isinstance(error, TypeError | ValueError):
         frame, number = frames[-1]

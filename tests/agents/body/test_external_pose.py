@@ -1,73 +1,70 @@
-"""Velocities of bodies that measure only positions."""
+"""Velocities of bodies that measure only positions, and poses from outside."""
 
-import numpy as np
+from math import isnan, nan
+
 import pytest
 
-from agents.body.external_pose import PATIENCE_S, External
+from agents.body.external_pose import FASTEST, PATIENCE_S, External
 from agents.body.interface import BodyState
+from agents.vectors import UNKNOWN
 
 
-def reading(t, position):
-    unknown = np.full((2, 3), np.nan)
-    return BodyState(
-        time=np.full(2, t),
-        position=np.array(position),
-        velocity=unknown.copy(),
-        yaw=np.zeros(2),
-        true_position=unknown,
-        true_yaw=unknown[:, 0],
-        battery=unknown[:, 0],
-        flying=np.zeros(2, dtype=bool),
-    )
+def state(t, position, velocity=UNKNOWN, yaw=0.0):
+    return BodyState(t, position, velocity, yaw)
 
 
-def test_a_row_without_a_velocity_gets_that_of_its_positions_and_the_others_keep_theirs():
-    estimator = External(2)
-    for k in range(101):
+def test_velocity_follows_from_positions():
+    external = External()
+    for k in range(151):
         t = 0.01 * k
-        state = reading(t, [[0.2 * t, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        state.velocity[1] = [0.0, 0.7, 0.0]
-        estimator.estimate(t, state)
-    assert state.velocity == pytest.approx(np.array([[0.2, 0.0, 0.0], [0.0, 0.7, 0.0]]), abs=1e-3)
-    for k in range(101, 151):  # it stands now
-        t = 0.01 * k
-        state = reading(t, [[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
-        estimator.estimate(t, state)
-    assert 0.0 <= state.velocity[0, 0] < 0.003
+        moving = state(t, (0.2 * min(t, 1.0), 0.0, 0.0))
+        external.estimate(t, moving)
+        if k == 100:
+            assert moving.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
+    assert 0.0 <= moving.velocity[0] < 0.003  # it stands now
 
 
-def test_the_velocity_of_an_old_position_and_of_none_is_unknown():
-    estimator = External(2)
-    state = reading(0.0, [[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
-    estimator.estimate(0.1, state)
-    assert state.velocity[0] == pytest.approx([0.0, 0.0, 0.0])
-    assert np.isnan(state.velocity[1]).all()
-    late = reading(0.0, [[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])
-    estimator.estimate(PATIENCE_S, late)
-    assert np.isnan(late.velocity).all()
+def test_measured_velocity_is_kept():
+    measured = state(0.0, (0.0, 0.0, 0.0), (0.0, 0.7, 0.0))
+    External().estimate(0.0, measured)
+    assert measured.velocity == (0.0, 0.7, 0.0)
 
 
-def test_one_array_of_unknowns_in_several_fields_stays_unknown():
-    state = reading(0.0, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    state.true_position = state.velocity
-    External(2).estimate(0.0, state)
-    assert np.isfinite(state.velocity).all()
-    assert np.isnan(state.true_position).all()
+def test_velocity_of_old_position_is_unknown():
+    external, first, old = External(), state(0.0, (0.0, 0.0, 0.0)), state(0.0, (0.0, 0.0, 0.0))
+    external.estimate(0.1, first)
+    assert first.velocity == (0.0, 0.0, 0.0)
+    external.estimate(PATIENCE_S, old)
+    assert all(map(isnan, old.velocity))
+    nowhere = state(0.0, (nan, 0.0, 0.0))
+    External().estimate(0.1, nowhere)
+    assert all(map(isnan, nowhere.velocity))
+
+
+def test_poses_that_are_old_or_jump_are_refused():
+    external = External()
+    assert external.update(1.0, (0.0, 0.0, 0.0), 0.0)
+    assert not external.update(1.0, (0.0, 0.0, 0.0), 0.0)
+    assert not external.update(1.1, (nan, 0.0, 0.0), 0.0)
+    assert not external.update(1.1, (FASTEST * 0.1 + 0.1, 0.0, 0.0), 0.0)
+    assert (external.refused, external.time) == (1, 1.0)
+    assert external.update(1.0 + PATIENCE_S, (9.0, 0.0, 0.0), 0.0)
+    assert external.velocity == (0.0, 0.0, 0.0)
 
 
 def test_without_a_measured_yaw_the_own_one_goes_on():
-    external, row = External(1), np.array([0])
-    state = reading(0.0, [[0.0, 0.0, 0.0]] * 2)
+    external = External()
 
     def yaw(t, measured, own):
-        external.update(0, t, np.array([0.1 * t, 0.0, 0.0]), measured)
-        state.yaw = np.array([own, 0.0])
-        external.fill(state, row)
-        return state.yaw[0]
+        external.update(t, (0.1 * t, 0.0, 0.0), measured)
+        filled = state(t - 0.5, (7.0, 7.0, 7.0), yaw=own)
+        external.fill(filled)
+        assert (filled.time, filled.position, filled.velocity) == (t, external.position, external.velocity)
+        return filled.yaw
 
-    assert yaw(0.0, np.nan, 0.3) == 0.3  # none was measured yet
+    assert yaw(0.0, nan, 0.3) == 0.3  # none was measured yet
     assert yaw(0.1, 1.0, 0.2) == 1.0
-    assert yaw(0.2, np.nan, 0.7) == pytest.approx(1.5)  # turned by 0.5 since
-    assert yaw(5.0, np.nan, -0.2) == pytest.approx(0.6)
+    assert yaw(0.2, nan, 0.7) == pytest.approx(1.5)  # turned by 0.5 since
+    assert yaw(5.0, nan, -0.2) == pytest.approx(0.6)
     assert yaw(5.1, 2.0, -0.2) == 2.0
-    assert np.isnan(yaw(5.2, np.nan, np.nan))
+    assert isnan(yaw(5.2, nan, nan))

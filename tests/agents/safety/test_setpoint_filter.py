@@ -1,184 +1,227 @@
 """The last word: whatever comes in, what goes out is a setpoint that the robot may have."""
 
-import math
+from math import cos, dist, inf, isfinite, isnan, nan, pi, sin
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO
+from agents.body.interface import BodyState
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
+from agents.safety.situation import Situation
 
-FEW = settings(max_examples=60)
-ALL = tuple(KINDS.values())
-TAKES = np.array([kind.takes for kind in ALL])
-FLIES = np.array([kind.flies for kind in ALL])
-LIMITS = Limits(np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 2.5]), margin=0.05, speed=0.5, goal_step=0.4)
-ROWS = len(ALL)
+FEW = settings(max_examples=100)
+EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+LIMITS = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05, speed=0.5, goal_step=0.4)
+ROOMY = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05)
 anything = st.one_of(
-    st.floats(-3.0, 3.0), st.floats(), st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 1e6, 0.0, -0.0])
+    st.floats(-3.0, 3.0), st.floats(), st.sampled_from([nan, inf, -inf, 1e308, -1e308, 1e6, 0.0, -0.0])
 )
 nearby = st.floats(-1.3, 1.3)
-FRESH = np.zeros(ROWS)
 
 
-def bounds(limits=LIMITS):
-    """Where goals may lie (rows, 3): heights of ground robots are nobody's business."""
-    low, high = np.tile(limits.low, (ROWS, 1)), np.tile(limits.high, (ROWS, 1))
-    low[:, :2] += limits.margin
-    high[:, :2] -= limits.margin
-    high[:, 2] -= limits.margin
-    low[:, 2] += [max(kind.height, FLOOR_M) for kind in ALL]
-    low[~FLIES, 2], high[~FLIES, 2] = -np.inf, np.inf
-    return low, high
+class Swerve:
+    """Avoidance that wants one setpoint."""
+
+    def __init__(self, *setpoint):
+        self.setpoint = setpoint
+
+    def restrain(self, setpoint, own, near):
+        return self.setpoint
 
 
+def judged(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
+    """A filter, and a situation that it judged."""
+    made, now = SetpointFilter(kind, limits), Situation()
+    now.take(0.0, BodyState(-age, position, (0.0, 0.0, 0.0), yaw))
+    made.judge(now)
+    return made, now
+
+
+def limited(kind, setpoint, position, **given):
+    made, now = judged(kind, position, **given)
+    return made.limit(setpoint, now), made
+
+
+def bounds(kind):
+    """Where goals may lie: heights of ground robots are nobody's business."""
+    (low_x, low_y, low_z), (high_x, high_y, high_z), edge = LIMITS.low, LIMITS.high, LIMITS.margin
+    bottom, top = (low_z + max(kind.height, FLOOR_M), high_z - edge) if kind.flies else (-inf, inf)
+    return (low_x + edge, low_y + edge, bottom), (high_x - edge, high_y - edge, top)
+
+
+@EACH
 @FEW
 @given(
-    arrays(float, (ROWS, 4), elements=anything),
-    arrays(float, (ROWS, 3), elements=st.one_of(nearby, anything)),
-    arrays(float, ROWS, elements=anything),
-    arrays(float, ROWS, elements=st.one_of(st.floats(0, 1), anything)),
+    st.tuples(*[anything] * 4),
+    st.tuples(*[st.one_of(nearby, anything)] * 3),
+    anything,
+    st.one_of(st.floats(0, 1), anything),
 )
-def test_whatever_comes_in_a_lawful_setpoint_goes_out(setpoint, position, yaw, age):
-    before = setpoint.copy(), position.copy(), yaw.copy()
-    verdict = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, age)
-    for kept, now in zip(before, (setpoint, position, yaw), strict=True):
-        np.testing.assert_array_equal(kept, now)
-    safe, blind = verdict.setpoint, verdict.invalid_pose
-    believable = (np.abs(position) < 1e6).all(axis=1) & (np.abs(yaw) < 1e6)
-    np.testing.assert_array_equal(blind, ~(believable & (np.abs(age) <= LIMITS.own_silence_s)))
-    by_position = TAKES == "position"
-    assert np.isnan(safe[blind & by_position]).all()
-    assert np.isfinite(safe[~(blind & by_position)]).all()
-    assert not safe[blind & ~by_position].any()
-    speed = np.minimum([kind.speed for kind in ALL], LIMITS.speed)
-    turn = np.array([kind.turn_rate for kind in ALL])
-    for row in np.flatnonzero(~by_position):
-        linear = safe[row, :3] if TAKES[row] == "velocity" else safe[row, 0]
-        rate = safe[row, 3] if TAKES[row] == "velocity" else safe[row, 1]
-        assert np.abs(linear).max() <= speed[row]
-        assert abs(rate) <= turn[row]
-    low, high = bounds()
-    for row in np.flatnonzero(by_position & ~blind):
-        step = safe[row, :3] - position[row]
-        longest = min(LIMITS.goal_step, speed[row] / ALL[row].response)
-        assert np.linalg.norm(step) <= longest * (1 + 1e-9) + 1e-9 * np.abs(position[row]).max()
-        inside = (position[row] >= low[row]) & (position[row] <= high[row])
-        assert (safe[row, :3][inside] >= low[row][inside] - 1e-12).all()
-        assert (safe[row, :3][inside] <= high[row][inside] + 1e-12).all()
-        assert (step[position[row] > high[row]] <= 0.0).all()  # from outside, only inward
-        assert (step[position[row] < low[row]] >= 0.0).all()
+def test_lawful_setpoint_for_whatever_comes(kind, setpoint, position, yaw, age):
+    made, now = judged(kind, position, yaw=yaw, age=age)
+    safe = made.limit(setpoint, now)
+    believable = all(abs(each) < 1e6 for each in (*position, yaw))
+    assert now.invalid == (not (believable and abs(age) <= LIMITS.own_silence_s))
+    if now.invalid:
+        assert all(map(isnan, safe)) if kind.takes == "position" else safe == (0.0, 0.0, 0.0, 0.0)
+        return
+    assert all(map(isfinite, safe))
+    speed = min(kind.speed, LIMITS.speed)
+    if kind.takes == "twist":
+        assert abs(safe[0]) <= speed
+        assert abs(safe[1]) <= kind.turn_rate
+    elif kind.takes == "velocity":
+        assert max(map(abs, safe[:3])) <= speed
+        assert abs(safe[3]) <= kind.turn_rate
+    else:
+        far = max(map(abs, position))
+        assert dist(safe[:3], position) <= min(LIMITS.goal_step, speed / kind.response) * (1 + 1e-9) + 1e-9 * far
+        for goal, here, low, high in zip(safe[:3], position, *bounds(kind), strict=True):
+            if low <= here <= high:
+                assert low - 1e-12 <= goal <= high + 1e-12
+            else:  # from outside, only inward
+                assert goal <= here if here > high else goal >= here
 
 
+@EACH
 @FEW
-@given(arrays(float, (ROWS, 4), elements=nearby), arrays(float, (ROWS, 3), elements=nearby), nearby)
-def test_nobody_is_driven_farther_out(setpoint, position, turned):
-    yaw = np.full(ROWS, 3.0 * turned)
-    safe = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, FRESH).setpoint
-    low, high = bounds()
-    for row in range(ROWS):
-        if TAKES[row] == "position":
-            continue
-        velocity = safe[row, :3]
-        if TAKES[row] == "twist":
-            velocity = np.array([safe[row, 0] * math.cos(yaw[row]), safe[row, 0] * math.sin(yaw[row]), 0.0])
-        assert not (velocity[position[row] > high[row]] > 0.0).any()
-        assert not (velocity[position[row] < low[row]] < 0.0).any()
+@given(st.tuples(*[nearby] * 4), st.tuples(*[nearby] * 3), st.floats(-4, 4), st.floats(0, 0.5))
+def test_robot_is_not_driven_farther_out(kind, setpoint, position, yaw, age):
+    safe, _ = limited(kind, setpoint, position, yaw=yaw, age=age)
+    velocity = safe[:3]
+    if kind.takes == "position":
+        velocity = [goal - here for goal, here in zip(velocity, position, strict=True)]
+    elif kind.takes == "twist":
+        velocity = safe[0] * cos(yaw), safe[0] * sin(yaw), 0.0
+    for v, here, low, high in zip(velocity, position, *bounds(kind), strict=True):
+        assert not (v > 0.0 and here > high)
+        assert not (v < 0.0 and here < low)
 
 
+@EACH
 @FEW
-@given(arrays(float, (ROWS, 4), elements=st.one_of(nearby, anything)), arrays(float, (ROWS, 3), elements=nearby))
-def test_changed_says_whether_it_was_changed(setpoint, position):
-    verdict = SetpointFilter(ALL, LIMITS).check(setpoint, position, np.zeros(ROWS), FRESH)
-    same = np.isclose(verdict.setpoint, setpoint, rtol=0, atol=1e-9).all(axis=1)
-    np.testing.assert_array_equal(verdict.changed, ~same)
+@given(st.tuples(*[st.one_of(nearby, anything)] * 4), st.tuples(*[nearby] * 3))
+def test_changed_says_whether_it_was_changed(kind, setpoint, position):
+    safe, made = limited(kind, setpoint, position)
+    same = all(abs(a - b) <= 1e-9 for a, b in zip(safe, setpoint, strict=True))
+    assert made.changed == (not same)
+    assert made.not_finite == (not all(abs(each) < 1e6 for each in setpoint))
 
 
-@FEW
-@given(arrays(float, (ROWS, 4), elements=anything), arrays(float, (ROWS, 3), elements=st.one_of(nearby, anything)))
-def test_rows_are_checked_as_if_each_were_alone(setpoint, position):
-    yaw, age = np.linspace(-3, 3, ROWS), np.linspace(0, 0.7, ROWS)
-    whole = SetpointFilter(ALL, LIMITS).check(setpoint, position, yaw, age)
-    for row in range(ROWS):
-        one = slice(row, row + 1)
-        alone = SetpointFilter(ALL[one], LIMITS).check(setpoint[one], position[one], yaw[one], age[one])
-        for field in ("setpoint", "changed", "invalid_pose", "not_finite"):
-            np.testing.assert_array_equal(getattr(alone, field)[0], getattr(whole, field)[row])
+@pytest.mark.parametrize(
+    ("kind", "setpoint"),
+    [(CRAZYFLIE, (0.1, 0.2, 0.8, 0.3)), (TELLO, (0.2, 0.1, -0.1, 1.0)), (KHEPERA4, (0.2, 2.0, 0.0, 0.0))],
+)
+def test_lawful_setpoints_pass_untouched(kind, setpoint):
+    for position in ((0.0, 0.0, 0.8), (0.6, 0.6, 0.8)):
+        safe, made = limited(kind, setpoint, position, limits=ROOMY)
+        if kind is not CRAZYFLIE or position[0] == 0.0:
+            assert safe == setpoint
+            assert not any((made.changed, made.not_finite, made.avoided))
 
 
-def check(kind, setpoint, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    return SetpointFilter((kind,), limits).check(
-        np.array([setpoint]), np.array([position]), np.array([yaw]), np.array([age])
-    )
-
-
-def whereabouts(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
-    return SetpointFilter((kind,), limits).validate_poses(np.array([position]), np.array([yaw]), np.array([age]))
-
-
-def test_lawful_setpoints_pass_untouched():
-    for kind, setpoint in (
-        (CRAZYFLIE, [0.1, 0.2, 0.8, 0.3]),
-        (TELLO, [0.2, 0.1, -0.1, 1.0]),
-        (KHEPERA4, [0.2, 2.0, 0, 0]),
-    ):
-        verdict = check(kind, setpoint, [0.0, 0.0, 0.8])
-        np.testing.assert_array_equal(verdict.setpoint, [setpoint])
-        assert (verdict.changed[0], verdict.invalid_pose[0], verdict.not_finite[0]) == (False, False, False)
-
-
-def test_goals_are_pulled_into_the_arena_and_near_the_robot():
-    high = check(CRAZYFLIE, [0.0, 0.0, 9.0, 0.5], [0.0, 0.0, 2.3])
-    np.testing.assert_allclose(high.setpoint, [[0.0, 0.0, 2.39, 0.5]])
+def test_goals_are_pulled_into_the_arena():
+    high, made = limited(CRAZYFLIE, (0.0, 0.0, 9.0, 0.5), (0.0, 0.0, 2.3))
+    assert high == pytest.approx((0.0, 0.0, 2.39, 0.5))
+    assert made.changed
     # 0.5 m/s, closed at 2/s: a goal may be 0.25 m ahead
-    far = check(CRAZYFLIE, [0.9, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(far.setpoint, [[0.25, 0.0, 1.0, 0.0]])
-    near = check(
-        CRAZYFLIE, [0.9, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0], limits=Limits(LIMITS.low, LIMITS.high, goal_step=0.1)
-    )
-    np.testing.assert_allclose(near.setpoint, [[0.1, 0.0, 1.0, 0.0]])
-    assert high.changed[0]
-    assert far.changed[0]
+    far, made = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    assert far == pytest.approx((0.25, 0.0, 1.0, 0.0))
+    assert made.changed
+    short = Limits(low=LIMITS.low, high=LIMITS.high, goal_step=0.1)
+    near, _ = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0), limits=short)
+    assert near == pytest.approx((0.1, 0.0, 1.0, 0.0))
 
 
-def test_the_lower_of_two_speed_limits_counts():
-    np.testing.assert_array_equal(check(KHEPERA4, [9.0, 0, 0, 0], [0, 0, 0]).setpoint, [[KHEPERA4.speed, 0, 0, 0]])
-    np.testing.assert_array_equal(check(TELLO, [9.0, 0, 0, 0], [0, 0, 1]).setpoint, [[0.5, 0, 0, 0]])
+def test_lower_of_two_speed_limits_counts():
+    assert limited(KHEPERA4, (9.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0] == (KHEPERA4.speed, 0.0, 0.0, 0.0)
+    assert limited(TELLO, (9.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0))[0] == (0.5, 0.0, 0.0, 0.0)
 
 
-def test_a_ground_robot_beyond_the_wall_may_turn_and_come_back():
-    out, back = (check(KHEPERA4, [v, 1.0, 0, 0], [0.97, 0.0, 0.0]) for v in (0.2, -0.2))
-    np.testing.assert_array_equal(out.setpoint, [[0.0, 1.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(back.setpoint, [[-0.2, 1.0, 0.0, 0.0]])
-    assert (out.changed[0], back.changed[0]) == (True, False)
+def test_ground_robot_beyond_the_wall_may_return():
+    out, made = limited(KHEPERA4, (0.2, 1.0, 0.0, 0.0), (0.97, 0.0, 0.0))
+    assert (out, made.changed) == ((0.0, 1.0, 0.0, 0.0), True)
+    back, made = limited(KHEPERA4, (-0.2, 1.0, 0.0, 0.0), (0.97, 0.0, 0.0))
+    assert (back, made.changed) == ((-0.2, 1.0, 0.0, 0.0), False)
+
+
+def test_velocities_close_in_on_a_wall():
+    def out(x, age=0.0):
+        return limited(TELLO, (1.0, 0.5, 0.0, 0.0), (x, 0.0, 1.0), age=age, limits=ROOMY)[0][0]
+
+    assert out(-0.5) == 1.0
+    assert out(0.65) == pytest.approx(0.3 * TELLO.response)
+    assert out(0.95) == 0.0
+    assert out(1.0) == pytest.approx(-0.05 * TELLO.response)  # back
+    assert out(0.65, age=0.2) == pytest.approx(0.3 / (1.0 / TELLO.response + 0.2))  # it may have come nearer since
+
+
+@pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
+def test_wheels_slow_down_toward_a_wall(kind):
+    def driven(v, yaw, x=0.85):
+        return limited(kind, (v, 1.0, 0.0, 0.0), (x, 0.0, 0.0), yaw=yaw, limits=ROOMY)[0][0]
+
+    assert driven(0.2, 0.0) == pytest.approx(0.1 * kind.response)
+    assert driven(0.2, pi) == 0.2
+    assert driven(-0.2, pi) == pytest.approx(-0.1 * kind.response)
+    assert driven(0.2, 1.2) == 0.2  # along the wall
+    assert driven(0.2, 0.0, x=0.96) == 0.0
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_escaped_is_far_outside(axis, side):
-    edge = np.array([0.0, 0.0, 1.25])
-    edge[axis] = LIMITS.high[axis] if side > 0 else LIMITS.low[axis]
+def test_far_outside_is_outside_for_sure(axis, side):
     for beyond, escaped in ((OUTSIDE_M - 0.01, False), (OUTSIDE_M + 0.01, True)):
-        place = edge.copy()
-        place[axis] += side * beyond
-        where = whereabouts(CRAZYFLIE, place.tolist())
-        assert (bool(where.outside[0]), bool(where.invalid[0]), where.all_valid) == (escaped, False, False)
-        assert where.excess[0] == pytest.approx(beyond)
-        assert bool(where.outside_wall[0]) == (axis < 2 or side > 0)  # floors are measured a little below themselves
+        place = [0.0, 0.0, 1.25]
+        place[axis] = (LIMITS.high[axis] if side > 0 else LIMITS.low[axis]) + side * beyond
+        _, now = judged(CRAZYFLIE, tuple(place))
+        assert (now.outside, now.invalid, now.sound, now.flyaway) == (escaped, False, False, False)
+        assert now.excess == pytest.approx(beyond)
+        assert now.outside_wall == (axis < 2 or side > 0)  # floors are measured a little below themselves
 
 
-@pytest.mark.parametrize(("age", "blind"), [(0.0, False), (0.5, False), (0.51, True), (np.inf, True), (np.nan, True)])
-def test_an_old_position_is_none(age, blind):
-    verdict = check(TELLO, [0.1, 0, 0, 0], [0, 0, 1.0], age=age)
-    assert verdict.invalid_pose[0] == blind
-    np.testing.assert_array_equal(verdict.setpoint, [[0.0 if blind else 0.1, 0, 0, 0]])
+def test_sound_pose_clears_what_was_judged_before():
+    made, now = judged(CRAZYFLIE, (3.0, 0.0, 1.0))
+    assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (True, True, True, 2.0)
+    for position, sound in (((nan, 0.0, 1.0), False), ((0.0, 0.0, 1.0), True)):
+        now.position = position
+        made.judge(now)
+        assert (now.sound, now.invalid) == (sound, not sound)
+        assert (now.outside_wall, now.outside, now.flyaway, now.excess) == (False, False, False, 0.0)
 
 
-def test_a_goal_that_is_no_number_means_stay_here():
-    verdict = check(CRAZYFLIE, [np.nan, 0.0, 0.0, 0.0], [0.3, 0.2, 0.8])
-    np.testing.assert_array_equal(verdict.setpoint, [[0.3, 0.2, 0.8, 0.0]])
-    assert verdict.changed[0]
+@pytest.mark.parametrize(("age", "old"), [(0.0, False), (0.5, False), (0.51, True), (inf, True), (nan, True)])
+def test_an_old_position_is_none(age, old):
+    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=age)
+    assert now.invalid == old
+    assert made.limit((0.1, 0.0, 0.0, 0.0), now) == (0.0 if old else 0.1, 0.0, 0.0, 0.0)
+
+
+def test_goal_without_a_number_means_stay():
+    safe, made = limited(CRAZYFLIE, (nan, 0.0, 0.0, 0.0), (0.3, 0.2, 0.8))
+    assert safe == (0.3, 0.2, 0.8, 0.0)
+    assert made.changed
+    assert made.not_finite
+
+
+def test_avoidance_is_held_to_the_limits():
+    made, now = judged(TELLO, (0.0, 0.0, 1.0))
+    wanted = (0.3, 0.0, 0.0, 0.0)
+    assert made.check(wanted, now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.1, 0.0, 0.0, 0.0)
+    assert (made.changed, made.avoided) == (True, True)
+    assert made.check(wanted, now, Swerve(0.0, 9.0, 0.0, 0.0), None, None) == (0.0, 0.5, 0.0, 0.0)
+    assert made.check(wanted, now, Swerve(*wanted), None, None) == wanted
+    assert (made.changed, made.avoided) == (False, False)
+    assert made.check(wanted, now, Swerve(nan, 0.0, 0.0, 0.0), None, None) == wanted
+    assert not made.avoided
+
+
+def test_avoidance_moves_no_robot_without_a_pose():
+    made, now = judged(TELLO, (0.0, 0.0, 1.0), age=1.0)
+    assert made.check((0.3, 0.0, 0.0, 0.0), now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.0, 0.0, 0.0, 0.0)
+    made, now = judged(TELLO, (0.0, 0.0, 1.0))
+    assert made.check((nan, 0.0, 0.0, 0.0), now, Swerve(0.1, 0.0, 0.0, 0.0), None, None) == (0.0, 0.0, 0.0, 0.0)
+    assert made.not_finite

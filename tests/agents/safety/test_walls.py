@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance
-from agents.body.kinds import KINDS, TELLO
-from agents.body.limits import Limits
+from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
-from agents.safety.setpoint_filter import SetpointFilter
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
 from tests.agents.swarm import Group
 
 HOVER = 0.8
-LIMITS = Limits(np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 2.5]), margin=0.05)
 WALLS = [(kind, axis, side) for kind in KINDS for axis, side in ((0, 1.0), (1, -1.0))]
 WALLS += [(kind, 2, 1.0) for kind in KINDS if KINDS[kind].flies]
 
@@ -56,36 +53,3 @@ def test_nobody_gets_beyond_a_wall(kind, axis, side):
 @pytest.mark.parametrize("kind", KINDS)
 def test_nor_where_commands_take_effect_late(kind):
     assert -0.1 < farthest(kind, 0, 1.0, latency_s=0.15) < 0.001
-
-
-def test_velocities_toward_a_wall_are_what_would_close_in_on_a_goal_there():
-    def out(x: float, age: float = 0.0) -> float:
-        return float(
-            SetpointFilter((TELLO,), LIMITS)
-            .check(np.array([[1.0, 0.5, 0.0, 0.0]]), np.array([[x, 0.0, 1.0]]), np.zeros(1), np.array([age]))
-            .setpoint[0, 0]
-        )
-
-    assert out(-0.5) == 1.0
-    assert out(0.65) == pytest.approx(0.3 * TELLO.response)
-    assert out(0.95) == 0.0
-    assert out(1.0) == pytest.approx(-0.05 * TELLO.response)  # back
-    assert out(0.65, age=0.2) == pytest.approx(0.3 / (1.0 / TELLO.response + 0.2))  # it may have come nearer since
-
-
-@pytest.mark.parametrize("kind", ["khepera4", "turtlebot3"])
-def test_wheels_slow_down_toward_a_wall_whichever_way_they_look(kind):
-    made = KINDS[kind]
-
-    def driven(v: float, yaw: float, x: float = 0.85) -> float:
-        return float(
-            SetpointFilter((made,), LIMITS)
-            .check(np.array([[v, 1.0, 0.0, 0.0]]), np.array([[x, 0.0, 0.0]]), np.array([yaw]), np.zeros(1))
-            .setpoint[0, 0]
-        )
-
-    assert driven(0.2, 0.0) == pytest.approx(0.1 * made.response)
-    assert driven(0.2, np.pi) == 0.2
-    assert driven(-0.2, np.pi) == pytest.approx(-0.1 * made.response)
-    assert driven(0.2, 1.2) == 0.2  # along the wall
-    assert driven(0.2, 0.0, x=0.96) == 0.0
