@@ -33,9 +33,8 @@ class Preflight:
         self._since, self._covered = inf, False  # covered: a drone with a robot above it
         x, y = assignment.start or (0.0, 0.0)
         self._other_starts = [
-            other for other in assignment.other_starts
-            if hypot(other[1] - x, other[2] - y) > assignment.kind.radius + other[3]
-        ]  # fmt: skip
+            each for each in assignment.starts if hypot(each[1] - x, each[2] - y) > assignment.kind.radius + each[3]
+        ]
 
     def check(self, now: Situation, missing: Sequence[str], neighbours: Neighbours, health: ProcessHealth) -> str:
         """First reason why the robot must not take off, empty if there is none.
