@@ -212,5 +212,7 @@ class Obedience:
         self.still = self.strays = False
         self.told = self.told_s = self.strayed = self.vain_turn = self.spin = self.turn = self.turn_before = 0.0
         self.vain = self.drift = self.way = self.way_before = ZERO
-        self.begin = self.anchor = position
+        # a place of which a part is unknown is no begin: nothing would ever be nearer to it
+        known = is_finite(position) and isfinite(yaw)
+        self.begin = self.anchor = position if known else UNKNOWN
         self.begin_yaw = self.anchor_yaw = yaw

@@ -129,3 +129,16 @@ def test_setpoints_without_numbers_tell_nothing(kind, setpoint):
     for tick in range(500):
         obedience.update(tick * DT, setpoint, (0.0, 0.0, 0.0), math.inf if tick % 2 else 0.0, True)
     assert (obedience.told, obedience.strayed, obedience.still) == (0.0, 0.0, False)
+
+
+@pytest.mark.parametrize(("position", "yaw"), [((1.0, 0.0, 0.5), math.nan), ((1.0, math.nan, 0.5), 0.0)])
+def test_partly_known_pose_is_no_begin(position, yaw):
+    robot = Told(CRAZYFLIE)
+    robot.position = (1.0, 0.0, 0.5)
+    robot.go(1.0, told=0.5, speed=0.5)
+    for _ in range(100):
+        robot.obedience.update(robot.tick * DT, (2.0, 0.0, 0.5, 0.0), position, yaw, False)
+        robot.tick += 1
+    assert robot.go(10.0, told=0.5, speed=0.5) == (False, False)
+    assert robot.obedience.strayed < 0.1
+    assert robot.go(4.0, speed=0.5) == (False, True)
