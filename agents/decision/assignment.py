@@ -52,3 +52,12 @@ class Assignment:
     def ground(self) -> float:
         """Height that the robot holds [m]: 0 on wheels."""
         return self.hover if self.kind.flies else 0.0
+
+    @property
+    def plugins(self) -> tuple[tuple[str, object], ...]:
+        """Plug-ins at work in a tick, each with what it is."""
+        planners = (("planner", leg.planner) for leg in self.legs)
+        return (
+            ("law", self.law), ("trigger", self.trigger), ("trigger", self.update), ("predictor", self.predictor),
+            ("avoidance", self.avoidance), *planners,
+        )  # fmt: skip

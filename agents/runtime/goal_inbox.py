@@ -7,76 +7,77 @@ from collections.abc import Sequence
 from functools import partial
 from math import nan
 
-import numpy as np
 import zenoh
 
-from agents.agent import Agent
-from agents.arrays import PoseTable
-from agents.decision.centralised import Guidance
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
+from agents.robot import Robot
 from agents.runtime.pose_inbox import NEWS
 
 
 class GoalInbox:
-    """Goals for the guided rows of one process, through the modelled channel; polled."""
+    """Goals for the guided robots of one process, through the modelled channel; polled."""
 
     def __init__(
         self,
         session: zenoh.Session,
         keys: Keys,
-        agent: Agent,
-        guidance: Guidance,
+        robots: Sequence[Robot],
         *,
         reach: messages.Vector,
-        conditions: Conditions | None = None,
+        conditions: Sequence[Conditions] = (),
     ) -> None:
-        """Subscribes for the guided rows of `agent`; goals beyond `reach` [m] are refused.
+        """Subscribes for the guided ones of `robots`; goals beyond `reach` [m] are refused.
 
-        `conditions` are the effects of the modelled channel on the goals of each guided row; None: none.
+        `conditions` are the effects of the modelled channel on the goals of each robot; empty: none.
         """
-        self._session, self._agent, self._guidance, self._reach = session, agent, guidance, reach
-        self._names: Sequence[str] = agent.assignment.names
-        rows = np.flatnonzero(guidance.guided).tolist()
-        self._inboxes = [
-            pubsub.Inbox(pubsub.subscriber(session, keys.goal(self._names[row]), 8), messages.Goal, keys=keys)
-            for row in rows
-        ]
+        self._session, self._robots, self._reach = session, robots, reach
+        guided = [row for row, robot in enumerate(robots) if robot.guidance is not None]
+        self._inboxes = {
+            row: pubsub.Inbox(
+                pubsub.subscriber(session, keys.goal(robots[row].assignment.name), 8), messages.Goal, keys=keys
+            )
+            for row in guided
+        }
         self._watch = pubsub.AliveWatch(session, keys.lives(keys.centre_alive))
         self._centre, self._life = keys.centre_alive, ""
-        self._seq = dict.fromkeys(rows, 0)
-        self._rows = np.array(rows, dtype=np.intp)
-        self._channel = Channel(conditions or Conditions.ideal(len(rows)))
+        self._seq = dict.fromkeys(guided, 0)
+        self._channel = Channel(conditions or [Conditions()] * len(robots))
         # by row, for telemetry, which empties them
-        self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in self._names]
+        self.news = [deque[messages.GoalReceipt](maxlen=NEWS) for _ in robots]
 
     @property
     def malformed(self) -> int:
-        return sum(inbox.malformed for inbox in self._inboxes)
+        return sum(inbox.malformed for inbox in self._inboxes.values())
 
     def receive(self, t: float, utc: float) -> None:
         """Receives all until `t` [s] of a clock that was 0 at `utc`."""
         for token, there in self._watch.changes():
             if token != self._centre:
                 self._begin(Keys.life_of(token), there=there)
-            elif there:
-                self._guidance.mark_alive()
-            elif network.connected(self._session):  # without a router every token vanishes, which proves nothing
-                self._guidance.mark_lost(t)
-        for link, (row, inbox) in enumerate(zip(self._rows.tolist(), self._inboxes, strict=True)):
+            elif there or network.connected(self._session):  # without a router every token vanishes: proves nothing
+                self._mark(t, there=there)
+        for row, inbox in self._inboxes.items():
             for goal, sample in inbox.read_samples(partial(self._check, row, utc + t)):
-                self._receive(link, goal, len(sample.payload), t, utc)
-        if (got := self._channel.due(t)) is None:
-            return
-        assert got.yaw is not None
-        assert got.extra is not None
-        for at, (sent, pose) in enumerate(got.extra.tolist()):
-            row, one = self._rows[got.link[at : at + 1]], slice(at, at + 1)
-            if self._guidance.receive(row, got.position[one], got.yaw[one], got.stamp[one]).any():
-                receipt = messages.GoalReceipt(int(got.seq[at]), utc + sent, utc + pose, utc + t)
-                self.news[int(row[0])].append(receipt)
+                self._seq[row] = goal.seq
+                stamp, start = validation.taken(goal.stamp - utc, t), self._robots[row].lifecycle.start_at
+                size = len(sample.payload)
+                self._channel.send(row, (goal, stamp), goal.seq, stamp, start=start, size=size, now=t)
+        for row, _, (goal, stamp) in self._channel.due(t):
+            guidance = self._robots[row].guidance
+            yaw = nan if goal.yaw is None else goal.yaw
+            if guidance is not None and guidance.receive(goal.position, yaw, stamp):
+                self.news[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
+
+    def _mark(self, t: float, *, there: bool) -> None:
+        for row in self._inboxes:
+            guidance = self._robots[row].guidance
+            if guidance is not None and there:
+                guidance.mark_alive()
+            elif guidance is not None:
+                guidance.mark_lost(t)
 
     def _begin(self, life: str | None, *, there: bool) -> None:
         """Resets the numbers for a new central controller: its clock may be behind that of the former one."""
@@ -84,23 +85,14 @@ class GoalInbox:
             return
         if self._life:
             self._seq = dict.fromkeys(self._seq, 0)
-            self._guidance.stamp[self._rows] = -np.inf
+            for row in self._inboxes:
+                guidance = self._robots[row].guidance
+                if guidance is not None:
+                    guidance.begin_anew()
         self._life = life
 
     def _check(self, row: int, now: float, goal: messages.Goal) -> None:
-        oldest_s = self._agent.assignment.limits.link_silence_s
+        oldest_s = self._robots[row].assignment.limits.link_silence_s
         validation.check_goal(goal, now=now, reach=self._reach, oldest_s=oldest_s)
         if goal.seq <= self._seq[row]:
             raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")
-
-    def _receive(self, link: int, goal: messages.Goal, size: int, t: float, utc: float) -> None:
-        """Puts a goal of `size` [bytes] into the modelled channel."""
-        row = int(self._rows[link])
-        self._seq[row] = goal.seq
-        stamp, sent = validation.taken(goal.stamp - utc, t), goal.stamp - utc
-        table = PoseTable(
-            np.array([link]), np.array([goal.seq]), np.array([stamp]), np.array([t]), np.array([goal.position]),
-            np.zeros((1, 3)), np.array([nan if goal.yaw is None else goal.yaw]), np.array([size]),
-            np.array([[sent, goal.pose - utc]]),
-        )  # fmt: skip
-        self._channel.send(table, start=self._agent.lifecycle.start_at[[row]], now=t)

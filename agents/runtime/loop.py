@@ -526,7 +526,7 @@ class Runtime:
     def _read(self, t: float) -> Sequence[BodyState]:
         """States of the bodies, completed by what others measure."""
         states = self._body.read(t)
-        self._airborne = any([state.flying for state in states])
+        self._airborne = any(state.flying for state in states)
         for row, state in enumerate(states):
             if isnan(state.velocity[0]):
                 self._estimators[row].estimate(t, state)

@@ -11,18 +11,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf, isfinite
-from typing import Any, Final
+from typing import Final
 
 import msgspec
-import numpy as np
 import zenoh
 
-from agents.agent import Actions, Agent
-from agents.arrays import Array, Index
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
+from agents.robot import Robot
 from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import PoseInbox
 
@@ -33,23 +31,24 @@ UNDER_WAY: Final = ("airborne", "running")
 
 
 class Counts:
-    """Counters of a process of n rows; ticks and interventions since the common start."""
+    """Counters of a process of n robots; ticks and interventions since the common start."""
 
     def __init__(self, rows: int) -> None:
         self.sent = [0] * rows  # (n) poses
-        self.interventions: Index = np.zeros(rows, dtype=np.intp)  # (n,) ticks on which safety changed the decision
-        self.avoided: Index = np.zeros(rows, dtype=np.intp)  # (n,) ticks on which avoidance did
+        self.interventions = [0] * rows  # (n) ticks on which safety changed the decision
+        self.avoided = [0] * rows  # (n) ticks on which avoidance did
         self.refused = self.ticks = self.missed = 0  # orders, ticks, skipped ticks
         self.late_s = 0.0  # [s] largest lateness of a tick since the last status
 
     def begin(self) -> None:
         """Resets the counters that begin at the common start."""
         self.ticks = self.missed = 0
-        self.interventions[:] = self.avoided[:] = 0
+        count = len(self.sent)
+        self.interventions, self.avoided = [0] * count, [0] * count
 
 
 class Telemetry:
-    """States, statuses and range readings of the rows of a process."""
+    """States, statuses and range readings of the robots of a process."""
 
     def __init__(
         self,
@@ -57,17 +56,17 @@ class Telemetry:
         keys: Keys,
         encoding: messages.Encoding,
         *,
-        agent: Agent,
+        robots: Sequence[Robot],
         neighbours: PoseInbox,  # poses received since the last state are sent with it, and removed
         counts: Counts,  # kept by the runtime
         malformed: Callable[[], int],  # number of refused payloads, other than poses
-        ranged: Sequence[bool],  # (n) rows whose bodies measure ranges: those of the others come from the network
-        # goals received by each row since the last state, removed here; None: no row is guided
+        ranged: Sequence[bool],  # (n) robots whose bodies measure ranges: those of the others come from the network
+        # goals received by each robot since the last state, removed here; None: no robot is guided
         receipts: Sequence[deque[messages.GoalReceipt]] | None = None,
     ) -> None:
-        self._agent, self._neighbours, self._counts, self._malformed = agent, neighbours, counts, malformed
+        self._robots, self._neighbours, self._counts, self._malformed = robots, neighbours, counts, malformed
         self._encoding = encoding
-        names = self._names = agent.assignment.names
+        names = self._names = tuple(robot.assignment.name for robot in robots)
         mime = messages.MIME[encoding]
         self._states = [pubsub.publisher(session, keys.state(name), mime) for name in names]
         self._statuses = [pubsub.pose_publisher(session, keys.status(name), mime) for name in names]
@@ -75,7 +74,7 @@ class Telemetry:
             pubsub.publisher(session, keys.ranges(name), mime) if own else None
             for name, own in zip(names, ranged, strict=True)
         ]
-        # [s] UTC at which the clock of the process was 0, and on that clock, of the next statuses of all rows
+        # [s] UTC at which the clock of the process was 0, and on that clock, of the next statuses of all robots
         self.utc = self.due = 0.0
         self._receipts = [deque[messages.GoalReceipt]() for _ in names] if receipts is None else receipts
         self._seq = 0
@@ -86,31 +85,29 @@ class Telemetry:
         self._incidents: list[deque[messages.Incident]] = [deque(maxlen=INCIDENTS) for _ in names]
         self._numbers = [0] * len(names)
 
-    def send_states(self, state: BodyState, actions: Actions, t: float) -> None:
-        """Sends the state of every row, also of one whose position is unknown."""
+    def send_states(self, t: float) -> None:
+        """Sends the state of every robot, also of one whose position is unknown."""
         self._seq += 1
-        agent = self._agent
-        position, velocity, truth = state.position.tolist(), state.velocity.tolist(), state.true_position.tolist()
-        goal, setpoint, error = agent.goal.tolist(), actions.setpoint.tolist(), agent.error.tolist()
-        yaw, true_yaw, phase = state.yaw.tolist(), state.true_yaw.tolist(), agent.lifecycle.phase.tolist()
-        for row, name in enumerate(self._names):
+        for row, robot in enumerate(self._robots):
+            now, state, setpoint = robot.now, robot.now.state, robot.setpoint
+            attitude, shadow = state.attitude, state.shadow_position
             message = messages.State(
-                name,
+                self._names[row],
                 self._seq,
                 self.utc + t,
-                WORDS[phase[row]],
-                messages.vector(position[row]),
-                messages.vector(velocity[row]),
-                messages.heading(yaw[row]),
-                messages.vector(goal[row]),
-                tuple(setpoint[row]) if all(map(isfinite, setpoint[row])) else None,
-                messages.number(error[row]),
-                messages.vector(truth[row]),
-                messages.heading(true_yaw[row]),
+                WORDS[robot.lifecycle.phase],
+                messages.vector(now.position),
+                messages.vector(now.velocity),
+                messages.heading(now.yaw),
+                messages.vector(robot.goal),
+                setpoint if all(map(isfinite, setpoint)) else None,
+                messages.number(robot.error),
+                messages.vector(state.true_position),
+                messages.heading(state.true_yaw),
                 list(self._neighbours.news[row]),
-                _known_row(state.attitude, row),
-                _known_row(state.shadow_position, row),
-                _known_row(state.shadow_yaw, row),
+                attitude if all(map(isfinite, attitude)) else None,
+                messages.vector(shadow),
+                messages.number(state.shadow_yaw),
                 list(self._receipts[row]),
             )
             for payload in messages.payloads(message, self._encoding):
@@ -118,93 +115,90 @@ class Telemetry:
             self._neighbours.news[row].clear()
             self._receipts[row].clear()
 
-    def send_ranges(self, state: BodyState) -> None:
-        """Sends new range readings of the rows that measure them."""
-        if state.rays is None:
-            return
-        for row in np.unique(state.rays.row).tolist():
-            publisher = self._ranges[row]
-            scan = state.rays.scan_of(row) if publisher is not None else None
+    def send_ranges(self, states: Sequence[BodyState]) -> None:
+        """Sends new range readings of the robots that measure them."""
+        for row, state in enumerate(states):
+            publisher, scan = self._ranges[row], state.scan
             if publisher is not None and scan is not None and scan.time > self._scanned[row]:
                 self._scanned[row] = scan.time
                 ranges = range_inbox.message(self._names[row], self.utc, scan)
                 publisher.put(messages.encode(ranges, self._encoding))
 
     def send_statuses(
-        self, t: float, *, everything: bool, state: BodyState | None = None, changed: bool = False
+        self, t: float, *, everything: bool, states: Sequence[BodyState] = (), changed: bool = False
     ) -> None:
-        """Sends statuses: of all rows if `everything`, else of those that have changed.
+        """Sends statuses: of all robots if `everything`, else of those that have changed.
 
         `changed`: neighbours appeared or vanished, which the phases do not show.
         """
-        agent, counts = self._agent, self._counts
-        if not (everything or changed or agent.lifecycle.moved or agent.hazards.incidents):
+        counts = self._counts
+        for robot in self._robots:
+            changed = changed or robot.lifecycle.moved or bool(robot.hazards.incidents)
+        if not (everything or changed):
             return
         self._note_incidents()
         if everything:
             self.due = t + STATUS_S
-        life = agent.lifecycle
-        receiver = agent.assignment.links.receiver
-        for row, name in enumerate(self._names):
-            missing = agent.missing_neighbours(row)
-            news = (life.phase[row], life.reason[row], tuple(missing), self._numbers[row])
+        for row, robot in enumerate(self._robots):
+            life, missing = robot.lifecycle, robot.missing_neighbours()
+            news = (life.phase, life.reason, tuple(missing), self._numbers[row])
             if not everything and news == self._reported[row]:
                 continue
             if news[:2] != self._reported[row][:2]:
-                print(f"{name}: {Phase(life.phase[row]).word}" + (f" ({news[1]})" if news[1] else ""), flush=True)
+                print(f"{self._names[row]}: {WORDS[life.phase]}" + (f" ({news[1]})" if news[1] else ""), flush=True)
             self._reported[row] = news
-            mine = [sender for sender in self._neighbours.senders if (receiver[sender.links] == row).any()]
-            battery = float(state.battery[row]) if state is not None else float("nan")
-            if self._origin[row] is None and state is not None and life.phase[row] == Phase.RUNNING:
-                x, y, z = state.position[row].tolist()
-                self._origin[row] = (x, y, z, float(state.yaw[row])) if isfinite(x + y + z) else None
-            start = float(life.start_at[row])  # a plain float: msgspec does not encode those of numpy
-            status = messages.Status(
-                robot=name,
-                stamp=self.utc + t,
-                phase=Phase(life.phase[row]).word,
-                reason=life.reason[row],
-                body=state.notes[row] if state is not None and state.notes else "",
-                battery=battery if isfinite(battery) else None,
-                sent=counts.sent[row],
-                received=self._neighbours.received[row],
-                lost={sender.name: sender.lost for sender in mine},
-                dropped=self._dropped_of(row),
-                stale={sender.name: sender.stale for sender in mine if sender.stale},
-                foreign={sender.name: sender.foreign for sender in mine if sender.foreign},
-                malformed=self._malformed() + self._neighbours.malformed,
-                refused=counts.refused,
-                ticks=counts.ticks,
-                missed=counts.missed,
-                decisions=int(agent.updates[row]),
-                interventions=int(counts.interventions[row]),
-                avoided=int(counts.avoided[row]),
-                late_s=counts.late_s,
-                started=self.utc + start if isfinite(start) else 0.0,
-                missing=missing,
-                pid=os.getpid(),
-                cpu_s=time.process_time(),
-                rss_mb=resident_mb(),
-                origin=agent.origin(row) or self._origin[row],
-                hazard=agent.hazards.worst(row),
-                incidents=list(self._incidents[row]),
-            )
-            self._last[row] = status
+            self._last[row] = status = self._status(row, t, missing, states[row] if states else None)
             self._statuses[row].put(messages.encode(status, self._encoding))
         if everything:
             counts.late_s = 0.0
 
+    def _status(self, row: int, t: float, missing: list[str], state: BodyState | None) -> messages.Status:
+        robot, counts = self._robots[row], self._counts
+        life, mine = robot.lifecycle, self._neighbours.senders_of(row)
+        if self._origin[row] is None and state is not None and life.phase == Phase.RUNNING:
+            x, y, z = robot.now.position
+            self._origin[row] = (x, y, z, state.yaw) if isfinite(x + y + z) else None
+        return messages.Status(
+            robot=self._names[row],
+            stamp=self.utc + t,
+            phase=WORDS[life.phase],
+            reason=life.reason,
+            body="" if state is None else state.note,
+            battery=None if state is None else messages.number(state.battery),
+            sent=counts.sent[row],
+            received=self._neighbours.received[row],
+            lost={sender.name: sender.lost for sender in mine},
+            dropped=self._neighbours.dropped_of(row),
+            stale={sender.name: sender.stale for sender in mine if sender.stale},
+            foreign={sender.name: sender.foreign for sender in mine if sender.foreign},
+            malformed=self._malformed() + self._neighbours.malformed,
+            refused=counts.refused,
+            ticks=counts.ticks,
+            missed=counts.missed,
+            decisions=robot.updates,
+            interventions=counts.interventions[row],
+            avoided=counts.avoided[row],
+            late_s=counts.late_s,
+            started=self.utc + life.start_at if isfinite(life.start_at) else 0.0,
+            missing=missing,
+            pid=os.getpid(),
+            cpu_s=time.process_time(),
+            rss_mb=resident_mb(),
+            origin=robot.origin or self._origin[row],
+            hazard=robot.hazards.worst(),
+            incidents=list(self._incidents[row]),
+        )
+
     def _note_incidents(self) -> None:
         """Moves incidents from the decision into statuses, and prints them: the log outlives the network."""
-        happened = self._agent.hazards.incidents
-        for incident in happened:
-            row = incident.row
-            self._numbers[row] += 1
-            self._incidents[row].append(
-                messages.Incident(self._numbers[row], round(self.utc + incident.time, 6), incident.text)
-            )
-            print(f"{self._names[row]}: {incident.text}", flush=True)
-        happened.clear()
+        for row, robot in enumerate(self._robots):
+            for incident in robot.hazards.incidents:
+                self._numbers[row] += 1
+                self._incidents[row].append(
+                    messages.Incident(self._numbers[row], round(self.utc + incident.time, 6), incident.text)
+                )
+                print(f"{self._names[row]}: {incident.text}", flush=True)
+            robot.hazards.incidents.clear()
 
     def repeat_statuses(self, reason: str, stamp: float) -> None:
         """Repeats the last statuses with another `reason`; from any thread, while the loop hangs."""
@@ -213,21 +207,6 @@ class Telemetry:
                 phase = "landing" if status.phase in UNDER_WAY else status.phase
                 repeated = msgspec.structs.replace(status, stamp=stamp, phase=phase, reason=reason)
                 publisher.put(messages.encode(repeated, self._encoding))
-
-    def _dropped_of(self, row: int) -> dict[str, int]:
-        assignment = self._agent.assignment
-        dropped = self._neighbours.dropped
-        at = np.flatnonzero((dropped > 0) & (assignment.links.receiver == row))
-        senders = assignment.links.sender[at].tolist()
-        return {assignment.robots[j]: int(n) for j, n in zip(senders, dropped[at].tolist(), strict=True)}
-
-
-def _known_row(column: Array | None, row: int) -> Any:  # noqa: ANN401 - a number or a tuple, as the column has it
-    """A row of an optional column of the body's state, for a message; None if unknown."""
-    if column is None or not np.isfinite(column[row]).all():
-        return None
-    value = column[row].tolist()
-    return tuple(value) if isinstance(value, list) else value
 
 
 def resident_mb() -> float:

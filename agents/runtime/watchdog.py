@@ -9,11 +9,10 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-from agents.arrays import Index
 from agents.body.interface import Body
 
 SILENCE_S: Final = 0.5
@@ -34,7 +33,7 @@ class Watchdog:
     def __init__(
         self,
         body: Body,
-        rows: Index,
+        rows: Sequence[int],
         *,
         alarm: Callable[[str], object],  # reports the reason to the other processes
         silence_s: float = SILENCE_S,  # longest time without a beat [s]

@@ -19,7 +19,7 @@ from agents.decision.lifecycle import FINISHED, Phase
 from agents.formation.graph import Links
 from agents.network import messages
 from agents.plugins import registry
-from agents.safety.hazards import Incident, Outcome
+from agents.safety.hazards import Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -49,71 +49,63 @@ T = TypeVar("T")
 
 
 class Logbook:
-    """Repetition of a virtual run as a trace or a recording."""
+    """Virtual run as a trace or a recording."""
 
-    def __init__(self, log: Log, experiment: Experiment, case: str, copy: int = 0) -> None:
-        """The repetition of `log.seeds[copy]`."""
-        rows = len(log.names)
+    def __init__(self, log: Log, experiment: Experiment, case: str) -> None:
         self._log, self._experiment, self._case = log, experiment, case
-        self._mine = slice(copy * rows, (copy + 1) * rows)
-        self._seed = log.seeds[copy]
         self._scene = bodies.scene(experiment)
         self._links: Links = Plan(experiment).pose_links
-        self._sent = log.sent.between(copy * rows, (copy + 1) * rows)
-        per_copy = len(self._links)
-        self._received = log.received.between(copy * per_copy, (copy + 1) * per_copy)
-        self._dropped: Index = log.lost[copy * per_copy : (copy + 1) * per_copy]
 
     @cached_property
     def goals(self) -> Goals | None:
         """Goals of the central controller; None if each robot decides for itself."""
-        centre, mine, rows = self._log.centre, self._mine, len(self._log.names)
+        centre, rows = self._log.centre, len(self._log.names)
         if centre is None:
             return None
         sizes = [len(messages.encode(goal, self._encoding)) for _, goal in self._goal_messages(centre)]
-        received = received_in_run(centre.received.between(mine.start, mine.stop), self._experiment.duration_s)
+        received = received_in_run(centre.received, self._experiment.duration_s)
         return Goals.of_run(
-            replace(centre.sent.between(mine.start, mine.stop), bytes=np.array(sizes, dtype=np.intp)),
-            centre.followed.between(mine.start, mine.stop),
+            replace(centre.sent, bytes=np.array(sizes, dtype=np.intp)),
+            centre.followed,
             self._experiment.duration_s,
             received=np.bincount(received.link, minlength=rows),
             lost=np.zeros(rows, dtype=np.intp),
-            dropped=centre.lost_poses[mine],
+            dropped=centre.lost_poses,
         )
 
     def trace(self) -> Trace:
         """The run from the common start on, as arrays."""
-        log, mine, duration = self._log, self._mine, self._experiment.duration_s
+        log, duration = self._log, self._experiment.duration_s
         run = (log.time >= -ROUNDING_S) & (log.time <= duration + ROUNDING_S)
-        rows, sent = len(log.names), self._sent.take(in_run(self._sent.stamp, duration))
+        rows, sent = len(log.names), self._log.sent.take(in_run(self._log.sent.stamp, duration))
         if not log.lean:
             sizes = [len(messages.encode(pose, self._encoding)) for pose in self._poses(sent)]
             sent = replace(sent, bytes=np.array(sizes, dtype=np.intp))
         contacts = messages_in_run(self._contacts(), EPOCH, duration)
         world = messages_in_run(self._world(), EPOCH, duration)
         columns: dict[str, Any] = {what: getattr(log, what) for what in (*SAMPLED, *OPTIONAL)}
-        columns = {what: None if each is None else each[run, mine] for what, each in columns.items()}
+        columns = {what: None if each is None else each[run] for what, each in columns.items()}
         return Trace(
             case=self._case,
             experiment=self._experiment,
-            seed=self._seed,
+            seed=self._log.seed,
             robots=log.names,
             clock="virtual",
             time=np.round(log.time[run], 9),
             sent=sent_in_run(sent, duration),
-            received=received_in_run(self._received, duration),
+            received=received_in_run(self._log.received, duration),
             lost=np.zeros(rows, dtype=np.intp),
             missed_deadlines=np.zeros(rows, dtype=np.intp),
             ticks=np.full(rows, log.ticks, dtype=np.intp),
-            decisions=log.updates[mine],
+            decisions=log.updates,
             events=tuple(
                 messages.Event(t, kind, source, text) for t, kind, source, text in self._events() if t <= duration
             ),
-            interventions=log.interventions[mine],
-            avoided=log.avoided[mine],
+            interventions=log.interventions,
+            avoided=log.avoided,
             contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
-            dropped=self._dropped,
+            dropped=self._log.lost,
             goals=None if log.lean else self.goals,
             **columns,
         )
@@ -125,7 +117,7 @@ class Logbook:
             self._experiment,
             document,
             case=self._case,
-            seed=self._seed,
+            seed=self._log.seed,
             clock="virtual",
             started=EPOCH,
             draw=markers.drawing(self._experiment),
@@ -139,7 +131,7 @@ class Logbook:
     def _messages(self) -> Iterator[Iterable[tuple[float, Message, int | None]]]:
         """All messages, those of a kind in order of time: when each is logged [s, UTC], and its size if it was sent."""
         yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
-        yield ((pose.stamp, pose, len(messages.encode(pose, self._encoding))) for pose in self._poses(self._sent))
+        yield ((pose.stamp, pose, len(messages.encode(pose, self._encoding))) for pose in self._poses(self._log.sent))
         yield ((state.stamp, state, None) for _, states in self._states() for state in states)
         if self._log.centre is not None and self.goals is not None:
             goals = self._goal_messages(self._log.centre)
@@ -161,7 +153,7 @@ class Logbook:
 
     def _goal_messages(self, centre: CentreLog) -> Iterator[tuple[float, messages.Goal]]:
         """Goals, and when they were sent since the common start [s]."""
-        own, names = centre.sent.between(self._mine.start, self._mine.stop), self._log.names
+        own, names = centre.sent, self._log.names
         assert own.yaw is not None
         assert own.extra is not None
         columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
@@ -193,14 +185,14 @@ class Logbook:
 
     def _states(self) -> Iterator[tuple[float, list[messages.State]]]:
         """Telemetry, sample by sample, with the poses that each robot received since the sample before."""
-        log, mine = self._log, self._mine
+        log = self._log
         words = [phase.word for phase in Phase]
         columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
         rest = [getattr(log, what) for what in OPTIONAL]
         samples = zip(
             log.time.tolist(),
-            *(column[:, mine].tolist() for column in (*columns, log.true_position, log.true_yaw)),
-            *(repeat(None, len(log.time)) if column is None else column[:, mine].tolist() for column in rest),
+            *(column.tolist() for column in (*columns, log.true_position, log.true_yaw)),
+            *(repeat(None, len(log.time)) if column is None else column.tolist() for column in rest),
             strict=True,
         )
         received, receipts = self._received_by_sample(), self._goals_by_sample()
@@ -230,7 +222,7 @@ class Logbook:
             )
 
     def _received_by_sample(self) -> dict[tuple[int, int], list[messages.PoseReceipt]]:
-        names, got = self._log.names, self._received
+        names, got = self._log.names, self._log.received
         columns = (self._links.sender[got.link], got.seq, got.stamp, got.arrival, got.position, got.velocity)
         news = (
             messages.PoseReceipt(names[whose], number, EPOCH + taken, EPOCH + arrived, tuple(where), tuple(moves))
@@ -241,7 +233,7 @@ class Logbook:
     def _goals_by_sample(self) -> dict[tuple[int, int], list[messages.GoalReceipt]]:
         if self._log.centre is None:
             return {}
-        got = self._log.centre.followed.between(self._mine.start, self._mine.stop)
+        got = self._log.centre.followed
         assert got.extra is not None
         columns = (got.seq, got.stamp, got.extra[:, 0], got.arrival)
         news = (
@@ -261,13 +253,13 @@ class Logbook:
     def _statuses(self) -> Iterator[messages.Status]:
         """The counters at the end of the run and at the end of everything."""
         log = self._log
-        sent = self._counts(self._sent.link, self._sent.stamp)
-        received = self._counts(self._links.receiver[self._received.link], self._received.arrival)
-        unsafe = {each.row - self._mine.start: each.text for each in self._incidents() if each.outcome >= Outcome.LAND}
+        sent = self._counts(self._log.sent.link, self._log.sent.stamp)
+        received = self._counts(self._links.receiver[self._log.received.link], self._log.received.arrival)
+        unsafe = {row: each.text for row, each in log.incidents if each.outcome >= Outcome.LAND}
         for end, phase, done in ((self._experiment.duration_s, "landing", 0), (log.ended, "done", 1)):
             for row, name in enumerate(log.names):
                 mine = self._links.receiver == row
-                each = zip(self._links.sender[mine].tolist(), self._dropped[mine].tolist(), strict=True)
+                each = zip(self._links.sender[mine].tolist(), self._log.lost[mine].tolist(), strict=True)
                 yield messages.Status(
                     robot=name,
                     stamp=EPOCH + end,
@@ -283,9 +275,9 @@ class Logbook:
                     refused=0,
                     ticks=log.ticks,
                     missed=0,
-                    decisions=int(log.updates[self._mine][row]),
-                    interventions=int(log.interventions[self._mine][row]),
-                    avoided=int(log.avoided[self._mine][row]),
+                    decisions=int(log.updates[row]),
+                    interventions=int(log.interventions[row]),
+                    avoided=int(log.avoided[row]),
                     late_s=0.0,
                     started=EPOCH,
                     missing=[],
@@ -295,17 +287,13 @@ class Logbook:
                 )
 
     def _contacts(self) -> Iterator[messages.Contact]:
-        """Contacts of this repetition, take-off and landing included."""
-        rows, names = len(self._log.names), self._log.names
-        first = self._mine.start
+        """Contacts, take-off and landing included."""
+        names = self._log.names
         for touch in self._log.touches:
-            if first <= touch.first < first + rows:
-                other = (
-                    names[touch.second - first] if touch.second >= 0 else (*self._scene.names, WALL)[-1 - touch.second]
-                )
-                yield messages.Contact(
-                    EPOCH + touch.time, names[touch.first - first], other, float(touch.impulse), float(touch.overlap)
-                )
+            other = names[touch.second] if touch.second >= 0 else (*self._scene.names, WALL)[-1 - touch.second]
+            yield messages.Contact(
+                EPOCH + touch.time, names[touch.first], other, float(touch.impulse), float(touch.overlap)
+            )
 
     def _world(self) -> Iterator[messages.WorldState]:
         """Reports of a world at 1 Hz; none where robots are alone in an empty place."""
@@ -313,7 +301,6 @@ class Logbook:
         if log.lean or not (scene.names or log.touches or finds_contacts(chosen)):
             return
         touched = np.sort([contact.stamp - EPOCH for contact in self._contacts()])
-        moved = log.obstacles[:, self._mine.start // len(log.names)]
         whole = np.flatnonzero(np.abs(log.time - np.round(log.time)) < 0.5 / self._experiment.rates.state_hz - 1e-9)
         for k in whole.tolist():
             t = float(log.time[k])
@@ -328,7 +315,7 @@ class Logbook:
                 mirrored=[],
                 obstacles=[
                     messages.ObstaclePose(*each)
-                    for each in zip(scene.names, map(tuple, moved[k].tolist()), strict=True)
+                    for each in zip(scene.names, map(tuple, log.obstacles[k].tolist()), strict=True)
                 ],
                 contacts=int(np.searchsorted(touched, t, side="right")),
                 refused=0,
@@ -343,13 +330,9 @@ class Logbook:
 
     def _events(self) -> Iterator[tuple[float, str, str, str]]:
         """Events of the conductor and hazards, in order of time."""
-        first, names = self._mine.start, self._log.names
-        hazards = ((each.time, "hazard", names[each.row - first], each.text) for each in self._incidents())
+        names = self._log.names
+        hazards = ((each.time, "hazard", names[row], each.text) for row, each in self._log.incidents)
         yield from sorted([*self._conducted(), *hazards], key=lambda event: event[0])
-
-    def _incidents(self) -> Iterator[Incident]:
-        """Hazards of the robots of this repetition."""
-        return (each for each in self._log.incidents if self._mine.start <= each.row < self._mine.stop)
 
     def _conducted(self) -> Iterator[tuple[float, str, str, str]]:
         yield self._log.airborne, "phase", "conductor", "airborne"

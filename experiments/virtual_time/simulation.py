@@ -15,7 +15,8 @@ import numpy as np
 from agents.arrays import Array, Index, PoseTable
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
-from agents.plugins.calls import blamed
+from agents.plugins.calls import explain
+from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import Incident
 from experiments.definition import bodies
@@ -104,8 +105,11 @@ def simulate(
         PluginError: If a plug-in fails; the error names it.
     """
     flight = Flight(experiment, seed, quiet=quiet, lean=lean)
-    with blamed():
+    try:
         flight.fly(landing=landing, progress=progress, watch=watch)
+    except FAILURES as error:
+        plugins = [each for robot in flight.robots for each in robot.assignment.plugins]
+        raise explain(error, plugins) from error
     return flight.log()
 
 

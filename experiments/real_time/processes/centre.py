@@ -12,15 +12,12 @@ import gc
 import os
 import threading
 import time
-from math import isfinite
+from collections.abc import Sequence
+from math import inf, isfinite, nan
 from typing import Final
 
-import numpy as np
-from msgspec.structs import replace
-
-from agents.arrays import Index
 from agents.clock import Clock, uptime
-from agents.decision.centralised import Centre, CentreGoals
+from agents.decision.centralised import Centre, CentreGoal
 from agents.decision.lifecycle import IDLE, Phase
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -31,8 +28,8 @@ from agents.runtime import command_line
 from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
 from agents.ticks import Ticks
-from experiments.definition import link_conditions
 from experiments.definition.experiment import Experiment
+from experiments.definition.link_conditions import TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch, Network, joined
@@ -49,25 +46,27 @@ class CentreProcess:
     def __init__(self, experiment: Experiment, joint: Network) -> None:
         """Declares all but the token, which tells that orders are received."""
         session, keys = joint.session, joint.keys
-        assignment = Plan(experiment).assignment(centrally=True)
-        self.centre = centre = Centre(assignment)
-        self._names, self._session, self._keys = assignment.names, session, keys
+        plan = Plan(experiment)
+        names = self._names = plan.names
+        self.centre = centre = Centre([plan.assignment(name, centrally=True) for name in names])
+        common = centre.assignments[0]  # rates, limits and duration are those of the experiment
+        self._duration, self._session, self._keys = common.duration, session, keys
         self._ownership = joint.ownership
         self._router = network.RouterWatch(session, keys.centre_alive, joint.endpoints)
         self._cut_off = False
         self._encoding: messages.Encoding = experiment.network.encoding
-        self._ticks = Ticks(assignment.body_hz / assignment.decide_every, clock=uptime)
+        self._ticks = Ticks(common.body_hz / common.decide_every, clock=uptime)
         # poses that are sent on the tick of a decision arrive within half a tick, and still count
-        self._patience = 0.5 / assignment.body_hz
-        names, rows = self._names, centre.needed.tolist()
+        self._patience = 0.5 / common.body_hz
+        rows, ends = centre.needed, [(name, name) for name in names]
         self._poses = ModelledInbox(
-            session, keys, {names[row]: np.array([row]) for row in rows},
-            link_conditions.conditions_to_centre(experiment, np.arange(len(names))), centre,
-            reach=reach_of(assignment.limits.low, assignment.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
+            session, keys, {names[row]: [row] for row in rows},
+            conditions_of(experiment, ends, experiment.seed, stream=TO_CENTRE, real=True), centre,
+            reach=reach_of(common.limits.low, common.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
             counted=self._within_run,
         )  # fmt: skip
-        self._received: Index = np.zeros(len(names), dtype=np.intp)
-        self._guided = [row for row in rows if centre.guided[row]]
+        self._received = [0] * len(names)
+        self._guided = [row for row in rows if centre.robots[row].guided]
         self._statuses = {
             row: pubsub.Inbox(pubsub.pose_subscriber(session, keys.status(names[row])), messages.Status, keys=keys)
             for row in self._guided
@@ -75,8 +74,8 @@ class CentreProcess:
         mime = messages.MIME[self._encoding]
         self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
-        self._phase, self._start = np.full(len(names), IDLE), np.full(len(names), np.inf)
-        self._begun = np.inf
+        self._phase, self._start = [IDLE] * len(names), [inf] * len(names)
+        self._begun = inf
         self._clock = Clock()
         self._seq = round(self._clock.utc() * 1e3)  # beyond any number of a former central controller
         self._sent = self._missed = 0
@@ -115,48 +114,46 @@ class CentreProcess:
         for row, inbox in self._statuses.items():
             for status in inbox.read(_check_status):
                 self._update_status(row, status)
-        begun = float(self._start[self._guided].min())
+        begun = min(self._start[row] for row in self._guided)
         if begun != self._begun:
             self._begun = begun
             if isfinite(begun):  # decisions fall on the same instants as those of the robots
                 self._ticks.align(begun)
-        received = self._poses.receive(t, self._utc, lambda: np.full(len(self._names), begun))
-        if received is not None:
-            assert received.extra is not None
-            self.centre.receive(replace(received, stamp=received.extra[:, 0]))
-            for row, stamp in zip(received.link.tolist(), received.stamp.tolist(), strict=True):
-                self._received[row] += self._within_run(stamp)
+        for row, arrival, received in self._poses.receive(t, self._utc, lambda _: begun):
+            pose = received.pose
+            yaw = nan if pose.yaw is None else pose.yaw
+            velocity = pose.velocity or messages.STILL
+            self.centre.receive(row, pose.position, velocity, yaw, received.measured - self._utc, arrival)
+            self._received[row] += self._within_run(pose.stamp - self._utc)
 
     def _within_run(self, stamp: float) -> bool:
         """Whether a pose was measured in the run that began last."""
-        return 0.0 <= stamp - self._begun + ROUNDING_S < self.centre.assignment.duration
+        return 0.0 <= stamp - self._begun + ROUNDING_S < self._duration
 
     def _update_status(self, row: int, status: messages.Status) -> None:
         self._phase[row] = PHASES[status.phase]
         if status.origin is not None and all(map(isfinite, status.origin)):
             self.centre.begin_plan(row, status.origin)
-        self._start[row] = status.started - self._utc if status.started > 0.0 else np.inf
+        self._start[row] = status.started - self._utc if status.started > 0.0 else inf
 
-    def _send(self, goals: CentreGoals, t: float) -> None:
+    def _send(self, goals: Sequence[CentreGoal], t: float) -> None:
         """Sends goals, rounded as poses are."""
         self._seq += 1
-        for k, row in enumerate(goals.rows.tolist()):
-            x, y, z = goals.goal[k].tolist()
-            yaw = float(goals.yaw[k])
+        for row, (x, y, z), yaw, pose_stamp in goals:
             goal = messages.Goal(
                 self._names[row],
                 self._seq,
                 round(self._utc + t, 6),
                 (round(x, 6), round(y, 6), round(z, 6)),
                 round(yaw, 6) if isfinite(yaw) else None,
-                round(self._utc + float(goals.pose_stamp[k]), 6),
+                round(self._utc + pose_stamp, 6),
             )
             self._goals[row].put(messages.encode(goal, self._encoding))
-        self._sent += len(goals.rows)
+        self._sent += len(goals)
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()
-        senders = {int(sender.links[0]): sender for sender in self._poses.senders}  # by row
+        senders = {sender.links[0]: sender for sender in self._poses.senders}  # by row
         report = messages.CentreState(
             stamp=self._utc + t,
             robots=[self._names[row] for row in self._guided],
@@ -166,9 +163,9 @@ class CentreProcess:
             decisions=self.centre.decisions,
             missed=self._missed,
             goals=self._sent,
-            received={sender.name: int(self._received[row]) for row, sender in senders.items()},
+            received={sender.name: self._received[row] for row, sender in senders.items()},
             lost={sender.name: sender.lost for sender in senders.values()},
-            dropped={sender.name: int(self._poses.dropped[row]) for row, sender in senders.items()},
+            dropped={sender.name: self._poses.dropped[row] for row, sender in senders.items()},
             malformed=sum(inbox.malformed for inbox in self._statuses.values()) + self._poses.malformed,
             pid=os.getpid(),
             cpu_s=cpu_s,

@@ -26,6 +26,7 @@ from agents.body.fleet import assemble
 from agents.body.shadow_twin import shadowed
 from agents.clock import Clock
 from agents.network import session as network
+from agents.network.channel_model import Conditions
 from agents.network.endpoints import DEFAULT_ENDPOINT
 from agents.network.keys import Keys
 from agents.network.lab import secured
@@ -34,9 +35,10 @@ from agents.plugins import registry
 from agents.runtime import command_line
 from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
 from agents.runtime.loop import Ranging, Runtime, Setup
-from experiments.definition import bodies, link_conditions, mesh
+from experiments.definition import bodies, mesh
 from experiments.definition.endpoints import router_endpoints
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.link_conditions import FROM_CENTRE, Ends, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import chosen_case
@@ -93,9 +95,10 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
     """Runs robots of a case until they end."""
     names, clock = launch.names, Clock(launch.clock_correction)
     endpoints = mesh.neighbour_endpoints(experiment, names, endpoints)
-    request = replace(bodies.body_request(experiment, names, [experiment.seed], endpoints), clock=clock)
+    request = replace(bodies.body_request(experiment, names, experiment.seed, endpoints), clock=clock)
     body = shadowed(assemble(request), request, bodies.shadow_periods(experiment, names))
-    assignment = Plan(experiment).assignment(names)
+    plan = Plan(experiment)
+    assignments = [plan.assignment(name) for name in names]
     setup = Setup(
         keys=Keys(experiment.network.realm),
         endpoints=endpoints,
@@ -104,16 +107,24 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         lifeline=launch.lifeline,
         lifeline_s=FAR_SILENCE_S if launch.file == STDIN else SILENCE_S,
         located=[experiment.robots[name].position == "external" for name in names],
-        exact=[name not in Plan(experiment).externally_measured for name in names],
+        exact=[name not in plan.externally_measured for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
-        conditions=link_conditions.receiver_conditions(experiment, assignment.links, names),
-        goal_conditions=link_conditions.conditions_from_centre(experiment, names),
+        conditions=[
+            _conditions(experiment, [(link.name, name) for link in each.neighbours])
+            for name, each in zip(names, assignments, strict=True)
+        ],
+        goal_conditions=_conditions(experiment, [(name, name) for name in names], FROM_CENTRE),
         clock=clock,
         once=launch.once,
         rights=mesh.member_rights(experiment, endpoints),
         loop_silence_s=experiment.safety.loop_silence_s,
     )
-    return Runtime(assignment, body, setup).run()
+    return Runtime(assignments, body, setup).run()
+
+
+def _conditions(experiment: Experiment, ends: Ends, stream: str = "") -> list[Conditions]:
+    """Conditions of links of this process, on a network with a delay of its own."""
+    return conditions_of(experiment, ends, experiment.seed, stream=stream, real=True)
 
 
 def read_experiment() -> str:
