@@ -355,16 +355,8 @@ class Detector:
                 self.scanned = scan.time
         return t - self.scanned > SCAN_S
 
-    def words(  # noqa: PLR0917 - as `causes`
-        self,
-        cause: Cause,
-        now: Situation,
-        status: Status,
-        neighbours: Neighbours,
-        health: ProcessHealth,
-        below: Callable[[], str],
-    ) -> str:
-        """Extent of a cause that the last call of `causes` found; `below` names the robot that a landing avoids."""
+    def words(self, cause: Cause, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> str:
+        """Extent of a cause that the last call of `causes` found; of `BELOW` by `Landing.robot_below`."""
         t, state, limits = now.t, now.state, self.limits
         obedience, ascent = self.obedience, self.ascent
 
@@ -416,7 +408,6 @@ class Detector:
             Cause.SETPOINT: lambda: "not made of finite numbers",
             Cause.LATE: lambda: f"{health.missed_share:.0%} of the last second's",
             Cause.LANDING: lambda: f"more than {limits.landing_s:g} s without a descent",
-            Cause.BELOW: below,
             Cause.SINKING: sinking,
             Cause.CLOCK: lambda: clock_text(self.name, state.ahead),
             Cause.BEHIND: late,

@@ -60,9 +60,9 @@ class Watched:
         return self
 
     def words(self, cause):
-        return self.detector.words(
-            cause, self.now, self.status, self.neighbours, self.health, lambda: "B; it goes aside first"
-        )
+        if cause == Cause.BELOW:
+            return "B; it goes aside first"
+        return self.detector.words(cause, self.now, self.status, self.neighbours, self.health)
 
     def misplace(self, **flags):
         """Let the pose be invalid, or outside, as in `Situation`."""
