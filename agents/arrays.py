@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from math import nan
+from math import nan, pi, tau
 from typing import Annotated, Any, Self
 
 import msgspec
@@ -35,6 +35,11 @@ def norm(vectors: Array) -> Array:
     """
     length: Array = np.sqrt(np.vecdot(vectors, vectors))
     return length
+
+
+def wrap(angle: Array) -> Array:
+    """Angles in (−π, π]."""
+    return np.asarray(pi - np.mod(pi - angle, tau))
 
 
 def some(mask: Mask) -> bool:

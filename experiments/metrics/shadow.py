@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
-from agents.decision.position_control import wrap
+from agents.arrays import Array, Mask, norm, wrap
 from experiments.metrics.results import ShadowMetrics
 from experiments.recording.trace import Trace
 
