@@ -156,9 +156,9 @@ def simulate_seeds(
     progress: Progress = lambda *_: None,
     watch: Watch = lambda *_: lambda _: None,
 ) -> list[Run]:
-    """As `simulate`, once for each seed, side by side; recordings are made of the first seed only.
+    """As `simulate`, once for each seed; recordings are made of the first seed only.
 
-    `progress` is called repeatedly. `watch` gives for each case what its simulation calls, see `simulation.simulate`.
+    `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see `simulation.simulate`.
     """
     _refuse_too_much(read.experiment, len(seeds))
     folder = None if folder is None else Path(folder)
@@ -168,18 +168,19 @@ def simulate_seeds(
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
     for name, experiment in chosen(read, cases).items():
         experiment = standby.without_standby(experiment)  # noqa: PLW2901
-        log = simulation.simulate(
-            experiment,
-            seeds,
-            progress=partial(_pass_progress, progress, name, experiment.duration_s),
-            watch=watch(name, experiment),
-        )
-        _pass_progress(progress, name, experiment.duration_s, math.inf)
-        for copy in range(len(seeds)):
-            logbook = Logbook(log, experiment, name, copy)
-            traces[copy][name] = logbook.trace()
-            if folder is not None and copy == 0:
+        shown = watch(name, experiment)
+        for k, seed in enumerate(seeds):
+            log = simulation.simulate(
+                experiment,
+                seed,
+                progress=partial(_pass_progress, progress, name, experiment.duration_s),
+                watch=shown if k == 0 else lambda _: None,
+            )
+            logbook = Logbook(log, experiment, name)
+            traces[k][name] = logbook.trace()
+            if folder is not None and k == 0:
                 logbook.record(folder / f"{name}.mcap", read.text)
+        _pass_progress(progress, name, experiment.duration_s, math.inf)
     return [_measured(read.experiment.title, mine, folder, read.listing) for mine in traces]
 
 

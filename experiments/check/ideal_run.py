@@ -40,7 +40,7 @@ class Prediction:
 
     time: Array  # (T,) [s] after the common start
     position: Array  # (T, N, 3) [m]
-    incidents: tuple[Incident, ...] = ()  # hazards of robots on the way
+    incidents: tuple[tuple[int, Incident], ...] = ()  # hazards on the way, each with the row of its robot
     transmissions: int = 1  # of all robots in the run
     messages_hz: float = (
         0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
@@ -126,39 +126,34 @@ def isolated(experiment: Experiment) -> Experiment:
 def predict(experiment: Experiment) -> Prediction:
     """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
     bare = isolated(experiment)
-    timed = vars(type(Plan(bare).trigger)).get("timed", False)  # not inherited: a subclass may judge what is measured
-    shaken = has_noise(bare) and not timed
-    without, *noisy = fly(bare, [bare.seed] * (1 + shaken), quiet=1)
-    if without.stuck and noisy:  # only the noise may hold the robots back
-        return fly(bare, [bare.seed], quiet=1)[0]
-    counted = (*noisy, without)[0]
-    messages_hz = counted.transmissions / bare.duration_s
-    return replace(without, messages_hz=messages_hz, noisy=noisy[0] if noisy else None)
+    ideal = fly(bare, bare.seed, quiet=True)
+    if not has_noise(bare) or Plan(bare).trigger.TIMED:
+        return replace(ideal, messages_hz=ideal.transmissions / bare.duration_s)
+    noisy = fly(bare, bare.seed)
+    if noisy.stuck and not ideal.stuck:  # only the noise holds the robots back
+        return replace(ideal, messages_hz=ideal.transmissions / bare.duration_s)
+    return replace(ideal, messages_hz=noisy.transmissions / bare.duration_s, noisy=noisy)
 
 
 def repetitions(bare: Experiment) -> int:
-    """Number of flights with different seeds, side by side, that take twice as long as one flight at most."""
+    """Number of flights with different seeds."""
     return max(1, min(REPETITIONS, int(TICK_COST) // len(bare.robots)))
 
 
-def fly(bare: Experiment, seeds: Sequence[int], *, quiet: int = 0) -> list[Prediction]:
-    """Flights of what `isolated` made with these seeds side by side, the first `quiet` of them without noise."""
-    names = tuple(bare.robots)
+def fly(bare: Experiment, seed: int, *, quiet: bool = False) -> Prediction:
+    """Flight of what `isolated` made with a seed, `quiet`: without noise."""
     try:
-        log = simulation.simulate(bare, seeds, quiet=quiet, lean=True, landing=False)
+        log = simulation.simulate(bare, seed, quiet=quiet, lean=True, landing=False)
     except conductor.Stuck as stuck:
-        position, _ = bodies.start_poses(bare, names)
-        position[:, 2] = np.nan_to_num(bodies.hover_heights(bare, names))
-        return [Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))] * len(seeds)
+        position, _ = bodies.start_poses(bare, tuple(bare.robots))
+        position[:, 2] = [robot.hover or 0.0 for robot in bare.robots.values()]
+        return Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))
     run = log.time >= -ROUNDING_S
-    begun = [each for each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s]
-    sent = np.bincount(sent_in_run(log.sent, bare.duration_s).link // len(names), minlength=len(seeds))
-    flights = []
-    for k, transmissions in enumerate(sent.tolist()):
-        first, end = k * len(names), (k + 1) * len(names)
-        mine = tuple(each._replace(row=each.row - first) for each in begun if first <= each.row < end)
-        flights.append(Prediction(log.time[run], log.true_position[run, first:end], mine, transmissions))
-    return flights
+    begun = (
+        (row, each) for row, each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s
+    )
+    sent = sent_in_run(log.sent, bare.duration_s)
+    return Prediction(log.time[run], log.true_position[run], tuple(begun), len(sent))
 
 
 PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii

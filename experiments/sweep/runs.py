@@ -25,7 +25,7 @@ from experiments.recording.version import ROOT, engine_versions
 from experiments.recording.version import digest as digest_of_code
 from experiments.virtual_time.conductor import Stuck
 from experiments.virtual_time.log import Logbook
-from experiments.virtual_time.simulation import Log, simulate
+from experiments.virtual_time.simulation import simulate
 
 PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what a run comes to
 FAILED: Final = (Stuck, BodyError, registry.PluginError)  # what a run may end with that other runs do not
@@ -63,7 +63,7 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
 
     Args:
         case: An experiment as JSON.
-        seeds: Of the runs; each comes out as it would alone.
+        seeds: Of the runs.
         code: `code_of` the experiment in the process that distributes the work; nothing is run with other code.
 
     Returns:
@@ -106,30 +106,20 @@ def code_of(experiment: Experiment) -> str:
     ).hexdigest()[:20]
 
 
-def figures_of(log: Log, experiment: Experiment) -> list[Figures]:
-    """The figures of each repetition in a log, which may be a lean one."""
-    return [_figures(Logbook(log, experiment, "", copy).trace()) for copy in range(len(log.seeds))]
-
-
 def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[Figures], dict[int, str]]:
-    """Side by side, but for those that others would change: these once more without them."""
-    try:
-        log = simulate(experiment, seeds, lean=True)
-    except FAILED as error:
-        if len(seeds) == 1:
-            return [], {seeds[0]: str(error)}
-        apart = [_flown(experiment, (seed,)) for seed in seeds]
-        return [run for runs, _ in apart for run in runs], {k: why for _, failed in apart for k, why in failed.items()}
-    runs = figures_of(log, experiment)
-    failed: dict[int, str] = {}
-    held_up = tuple(seed for seed, waited in zip(seeds, log.waited, strict=True) if waited)
-    if held_up:
-        again, failed = _flown(experiment, held_up)
-        runs = [run for run in runs if run.seed not in held_up] + again
+    """Figures of the runs of these seeds, and why others failed."""
+    runs, failed = [], {}
+    for seed in seeds:
+        try:
+            log = simulate(experiment, seed, lean=True)
+        except FAILED as error:
+            failed[seed] = str(error)
+        else:
+            runs.append(figures_of(Logbook(log, experiment, "").trace()))
     return runs, failed
 
 
-def _figures(trace: Trace) -> Figures:
+def figures_of(trace: Trace) -> Figures:
     errors = LinkErrors.of_trace(trace)
     _, begin, end = bounds_of(trace)[0]
     window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
