@@ -62,10 +62,10 @@ def flight(analysis: Analysis) -> Iterator[Finding]:
     if _cut(analysis):
         message = f"flown for the first {end:g} s of {experiment.duration_s:g} s only"
         yield Finding("note", "predicted-in-part", message, "", ("duration_s",))
-    for each in prediction.incidents:
+    for row, each in prediction.incidents:
         if each.cause == Cause.BATTERY:  # a finding of its own, of all robots
             continue
-        name = analysis.names[each.row]
+        name = analysis.names[row]
         message = f"{name} at {each.time:.1f} s, though nothing disturbs it: {each.text}"
         yield Finding("warning", "hazard", message, "see docs/safety.md for what this means", ("robots", name))
 

@@ -39,7 +39,7 @@ class Flights:
     def of(cls, analysis: Analysis) -> Flights:
         bare = isolated(analysis.experiment)
         count, first = repetitions(bare), bare.seed
-        flown = fly(bare, range(first, first + count))
+        flown = [fly(bare, seed) for seed in range(first, first + count)]
         seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
         return cls(tuple(analysis.flown(each) for each in flown if not each.stuck), seeds, count)
 

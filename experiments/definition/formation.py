@@ -87,11 +87,15 @@ class Pattern:
             return None
         apart = norm(position[:, self.links.receiver] - position[:, self.links.sender])
         there = np.empty(apart.shape, dtype=bool)
-        for number, link in enumerate(self.one_way):
-            now = planned_at(link.since, link.until, link.reach, 0.0)
+        for number, now in enumerate(self.planned_at(0.0).tolist()):
             for k, (t, far) in enumerate(zip(time.tolist(), apart[:, number].tolist(), strict=True)):
-                there[k, number] = now = exists(link.since, link.until, link.release if now else link.reach, t, far)
+                there[k, number] = now = self.exists(number, t, far, was=now)  # noqa: PLW2901
         return there
+
+    def exists(self, number: int, elapsed: float, apart: float, *, was: bool) -> bool:
+        """Whether a link between robots that are `apart` [m] exists `elapsed` [s] after the start, as it `was` there."""
+        link = self.one_way[number]
+        return exists(link.since, link.until, link.release if was else link.reach, elapsed, apart)
 
 
 def linked(targets: Sequence[Link], ends: Sequence[tuple[int, int]]) -> Links:

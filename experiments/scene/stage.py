@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import KHEPERA4, Kind
 from agents.decision.lifecycle import Phase
-from agents.formation.changes import Reshaping
 from agents.formation.graph import Links, links
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
@@ -246,23 +246,24 @@ class LinkTracker:
         self._stage = stage
         plan = stage.plan
         self._law = None if plan is None else _if_installed(lambda: plan.law)
-        formation = None if plan is None or self._law is None else plan.formation
-        self._reshaping = None
-        if formation is not None and (formation.changes or formation.presence is not None):
-            self._reshaping = Reshaping(formation.links, formation.changes, formation.presence)
+        self._pattern = None if plan is None or self._law is None else plan.formation
+        self._present: list[bool] = []
+        if self._pattern is not None:
+            self._present = self._pattern.planned_at(0.0).tolist()
 
     def errors(self, time: float | None, position: Array) -> Array:
         """Error of each link (E,) [m], NaN for those that are not there, at a time since the common start [s]."""
-        net = self._stage.links
-        if self._law is None or not len(net):
-            return np.full(len(net), np.nan)
-        present = None
-        if self._reshaping is not None:
-            since = np.full(len(position), 0.0 if time is None else time)
-            self._reshaping.advance(since, position, position[net.sender])
-            net, present = self._reshaping.links, self._reshaping.present
-        error = self._law.error(position, position[net.sender], net)
-        return error if present is None else np.where(present, error, np.nan)
+        net, pattern, elapsed = self._stage.links, self._pattern, 0.0 if time is None else max(time, 0.0)
+        found = np.full(len(net), np.nan)
+        if self._law is None or pattern is None:
+            return found
+        apart = (position[net.receiver] - position[net.sender]).tolist()
+        for k, (link, away) in enumerate(zip(pattern.targets_at(elapsed), apart, strict=True)):
+            if pattern.bounded:
+                self._present[k] = pattern.exists(k, elapsed, math.hypot(*away), was=self._present[k])
+            if self._present[k] or not pattern.bounded:
+                found[k] = self._law.error(tuple(away), link)
+        return found
 
     def of_robots(self, error: Array) -> Array:
         """Sum of the known errors of the links on which each robot receives (N,) [m].

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf, isnan, nan
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from agents.arrays import Array
+from agents.body.interface import BodyState
 from agents.decision.lifecycle import RUNNING
 from agents.network.messages import Event
 from experiments.definition.experiment import Experiment
@@ -46,9 +48,9 @@ class PacedView:
         self._case, self._experiment = case, experiment
         rows = len(stage.names)
         self._tracker, self._trail = LinkTracker(stage), Trail(rows)
-        self._sent, self._sent_at = [deque[float]() for _ in stage.names], np.full(rows, -inf)
+        self._sent, self._sent_at = [deque[float]() for _ in stage.names], [-inf] * rows
         self._events: list[Event] = []
-        self._incidents = 0
+        self._incidents = [0] * rows
         self._drawn = self._waited = -inf
         self._page.begin(stage)
         self.clock.t = -inf
@@ -75,43 +77,46 @@ class PacedView:
 
     def _count(self, instant: Instant) -> None:
         """Transmissions and incidents since the last call."""
-        at = instant.agent.transmitter.last_event.time
-        for row in np.flatnonzero(at > self._sent_at).tolist():
-            self._sent[row].append(float(at[row]))
-        self._sent_at = at.copy()
+        for row, robot in enumerate(instant.robots):
+            at = robot.transmitter.asking.last.time
+            if at > self._sent_at[row]:
+                self._sent[row].append(at)
+                self._sent_at[row] = at
         for sent in self._sent:
             while sent and sent[0] <= instant.now - 1.0:
                 sent.popleft()
-        news = instant.agent.hazards.incidents[self._incidents :]
-        self._incidents += len(news)
         begin = instant.now - instant.time
-        for each in news:
-            self._events.append(Event(each.time - begin, "hazard", self._stage.names[each.row], each.text))
+        for row, robot in enumerate(instant.robots):
+            for each in robot.hazards.incidents[self._incidents[row] :]:
+                self._incidents[row] += 1
+                self._events.append(Event(each.time - begin, "hazard", self._stage.names[row], each.text))
 
     def _moment(self, instant: Instant) -> Moment:
-        agent, state = instant.agent, instant.state
-        known = np.isfinite(state.true_position).all(axis=1, keepdims=True)
-        position = np.where(known, state.true_position, state.position)
-        phase, elapsed = agent.lifecycle.phase, None if isnan(instant.time) else instant.time
-        held = agent.hazards.held
+        robots, states = instant.robots, instant.states
+        truth, measured = _column(states, "true_position"), _column(states, "position")
+        position = np.where(np.isfinite(truth).all(axis=1, keepdims=True), truth, measured)
+        true_yaw, yaw = _column(states, "true_yaw"), _column(states, "yaw")
+        attitude, shadow = _column(states, "attitude"), _column(states, "shadow_position")
+        running = np.array([robot.lifecycle.phase == RUNNING for robot in robots])
+        elapsed = None if isnan(instant.time) else instant.time
         conditions = [
-            CONDITION_OF.get(int(each), Condition.HELD if held[row] else Condition.ACTIVE)
-            for row, each in enumerate(phase)
+            CONDITION_OF.get(robot.lifecycle.phase, Condition.HELD if robot.hazards.held else Condition.ACTIVE)
+            for robot in robots
         ]
         self._trail.add(instant.now, position)
         return Moment(
             position=position,
-            yaw=np.where(np.isfinite(state.true_yaw), state.true_yaw, state.yaw),
-            goal=np.where((phase == RUNNING)[:, None], agent.goal, nan),
+            yaw=np.where(np.isfinite(true_yaw), true_yaw, yaw),
+            goal=np.where(running[:, None], np.array([robot.goal for robot in robots]), nan),
             condition=np.array(conditions, dtype=np.intp),
-            silent_for=instant.now - self._sent_at,
+            silent_for=instant.now - np.array(self._sent_at),
             error=self._tracker.errors(elapsed, position),
             broken=np.zeros(len(self._stage.links), dtype=bool),
-            obstacles=np.array(instant.engine.obstacles)[0],
+            obstacles=np.array(instant.engine.obstacles),
             trail=self._trail.points,
-            attitude=state.attitude,
-            shadow=state.shadow_position,
-            shadow_yaw=state.shadow_yaw,
+            attitude=None if np.isnan(attitude).all() else attitude,
+            shadow=None if np.isnan(shadow).all() else shadow,
+            shadow_yaw=None if np.isnan(shadow).all() else _column(states, "shadow_yaw"),
             time=elapsed,
         )
 
@@ -128,11 +133,11 @@ class PacedView:
 
     def _tabulate(self, instant: Instant, moment: Moment) -> None:
         errors = self._tracker.of_robots(moment.error)
-        battery, panel = instant.state.battery, self._page.panel
+        panel = self._page.panel
         rows = [
             Row(
                 name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
-                known(battery[k]), note=instant.agent.hazards.worst(k),
+                known(instant.states[k].battery), note=instant.robots[k].hazards.worst(),
             )
             for k, name in enumerate(self._stage.names)
         ]  # fmt: skip
@@ -142,3 +147,7 @@ class PacedView:
         panel.show_robots(rows)
         panel.show_links(moment.error, [None] * len(moment.error))
         panel.show_events(self._events, 0.0)
+
+
+def _column(states: Sequence[BodyState], name: str) -> Array:
+    return np.array([getattr(state, name) for state in states], dtype=float)

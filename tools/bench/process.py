@@ -77,8 +77,7 @@ def process() -> Iterator[Figure]:
         with Launcher(folder / "logs") as launcher:
             start_router(launcher, endpoints)
             for robot in experiment.robots:
-                mine = plan.assignment([robot])
-                senders = mine.links.by_sender(mine.robots)
+                senders = [link.name for link in plan.assignment(robot).neighbours]
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
                     f"bare-{robot}", "tools.bench.bare_process", endpoints[0], robot, rate, *senders
