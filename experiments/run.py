@@ -158,7 +158,8 @@ def simulate_seeds(
 ) -> list[Run]:
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
-    `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see `simulation.simulate`.
+    `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see
+    `simulation.simulate`.
     """
     _refuse_too_much(read.experiment, len(seeds))
     folder = None if folder is None else Path(folder)

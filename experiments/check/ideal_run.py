@@ -68,7 +68,7 @@ def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
 
 
 def linear_step(response: Response, axis: int, dt: float) -> Array:
-    """Step (4, 4) of a `Quadrotor` within its limits: of position [m], velocity [m/s], its change in a step, and goal."""
+    """Step (4, 4) of a `Quadrotor` within its limits, of position [m], velocity [m/s], its change in a step, goal."""
     tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
     pull = tilt * gain * response.position[axis]
     place, speed, _, goal = np.eye(4)

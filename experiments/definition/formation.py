@@ -93,7 +93,7 @@ class Pattern:
         return there
 
     def exists(self, number: int, elapsed: float, apart: float, *, was: bool) -> bool:
-        """Whether a link between robots that are `apart` [m] exists `elapsed` [s] after the start, as it `was` there."""
+        """Whether a link between robots `apart` [m] exists `elapsed` [s] after the start; `was`: it did before."""
         link = self.one_way[number]
         return exists(link.since, link.until, link.release if was else link.reach, elapsed, apart)
 
