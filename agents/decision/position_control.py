@@ -50,12 +50,12 @@ class PositionController:
             )
             return v, omega, 0.0, 0.0
         turn = 0.0 if isnan(goal_yaw) else self._turn_response * wrap(goal_yaw - yaw)
-        return (
-            clamp(response * (x - here_x), -speed, speed),
-            clamp(response * (y - here_y), -speed, speed),
-            clamp(response * (z - here_z), -speed, speed),
-            0.0 if isnan(turn) else turn,
-        )
+        if isnan(turn):
+            turn = 0.0
+        vx, vy, vz = response * (x - here_x), response * (y - here_y), response * (z - here_z)
+        if -speed <= vx <= speed and -speed <= vy <= speed and -speed <= vz <= speed:
+            return vx, vy, vz, turn
+        return clamp(vx, -speed, speed), clamp(vy, -speed, speed), clamp(vz, -speed, speed), turn
 
 
 def drive(  # noqa: PLR0917 - numbers alone, as the textbook has them
@@ -88,7 +88,8 @@ def drive(  # noqa: PLR0917 - numbers alone, as the textbook has them
     if backward:
         along, across = -along, -across
     alpha = atan2(across, along)
-    v = min(response * distance * (1.0 - abs(alpha) / pi), speed)
+    v = response * distance * (1.0 - abs(alpha) / pi)
+    v = speed if v > speed else v
     if along < BROADSIDE * distance:
         v *= along / distance / BROADSIDE
     omega = turn_response * across / distance
