@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
+from agents.body.kinds import CRAZYFLIE
 from agents.plugins.laws import Distance
 from experiments.check.check import check, figures
-from experiments.check.ideal_run import REPETITIONS, fly, isolated, predict, repetitions
+from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import document
 from experiments.sweep.runs import figures_of
 from experiments.virtual_time import conductor, simulation
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
+from twins.models.quadrotor import RESPONSES, Quadrotor
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 
@@ -312,3 +314,17 @@ def test_drones_above_one_another_do_not_touch():
     assert "they touch at 0.17 m" in crossing(0.52)["too-close"]
     assert "one is above the other then, with 0.07 m between them" in crossing(0.6)["too-close"]
     assert "too-close" not in crossing(0.65)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_linear_step_is_model(axis: int) -> None:
+    dt, setpoint = 0.01, [0.0, 0.0, 0.0, 0.0]
+    setpoint[axis] = 0.1
+    quadrotor = Quadrotor(CRAZYFLIE, (0.0, 0.0, 0.0), 0.0)
+    quadrotor.place((0.0, 0.0, 0.0), 0.0, flying=True)
+    state = np.array([0.0, 0.0, 0.0, 0.1])
+    for _ in range(200):
+        quadrotor.command((setpoint[0], setpoint[1], setpoint[2], 0.0))
+        quadrotor.move(dt)
+        state = linear_step(RESPONSES["crazyflie"], axis, dt) @ state
+        assert quadrotor.position[axis] == pytest.approx(state[0], abs=1e-12)

@@ -6,31 +6,32 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import KHEPERA4, TURTLEBOT3
+from agents.vectors import ZERO
 from twins.models.differential import DRIVES, Differential
 
 DT = 0.01
 
 
 def robot(kind=KHEPERA4, yaw=0.0):
-    return Differential((kind,), np.zeros((1, 3)), np.array([yaw]), DT)
+    return Differential(kind, ZERO, yaw)
 
 
 def drive(twin, twist, seconds):
-    """(T, 3) positions and (T,) yaws of the first robot."""
+    """(T, 3) positions and (T,) yaws."""
     path, yaws = [], []
     for _ in range(round(seconds / DT)):
-        twin.command(np.array([twist], dtype=float))
-        twin.advance()
-        path.append(twin.position[0].copy())
-        yaws.append(twin.yaw[0])
+        twin.command((*twist, 0.0, 0.0))
+        twin.move(DT)
+        path.append(twin.position)
+        yaws.append(twin.yaw)
     return np.array(path), np.array(yaws)
 
 
 @pytest.mark.parametrize(("v", "w"), [(0.2, 0.5), (0.15, -1.5), (-0.1, 0.8)])
-def test_a_constant_twist_is_a_circle(v, w):
+def test_constant_twist_is_a_circle(v, w):
     twin = robot(yaw=0.4)
     drive(twin, (v, w), 0.5)  # up to speed
-    begin, heading = twin.position[0].copy(), twin.yaw[0]
+    begin, heading = twin.position, twin.yaw
     path, yaws = drive(twin, (v, w), 3.0)
     t = DT * np.arange(1, 301)
     np.testing.assert_allclose(yaws, heading + w * t, atol=1e-12)
@@ -44,35 +45,35 @@ def test_a_constant_twist_is_a_circle(v, w):
 def test_straight_on_and_on_the_spot():
     twin = robot(yaw=math.pi / 3)
     drive(twin, (0.2, 0.0), 1.0)
-    way = np.linalg.norm(twin.position[0])
-    np.testing.assert_allclose(twin.position[0], way * np.array([0.5, math.sqrt(0.75), 0.0]), atol=1e-12)
+    way = np.linalg.norm(twin.position)
+    np.testing.assert_allclose(twin.position, way * np.array([0.5, math.sqrt(0.75), 0.0]), atol=1e-12)
     ramp = 0.2**2 / (2 * DRIVES["khepera4"].acceleration)
     assert way == pytest.approx(0.2 - ramp, abs=0.002)
-    place = twin.position.copy()
+    place = twin.position
     drive(twin, (0.0, 0.0), 0.2)
-    place = twin.position.copy()
+    place = twin.position
     drive(twin, (0.0, 1.0), 1.0)
     np.testing.assert_allclose(twin.position, place, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
-def test_the_speed_of_wheels_is_limited_and_the_curve_stays(kind):
+def test_limit_of_wheels_keeps_the_curve(kind):
     limits, twin = DRIVES[kind.name], robot(kind)
     v, w = 3.0, 6.0
     drive(twin, (v, w), 2.0)
-    speed = np.linalg.norm(twin.velocity[0])
-    before = twin.yaw[0]
-    twin.advance()
-    rate = (twin.yaw[0] - before) / DT
+    speed = np.linalg.norm(twin.velocity)
+    before = twin.yaw
+    twin.move(DT)
+    rate = (twin.yaw - before) / DT
     assert speed / rate == pytest.approx(v / w, rel=1e-9)
     assert speed + 0.5 * limits.base * rate == pytest.approx(limits.speed)
 
 
-def test_every_limit_of_a_kind_can_be_driven():
+def test_speed_of_a_kind_can_be_driven():
     for kind in (KHEPERA4, TURTLEBOT3):
         twin = robot(kind)
         drive(twin, (kind.speed, 0.0), 1.0)
-        assert np.linalg.norm(twin.velocity[0]) == pytest.approx(kind.speed)
+        assert np.linalg.norm(twin.velocity) == pytest.approx(kind.speed)
 
 
 def test_acceleration_of_wheels_is_limited():
@@ -84,29 +85,29 @@ def test_acceleration_of_wheels_is_limited():
     assert speed[-1] == pytest.approx(0.2)
 
 
-def test_a_command_holds_until_the_next_one():
+def test_command_holds_until_the_next():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
     for _ in range(1000):
-        twin.advance()
-    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
+        twin.move(DT)
+    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
 
 
 def test_nan_is_no_command():
     twin = robot()
     drive(twin, (0.2, 0.0), 0.5)
     drive(twin, (np.nan, np.nan), 0.5)
-    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
+    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
     drive(twin, (np.nan, 0.0), 0.5)
     drive(twin, (0.0, np.nan), 0.5)
-    assert np.linalg.norm(twin.velocity[0]) == pytest.approx(0.2)
+    assert np.linalg.norm(twin.velocity) == pytest.approx(0.2)
     assert np.isfinite(twin.position).all()
 
 
-def test_halt():
+def test_land_halts_the_wheels():
     twin = robot()
     drive(twin, (0.2, 0.5), 0.5)
-    twin.halt(np.array([0]))
+    twin.land()
     for _ in range(20):
-        twin.advance()
-    assert not twin.velocity.any()
+        twin.move(DT)
+    assert twin.velocity == ZERO

@@ -1,6 +1,7 @@
-"""Noise that belongs to its robot, and disturbances with the statistics that they promise."""
+"""Noise of a robot, and the statistics of its disturbances."""
 
 import math
+import zlib
 from itertools import product
 
 import msgspec
@@ -8,97 +9,126 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
+from agents.vectors import NO_SETPOINT
 from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
-from twins.models.noise import BLOCK, Noise
+from twins.models.noise import BLOCK, Noise, refill
 
 
-def noise(rows, width, purpose="test", seed=1):
-    return Noise([f"R{k}" for k in range(rows)], [seed] * rows, purpose, width)
+def numbers(noise, draws):
+    """(draws, width)"""
+    width, drawn = noise.end // BLOCK, []
+    for _ in range(draws):
+        drawn.append(noise.ahead[noise.next : noise.next + width])
+        noise.next += width
+        refill(noise)
+    return np.array(drawn)
 
 
-def test_a_robot_s_noise_is_the_same_alone_and_in_a_swarm():
-    names, seeds = ["CF01", "KH01", "CF02", "CF01"], [1, 1, 1, 2]
-    swarm = Noise(names, seeds, "measurement", 3)
-    together = np.array([swarm.draw() for _ in range(BLOCK + 10)])  # over the edge of a block
-    for row, (name, seed) in enumerate(zip(names, seeds, strict=True)):
-        alone = Noise([name], [seed], "measurement", 3)
-        np.testing.assert_array_equal([alone.draw()[0] for _ in range(BLOCK + 10)], together[:, row])
+def test_stream_does_not_depend_on_block():
+    drawn = numbers(Noise("A", 1, "b", (1.0, 2.0)), 150)
+    blocks = Noise("A", 1, "b", (1.0, 2.0), block=150)
+    np.testing.assert_array_equal(drawn.ravel(), blocks.ahead)
 
 
-def test_streams_of_other_robots_seeds_and_purposes_are_others():
+def test_streams_of_names_seeds_purposes_differ():
     each = product(("A", "B"), (1, 2), ("jitter", "odometry"))
-    streams = [Noise([name], [seed], purpose, 1) for name, seed, purpose in each]
-    drawn = np.array([[stream.draw()[0, 0] for _ in range(2000)] for stream in streams])
+    drawn = np.array([numbers(Noise(name, seed, purpose, (1.0,)), 2000)[:, 0] for name, seed, purpose in each])
     assert np.abs(np.corrcoef(drawn) - np.eye(8)).max() < 0.1
 
 
-def test_it_is_white_with_unit_variance():
-    source = noise(8, 4)
-    drawn = np.array([source.draw() for _ in range(2000)])
+def test_stream_is_that_of_numpy():
+    source = np.random.default_rng([7, zlib.crc32(b"CF01"), zlib.crc32(b"measurement")])
+    expected = source.standard_normal((200, 4)) * [0.1, 0.1, 0.0, 0.3]
+    np.testing.assert_array_equal(numbers(Noise("CF01", 7, "measurement", (0.1, 0.1, 0.0, 0.3)), 200), expected)
+
+
+def test_noise_is_white_with_unit_variance():
+    drawn = numbers(Noise("A", 1, "test", (1.0,) * 4), 16000)
     assert drawn.std() == pytest.approx(1.0, abs=0.01)
     assert abs(drawn.mean()) < 0.01
     assert abs((drawn[1:] * drawn[:-1]).mean()) < 0.01
 
 
+def jittered(dt, seed, ticks, height=1.0):
+    jitter = HoverJitter(Disturbance(hover_jitter=Jitter(0.01, 0.5)), "A", seed, dt)
+    seen = []
+    for _ in range(ticks):
+        seen.append(jitter.advance(height))
+        refill(jitter.noise)
+    return np.array(seen)
+
+
 @pytest.mark.parametrize("dt", [0.005, 0.01, 0.05])
-def test_hover_jitter_has_its_sigma_and_its_correlation_time_whatever_the_step(dt):
-    rows, sigma, tau = 64, 0.01, 0.5
-    jitter = HoverJitter([Disturbance(hover_jitter=Jitter(sigma, tau))] * rows, noise(rows, 2), dt)
-    assert jitter.present
-    seen = [jitter.advance(np.ones(rows)) for _ in range(round(20.0 / dt))]
-    settled = np.array(seen[round(3.0 / dt) :])
+def test_hover_jitter_has_sigma_and_correlation_time(dt):
+    sigma, tau = 0.01, 0.5
+    seen = np.stack([jittered(dt, seed, round(20.0 / dt)) for seed in range(64)], axis=1)
+    settled = seen[round(3.0 / dt) :]
     assert settled.std() == pytest.approx(sigma, rel=0.04)
     for lag_s in (0.2, 0.5, 1.0):
         lag = round(lag_s / dt)
         correlation = (settled[lag:] * settled[:-lag]).mean() / sigma**2
         assert correlation == pytest.approx(math.exp(-lag_s / tau), abs=0.05)
-    assert np.array(seen[0]).std() == pytest.approx(sigma * math.sqrt(2 * dt / tau), rel=0.2)  # it begins at rest
+    assert seen[0].std() == pytest.approx(sigma * math.sqrt(2 * dt / tau), rel=0.2)  # it begins at rest
 
 
-def test_rows_without_jitter_stand_still_beside_those_that_have_it():
-    jitter = HoverJitter([Disturbance(), Disturbance(hover_jitter=Jitter(0.02))], noise(2, 2), 0.01)
-    for _ in range(50):
-        displacement = jitter.advance(np.ones(2))
-    assert not displacement[0].any()
-    assert displacement[1].all()
-    assert not HoverJitter([Disturbance()], noise(1, 2), 0.01).present
+def test_hover_jitter_grows_with_height():
+    full, half = jittered(0.01, 1, 20), jittered(0.01, 1, 20, height=0.1)
+    np.testing.assert_allclose(half, 0.5 * full, rtol=1e-12)
+    assert not jittered(0.01, 1, 20, height=0.0).any()
 
 
-def test_measurement_noise_has_its_sigmas_on_the_axes_that_are_measured():
-    nature = [Disturbance(position_sigma=0.003, yaw_sigma=0.02), Disturbance(position_sigma=0.001), Disturbance()]
-    axes = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
-    measurement = Measurement(nature, axes, noise(3, 4))
-    drawn = np.array([measurement.draw() for _ in range(5000)])
-    expected = [[0.003, 0.003, 0.003, 0.02], [0.001, 0.001, 0.0, 0.0], [0.0] * 4]
-    np.testing.assert_allclose(drawn.std(axis=0), expected, rtol=0.04)
-    assert not Measurement([Disturbance()], axes[:1], noise(1, 4)).present
+def test_no_disturbance_needs_no_noise():
+    none = Disturbance()
+    jitter, drift = HoverJitter(none, "A", 1, 0.01), Drift(none, "A", 1)
+    measurement = Measurement(none, "A", 1, spatial=True)
+    assert not Latency(none, 0.01).present
+    for disturbed in (jitter, drift, measurement):
+        assert not disturbed.present
+        refill(disturbed.noise)
+        assert disturbed.noise.ahead == []
 
 
-def test_the_variance_of_odometry_grows_with_the_way():
-    rows, rate = 300, 0.02
-    drift = Drift([Disturbance(odometry_drift=rate)] * rows, noise(rows, 2))
-    step = np.tile([0.006, 0.008], (rows, 1))  # a centimetre
-    for ticks in (100, 300):
-        for _ in range(ticks):
-            drift.advance(step)
-        way = 0.01 * (100 if ticks == 100 else 400)
-        assert drift.error.var() == pytest.approx(rate**2 * way, rel=0.12)
-    before = drift.error.copy()
-    drift.advance(np.zeros((rows, 2)))
-    np.testing.assert_array_equal(drift.error, before)  # who stands does not drift
+@pytest.mark.parametrize(
+    ("disturbance", "spatial", "sigma"),
+    [
+        (Disturbance(position_sigma=0.003, yaw_sigma=0.02), True, [0.003, 0.003, 0.003, 0.02]),
+        (Disturbance(position_sigma=0.001), False, [0.001, 0.001, 0.0, 0.0]),
+        (Disturbance(yaw_sigma=0.02), True, [0.0, 0.0, 0.0, 0.02]),
+    ],
+)
+def test_measurement_noise_has_sigma_on_measured_axes(disturbance, spatial, sigma):
+    measurement, drawn = Measurement(disturbance, "A", 1, spatial=spatial), []
+    for _ in range(5000):
+        drawn.append(measurement.draw())
+        refill(measurement.noise)
+    np.testing.assert_allclose(np.std(drawn, axis=0), sigma, rtol=0.04)
 
 
-def test_latency_is_exact_in_ticks_row_by_row():
-    latency = Latency([Disturbance(), Disturbance(latency_s=0.01), Disturbance(latency_s=0.03)], 0.01)
-    assert latency.present
-    got = [latency.delay(np.full((3, 4), float(k)))[:, 0] for k in range(8)]
-    np.testing.assert_array_equal(np.array(got)[:, 0], range(8))
-    np.testing.assert_array_equal(np.array(got)[:, 1], [np.nan, *range(7)])
-    np.testing.assert_array_equal(np.array(got)[:, 2], [np.nan] * 3 + list(range(5)))
-    assert not Latency([Disturbance()], 0.01).present
+def test_variance_of_odometry_grows_with_way():
+    rate, errors = 0.02, {100: [], 400: []}
+    for seed in range(300):
+        drift = Drift(Disturbance(odometry_drift=rate), "A", seed)
+        for tick in range(1, 401):
+            drift.advance(0.006, 0.008)  # a centimetre
+            refill(drift.noise)
+            if tick in errors:
+                errors[tick] += [drift.x, drift.y]
+    for ticks, error in errors.items():
+        assert np.var(error) == pytest.approx(rate**2 * 0.01 * ticks, rel=0.12)
+    before = drift.x, drift.y
+    drift.advance(0.0, 0.0)
+    assert (drift.x, drift.y) == before  # who stands does not drift
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 3])
+def test_latency_is_exact_in_ticks(ticks):
+    latency = Latency(Disturbance(latency_s=0.01 * ticks), 0.01)
+    assert latency.present == (ticks > 0)
+    commands = [(float(k), 0.0, 0.0, 0.0) for k in range(8)]
+    assert [latency.delay(command) for command in commands] == [NO_SETPOINT] * ticks + commands[: 8 - ticks]
 
 
 @pytest.mark.parametrize(("sigma", "correlation_s"), [(-0.1, 0.5), (1.0, 0.5), (0.01, 0.0)])
-def test_jitter_that_makes_no_sense(sigma, correlation_s):
+def test_senseless_jitter_is_refused(sigma, correlation_s):
     with pytest.raises(msgspec.ValidationError, match="Expected `float`"):
         msgspec.convert({"sigma": sigma, "correlation_s": correlation_s}, Jitter)
