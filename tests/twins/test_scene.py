@@ -39,20 +39,20 @@ def sampled(obstacle, count=4000):
 
 
 @given(metres, metres, st.sampled_from([BOX, POST, FENCE]))
-def test_distances_are_those_to_the_nearest_point(x, y, obstacle):
+def test_distance_is_to_the_nearest_point(x, y, obstacle):
     there = scene(obstacle)
     found = float(outlines.distance(there, 0, there.pose[0], np.array([x, y])))
     nearest = float(np.hypot(*(sampled(obstacle) - [x, y]).T).min())
     assert abs(found) == pytest.approx(nearest, abs=2e-4)
 
 
-def test_inside_is_negative_and_walls_have_no_inside():
+def test_inside_is_negative():
     there = scene(BOX, POST, FENCE)
     found = [float(outlines.distance(there, k, there.pose[k], there.pose[k, :2])) for k in range(3)]
     assert found == pytest.approx([-0.1, -0.2, 0.0])
 
 
-def test_distances_of_many_points_and_poses_at_once():
+def test_distances_of_many_points_at_once():
     there = scene(BOX)
     pose = np.zeros((5, 1, 3))
     pose[:, 0, 0] = np.arange(5.0)
@@ -64,14 +64,19 @@ def test_distances_of_many_points_and_poses_at_once():
     assert found[0, 1] == pytest.approx(0.9)
 
 
-def test_poses_over_time_are_those_of_the_scene():
+def test_planned_poses_over_time():
     plans = {"o0": Line(move_by=[1.0, 0.5], speed_=0.2), "o1": Circle(radius=0.5, period_s=10.0)}
     there = scene(BOX, POST, FENCE, plans=plans)
     time = np.linspace(-1.0, 20.0, 43)
-    assert there.along(time) == pytest.approx(np.array([there.at(t) for t in time]))
+    path = there.along(time)
+    assert path == pytest.approx(np.array([there.at(t) for t in time]))
+    assert path[time <= 0.0, 0] == pytest.approx(np.tile(there.pose[0], (3, 1)))
+    assert path[-1, 0] == pytest.approx([2.0, 1.0, 0.5])
+    assert path[-1, 1:] == pytest.approx(there.pose[1:])  # back after two turns
+    assert there.poses(20.0) == [tuple(pose) for pose in there.at(20.0).tolist()]
 
 
-def test_heights_overlap_only_between_bottom_and_top():
+def test_heights_overlap_between_bottom_and_top():
     there = scene(Obstacle(radius=0.1, bottom=1.0, height=0.5), Obstacle(radius=0.1))
     assert [bool(outlines.at_height(there, 0, low, low + 0.2)) for low in (0.7, 0.9, 1.4, 1.6)] == [
         False, True, True, False
@@ -95,5 +100,5 @@ def test_heights_overlap_only_between_bottom_and_top():
         (Obstacle(wall=[(2.0, -1.0), (2.0, 1.0)]), False),  # on the border
     ],
 )
-def test_what_is_outside(obstacle, out):
+def test_obstacles_outside_the_arena(obstacle, out):
     assert outlines.outside(scene(obstacle), 0) is out

@@ -74,8 +74,8 @@ class PlanarEngine(Orders[Moving]):
     def __init__(self, stage: Stage, choice: Planar) -> None:
         """Raises BodyError for a kind without a twin."""
         self.motions = moving_models(stage)
-        self._dt, self._steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
-        self._step = stage.dt / self._steps
+        self._dt, self.steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
+        self._step = stage.dt / self.steps
         self._ticks = 0
         self._fastest = GRAVITY * math.tan(choice.tilt) * stage.dt  # change of speed in a tick [m/s]
         self._found: list[Touch] = []
@@ -125,7 +125,7 @@ class PlanarEngine(Orders[Moving]):
         if self._planned:
             self._move_planned(t)
         for copy in self._copies:
-            copy.advance(self._ticks * dt, step, self._steps)
+            copy.advance(self._ticks * dt, step, self.steps)
         self._ticks += 1
         for robot, motion in zip(self._robots, self.motions, strict=True):
             if isinstance(motion, Quadrotor):

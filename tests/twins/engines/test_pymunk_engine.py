@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from agents.body.interface import BodyError
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.plugins import registry
-from experiments.file.document import chosen, load
-from experiments.virtual_time import simulation
-from tests.twins.planar_drive import DT, Drive, furnished, stage, still
+from tests.twins.planar_drive import DT, Drive, columns, command, furnished, stage, still
 from twins.engines.point_mass import PointMass
 from twins.engines.pymunk_engine import Planar
 
@@ -22,47 +20,48 @@ from twins.engines.pymunk_engine import Planar
 
 
 @pytest.mark.slow
-def test_without_contact_it_is_the_point_mass_engine():
+def test_no_contact_is_point_mass_engine():
     kinds = (CRAZYFLIE, TELLO, KHEPERA4, TURTLEBOT3, CRAZYFLIE)
-    flies = np.array([kind.flies for kind in kinds])
-    place = stage(kinds, [[0, 0], [9, 0], [18, 0], [0, 9], [9, 9]], np.linspace(-2, 2, 5))
-    engines = PointMass().build(place), Planar().build(place)
+    start = np.array([[0, 0], [9, 0], [18, 0], [0, 9], [9, 9]])
+    place = stage(kinds, start, np.linspace(-2, 2, 5))
+    one, other = engines = PointMass().build(place), Planar().build(place)
     rng = np.random.default_rng(5)
-    jitter, command = np.zeros((5, 2)), np.full((5, 4), np.nan)
-    aloft = np.flatnonzero(flies)
+    jitter, aloft = np.zeros((5, 2)), [row for row, kind in enumerate(kinds) if kind.flies]
     for k in range(1500):
         if k == 5:
-            [engine.takeoff(aloft, np.array([0.5, 0.8, 1.0])) for engine in engines]
+            for engine in engines:
+                engine.takeoff(aloft, [0.5, 0.8, 1.0])
         if k >= 300 and k % 10 == 0:
-            command = np.zeros((5, 4))
-            command[:, :2] = place.start[:, :2] + 0.15 * np.sin([k / 200.0, k / 300.0])
-            command[:, 2:] = [0.9, math.sin(k / 100.0)]
-            command[1] = [0.2 * math.sin(k / 150.0), 0.1, 0.05, 0.3]
-            command[2:4] = [[0.25, rng.normal(), 0, 0], [0.2, rng.normal(), 0, 0]]
-            [engine.command(command) for engine in engines]
+            setpoints = np.zeros((5, 4))
+            setpoints[:, :2] = start + 0.15 * np.sin([k / 200.0, k / 300.0])
+            setpoints[:, 2:] = [0.9, math.sin(k / 100.0)]
+            setpoints[1] = [0.2 * math.sin(k / 150.0), 0.1, 0.05, 0.3]
+            setpoints[2:4] = [[0.25, rng.normal(), 0, 0], [0.2, rng.normal(), 0, 0]]
+            for engine in engines:
+                command(engine, setpoints)
         jitter = 0.98 * jitter + 0.002 * rng.standard_normal((5, 2))
-        share = np.minimum(engines[0].position[:, 2] / 0.2, 1.0) * flies
+        share = np.minimum(columns(one, "position")[:, 2] / 0.2, 1.0)
         for engine in engines:
-            engine.advance(k * DT, share[:, None] * jitter)
-        one, other = engines
-        np.testing.assert_allclose(other.position, one.position, atol=1e-10)
-        np.testing.assert_allclose(other.velocity, one.velocity, atol=1e-10)
-        np.testing.assert_allclose(other.yaw, one.yaw, atol=1e-10)
-        np.testing.assert_array_equal(other.flying, one.flying)
-    assert np.linalg.norm(other.position[:, :2] - place.start[:, :2], axis=1).min() > 0.05
-    for k in range(600):
-        if k == 0:
-            [engine.land(np.arange(5)) for engine in engines]
+            engine.advance(k * DT, [tuple(each) for each in (share[:, None] * jitter).tolist()])
+        for name in ("position", "velocity", "yaw", "flying"):
+            np.testing.assert_allclose(columns(other, name), columns(one, name), atol=1e-10)
+    assert np.linalg.norm(columns(other, "position")[:, :2] - start, axis=1).min() > 0.05
+    for engine in engines:
+        engine.land(range(5))
+    for _ in range(600):
         for engine in engines:
-            engine.advance(0.0, np.zeros((5, 2)))
-        np.testing.assert_allclose(other.position, one.position, atol=1e-4)
-    np.testing.assert_array_equal(other.flying, one.flying)
-    assert not other.flying.any()
-    np.testing.assert_allclose(other.velocity, 0.0, atol=1e-9)
+            engine.advance(0.0, [(0.0, 0.0)] * 5)
+        np.testing.assert_allclose(columns(other, "position"), columns(one, "position"), atol=1e-4)
+    assert not columns(one, "flying").any()
+    assert not columns(other, "flying").any()
+    np.testing.assert_allclose(columns(other, "velocity"), 0.0, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_an_experiment_runs_the_same_on_it_as_on_point_masses():
+def test_experiment_runs_as_on_point_masses():
+    from experiments.file.document import chosen, load  # noqa: PLC0415
+    from experiments.virtual_time import simulation  # noqa: PLC0415
+
     logs = []
     for engine in ("point-mass", "pymunk"):
         read = load("robotic-park", f"world.engine={engine}", "timeline.0.at_s=3", "duration_s=7")
@@ -74,38 +73,38 @@ def test_an_experiment_runs_the_same_on_it_as_on_point_masses():
     assert not other.touches
 
 
-def test_a_quadrotor_accelerates_no_more_than_its_tilt_allows():
+def test_tilt_limits_acceleration():
     drive = Drive(stage([CRAZYFLIE], [[0, 0]])).aloft([[0, 0, 1]])
     drive.go(2.0, [[9, 9, 1, 0]])
     speeds = []
     for _ in range(50):
         drive.go(DT, [[-9, -9, 1, 0]])
-        speeds.append(drive.engine.velocity[0, :2].copy())
+        speeds.append(drive.velocity[0, :2])
     change = np.linalg.norm(np.diff(speeds, axis=0), axis=1) / DT
     assert change.max() == pytest.approx(9.81 * math.tan(math.radians(20.0)), rel=1e-9)
 
 
-def test_wheels_slip_when_told_to_accelerate_beyond_their_grip():
+def test_wheels_slip_beyond_their_grip():
     drive = Drive(stage([KHEPERA4], [[0, 0]]), traction=0.1)
     drive.go(0.1, [[0.27, 0, 0, 0]])
-    assert drive.engine.velocity[0, 0] == pytest.approx(0.1 * 9.81 * 0.1, rel=0.02)
+    assert drive.velocity[0, 0] == pytest.approx(0.1 * 9.81 * 0.1, rel=0.02)
 
 
-def test_a_step_is_never_longer_than_asked():
+def test_step_is_never_longer_than_asked():
     for dt, parts in ((0.02, 4), (0.01, 2), (0.004, 1)):
-        assert Planar().build(stage([KHEPERA4], [[0, 0]], dt=dt))._steps == parts
+        assert Planar().build(stage([KHEPERA4], [[0, 0]], dt=dt)).steps == parts
 
 
-def test_a_stopped_quadrotor_falls_and_stands_where_friction_holds_it():
+def test_stopped_quadrotor_falls_and_stands():
     drive = Drive(stage([CRAZYFLIE], [[0, 0]])).aloft([[0, 0, 1]])
     drive.go(1.0, [[9, 0, 1, 0]])
-    drive.engine.stop(np.array([0]))
+    drive.engine.stop([0])
     drive.go(0.3)
-    speed = drive.engine.velocity[0, 0]
+    speed = drive.velocity[0, 0]
     assert speed > 0.8
     drive.go(2.0)
-    assert drive.engine.position[0, 2] == 0.0
-    assert drive.engine.velocity[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert drive.position[0, 2] == 0.0
+    assert drive.velocity[0, 0] == pytest.approx(0.0, abs=1e-9)
 
 
 # robots against robots
@@ -113,7 +112,7 @@ def test_a_stopped_quadrotor_falls_and_stands_where_friction_holds_it():
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3])
 @pytest.mark.parametrize("aside", [0.0, 0.5, 1.2])
-def test_two_driven_at_each_other_touch_once_and_do_not_overlap(kind, aside):
+def test_two_robots_collide_without_overlap(kind, aside):
     offset = aside * kind.radius
     drive = Drive(stage([kind, kind], [[-0.5, 0], [0.5, offset]], [0.0, math.pi]))
     drive.go(4.0, [[kind.speed, 0, 0, 0]] * 2)
@@ -129,8 +128,8 @@ def test_two_driven_at_each_other_touch_once_and_do_not_overlap(kind, aside):
         # reduced mass × closing speed × (1 + restitution), and what the wheels push in that step
         blow = 0.5 * mass * 2.0 * kind.speed * 1.1
         assert blow * 0.999 < first.impulse < 1.001 * (blow + 0.7 * mass * 9.81 * 0.005)
-        np.testing.assert_allclose(drive.engine.velocity[:, 0], 0.0, atol=1e-3)
-        apart = drive.engine.position[1, 0] - drive.engine.position[0, 0]
+        np.testing.assert_allclose(drive.velocity[:, 0], 0.0, atol=1e-3)
+        apart = drive.position[1, 0] - drive.position[0, 0]
         assert apart == pytest.approx(2 * kind.radius, abs=2e-4)
 
 
@@ -159,13 +158,13 @@ def test_no_encounter_overlaps(heading, aside, pair):
     for _ in range(300):
         for row, sign in ((0, 1.0), (1, -1.0)):
             if pair[row].takes == "position":  # 0.5 m ahead it wants its full speed
-                setpoint[row] = [*(drive.engine.position[row, :2] + sign * 0.5 * toward), 1.0, 0.0]
+                setpoint[row] = [*(drive.position[row, :2] + sign * 0.5 * toward), 1.0, 0.0]
         drive.go(DT, setpoint)
     assert drive.touches
     assert drive.overlap(0, 1) < 1e-3
 
 
-def test_what_keeps_pushing_touches_once_and_what_comes_back_touches_again():
+def test_contact_counts_once_until_they_part():
     drive = Drive(stage([TURTLEBOT3, KHEPERA4], [[0, 0], [0.4, 0]], [0.0, math.pi / 2]))
     drive.go(6.0, [[0.2, 0, 0, 0], [0, 0, 0, 0]])
     assert len(drive.touches) == 1
@@ -175,27 +174,27 @@ def test_what_keeps_pushing_touches_once_and_what_comes_back_touches_again():
     assert drive.touches[1].time > 7.0
 
 
-def test_the_heavier_pushes_the_lighter_and_not_the_other_way_round():
+def test_heavier_robot_pushes_the_lighter():
     across = math.pi / 2  # sideways the pushed one's wheels cannot roll: it is dragged
     pushes = Drive(stage([TURTLEBOT3, KHEPERA4], [[0, 0], [0.4, 0]], [0.0, across]))
     pushes.go(5.0, [[0.2, 0, 0, 0], [0, 0, 0, 0]])
-    assert pushes.engine.position[1, 0] > 1.0
-    assert pushes.engine.velocity[1, 0] == pytest.approx(0.2, abs=2e-3)
+    assert pushes.position[1, 0] > 1.0
+    assert pushes.velocity[1, 0] == pytest.approx(0.2, abs=2e-3)
     stuck = Drive(stage([KHEPERA4, TURTLEBOT3], [[0, 0], [0.4, 0]], [0.0, across]))
     stuck.go(5.0, [[0.25, 0, 0, 0], [0, 0, 0, 0]])
-    assert stuck.engine.position[1, 0] == pytest.approx(0.4, abs=2e-3)  # the blow itself moves it a little
-    assert stuck.engine.velocity[0, 0] == pytest.approx(0.0, abs=1e-3)
+    assert stuck.position[1, 0] == pytest.approx(0.4, abs=2e-3)  # the blow itself moves it a little
+    assert stuck.velocity[0, 0] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_blow_in_the_air_conserves_momentum_and_gives_no_energy():
+def test_blow_in_the_air_conserves_momentum():
     drive = Drive(stage([CRAZYFLIE, TELLO], [[0, 0], [2, 0]]), restitution=0.5)
     drive.aloft([[0, 0, 1.0], [1.2, 0, 1.0]])
     mass = np.array([CRAZYFLIE.mass, TELLO.mass])
     setpoint = [[5, 0, 1, 0], [-0.5, 0, 0, 0]]
     while not drive.touches:
-        before = drive.engine.velocity[:, 0].copy()
+        before = drive.velocity[:, 0]
         drive.go(DT, setpoint)
-    after = drive.engine.velocity[:, 0]
+    after = drive.velocity[:, 0]
     steered = 3.6 * DT * mass.sum()
     assert mass @ after == pytest.approx(mass @ before, abs=steered)
     assert mass @ after**2 < mass @ before**2
@@ -205,13 +204,13 @@ def test_a_blow_in_the_air_conserves_momentum_and_gives_no_energy():
 
 
 @pytest.mark.slow
-def test_a_jam_does_not_overlap():
+def test_jam_does_not_overlap():
     kinds = [TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4] * 4
     grid = 0.25 * np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) - 0.375
     drive = Drive(stage(kinds, grid))
     for _ in range(60):
-        x, y = drive.engine.position[:, 0], drive.engine.position[:, 1]
-        turn = 2.0 * np.sin(np.arctan2(-y, -x) - drive.engine.yaw)
+        x, y = drive.position[:, 0], drive.position[:, 1]
+        turn = 2.0 * np.sin(np.arctan2(-y, -x) - columns(drive.engine, "yaw"))
         drive.go(0.1, np.column_stack([np.full(16, 0.2), turn, np.zeros((16, 2))]))
     assert len(drive.touches) > 15
     assert max(drive.overlap(a, b) for a in range(16) for b in range(a)) < 1e-3
@@ -230,40 +229,40 @@ def test_a_jam_does_not_overlap():
     ],
 )
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3])
-def test_an_obstacle_stops_a_robot_at_its_edge(obstacle, kind):
+def test_obstacle_stops_robot_at_its_edge(obstacle, kind):
     drive = Drive(stage([kind], [[0, 0]], scene=furnished({"it": obstacle})))
     drive.go(5.0, [[kind.speed, 0, 0, 0]])
     x = np.array(drive.path)[:, 0, 0]
     assert x.max() < 0.5 - kind.radius + 1e-3
     assert x[-1] == pytest.approx(0.5 - kind.radius, abs=2e-4)
-    assert drive.engine.velocity[0, 0] == pytest.approx(0.0, abs=1e-3)
+    assert drive.velocity[0, 0] == pytest.approx(0.0, abs=1e-3)
     assert [(touch.first, touch.second) for touch in drive.touches] == [(0, -1)]
 
 
 # orders and parameters
 
 
-def test_a_row_can_be_put_elsewhere_at_rest():
+def test_placed_robot_is_at_rest():
     drive = Drive(stage([KHEPERA4, TURTLEBOT3], [[0, 0], [0.4, 0]], [0, math.pi]))
     drive.go(2.0, [[0.2, 0, 0, 0]] * 2)
     assert len(drive.touches) == 1
-    drive.engine.place(np.array([0]), np.array([[3.0, 2.0, 0.0]]), np.array([1.0]), np.array([False]))
-    np.testing.assert_array_equal(drive.engine.position[0], [3.0, 2.0, 0.0])
+    drive.put(0, (3.0, 2.0, 0.0), 1.0)
+    np.testing.assert_array_equal(drive.position[0], [3.0, 2.0, 0.0])
     drive.go(1.0, [[np.nan] * 4, [0.0] * 4])
-    np.testing.assert_allclose(drive.engine.position[0], [3.0, 2.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(drive.engine.velocity[0], 0.0, atol=1e-12)
-    assert drive.engine.yaw[0] == pytest.approx(1.0, abs=1e-12)
-    drive.engine.place(np.array([0]), np.array([[0.0, 0.0, 0.0]]), np.array([0.0]), np.array([False]))
+    np.testing.assert_allclose(drive.position[0], [3.0, 2.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(drive.velocity[0], 0.0, atol=1e-12)
+    assert drive.engine.motions[0].yaw == pytest.approx(1.0, abs=1e-12)
+    drive.put(0, (0.0, 0.0, 0.0))
     drive.go(3.0, [[0.2, 0, 0, 0], [0, 0, 0, 0]])
     assert len(drive.touches) == 2
 
 
-def test_a_kind_without_a_twin_is_an_error():
+def test_kind_without_twin_is_refused():
     with pytest.raises(BodyError, match="no twin of 'hovercraft'"):
         Planar().build(stage([replace(KHEPERA4, name="hovercraft")], [[0, 0]]))
 
 
-def test_it_is_found_by_name_and_its_parameters_are_checked():
+def test_engine_has_a_name_and_checked_parameters():
     assert registry.build(registry.ENGINES, "pymunk") == Planar()
     with pytest.raises(msgspec.ValidationError, match=r"restitution"):
         registry.build(registry.ENGINES, {"kind": "pymunk", "restitution": 2.0})
