@@ -153,27 +153,27 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
 
 
 def body_request(
-    experiment: Experiment, names: Sequence[str], seeds: Sequence[int], endpoints: Sequence[str] = (), *, quiet: int = 0
+    experiment: Experiment, names: Sequence[str], seed: int, endpoints: Sequence[str] = (), *, quiet: bool = False
 ) -> BodyRequest:
     """Request for the bodies of `names`, one repetition for each seed; `endpoints` are the routers.
 
     The first `quiet` repetitions are without noise.
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
-    copies = len(seeds)
     noisy = tuple(disturbance(experiment, name) for name in names)
-    placed = [scattered_poses(experiment, names, seed) for seed in seeds]
+    position, yaw = scattered_poses(experiment, names, seed)
+    robots = [experiment.robots[name] for name in names]
     return BodyRequest(
-        names=tuple(names) * copies,
-        kinds=kinds(experiment, names) * copies,
-        addresses=tuple(experiment.robots[name].body for name in names) * copies,
-        start=np.concatenate([position for position, _ in placed]),
-        yaw=np.concatenate([yaw for _, yaw in placed]),
+        names=tuple(names),
+        kinds=kinds(experiment, names),
+        addresses=tuple(robot.body for robot in robots),
+        start=tuple((x, y, z) for x, y, z in position.tolist()),
+        yaw=tuple(yaw.tolist()),
         rate_hz=experiment.rates.body_hz,
-        seeds=tuple(seed for seed in seeds for _ in names),
-        disturbance=tuple(each.without_noise() for each in noisy) * quiet + noisy * (copies - quiet),
-        external=tuple(experiment.robots[name].position == "external" for name in names) * copies,
-        device=tuple(experiment.robots[name].device for name in names) * copies,
+        seeds=(seed,) * len(names),
+        disturbance=tuple(each.without_noise() for each in noisy) if quiet else noisy,
+        external=tuple(robot.position == "external" for robot in robots),
+        device=tuple(robot.device for robot in robots),
         endpoints=tuple(endpoints),
         keys=Keys(experiment.network.realm),
     )

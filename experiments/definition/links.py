@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins.laws import Law
 from experiments.definition.experiment import Experiment, Link, Target
 
