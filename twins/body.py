@@ -166,7 +166,7 @@ class TwinBody:
             self.engine = self._alone = PointMassEngine(list(models), dt)
         else:
             mirrored = world.mirrored
-            stage = Stage(request.kinds, request.start, request.yaw, dt, world.copy, mirrored, world.scene)
+            stage = Stage(request.kinds, request.start, request.yaw, dt, mirrored, world.scene)
             factory: EngineFactory = registry.build(registry.ENGINES, world.engine)
             self.engine = factory.build(stage)
             if type(self.engine) is PointMassEngine:

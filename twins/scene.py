@@ -219,7 +219,6 @@ def _disjoint(polygon: Array, low: Array, high: Array) -> bool:
 class World:
     """World shared by n twins; sequences have an entry for each."""
 
-    copy: Sequence[int]  # copy of the scene of each robot; one copy per repetition of an experiment
     scene: Scene
     engine: str | Mapping[str, object]  # registered engine: name, or table with `kind` and parameters
     sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.SENSORS`)

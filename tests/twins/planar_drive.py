@@ -10,7 +10,7 @@ from twins.scene import Obstacle, Scene
 DT = 0.01
 
 
-def stage(kinds, start, yaw=None, *, copy=None, mirrored=None, scene=None, dt=DT):
+def stage(kinds, start, yaw=None, *, mirrored=None, scene=None, dt=DT):
     """Robots at x, y (and z), in endless room unless a scene is given."""
     n = len(kinds)
     return Stage(
@@ -18,7 +18,6 @@ def stage(kinds, start, yaw=None, *, copy=None, mirrored=None, scene=None, dt=DT
         [(float(x), float(y), *(z or (0.0,))) for x, y, *z in start],
         [0.0] * n if yaw is None else [float(each) for each in yaw],
         dt,
-        (0,) * n if copy is None else tuple(copy),
         (False,) * n if mirrored is None else tuple(mirrored),
         Scene.empty() if scene is None else scene,
     )
@@ -57,8 +56,8 @@ class Drive:
 
     @property
     def obstacles(self):
-        """(M, 3) of the first copy."""
-        return np.array(self.engine.obstacles[0])
+        """(M, 3)"""
+        return np.array(self.engine.obstacles)
 
     def go(self, seconds, setpoint=None):
         for _ in range(round(seconds / DT)):

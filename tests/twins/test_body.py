@@ -251,7 +251,7 @@ def test_external_pose_replaces_the_measured_one():
 
 
 def test_mirrored_robot_is_where_it_is_shown():
-    world = World((0, 0), Scene.empty(), "point-mass", ((), ()), 1.0, (False, True))
+    world = World(Scene.empty(), "point-mass", ((), ()), 1.0, (False, True))
     twin = TwinBody(request((KHEPERA4, CRAZYFLIE)), world)
     states = twin.read(DT)
     assert np.isnan(states[1].position).all()

@@ -1,4 +1,4 @@
-"""Interface of the engines that move twins, in one scene or in many copies of it.
+"""Interface of the engines that move the twins of one scene.
 
 Engines are found by the entry-point group `zenpark.engines`: a frozen struct of parameters with a method `build`.
 """
@@ -28,9 +28,8 @@ class Stage:
     start: Sequence[Vector]  # [m]
     yaw: Sequence[float]  # [rad]
     dt: float  # step of `Engine.advance` [s]
-    copy: Sequence[int]  # copy of the scene of each robot; only robots of one copy can touch each other
     mirrored: Sequence[bool]  # robots that really are elsewhere: moved by `Engine.mirror` only
-    scene: Scene  # every copy has its own obstacles
+    scene: Scene
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ class Engine(Protocol):
     @property
     def motions(self) -> Sequence[Motion]: ...  # of the robots; the same objects for ever
     @property
-    def obstacles(self) -> Sequence[Sequence[Pose]]: ...  # current poses of the obstacles of each copy
+    def obstacles(self) -> Sequence[Pose]: ...  # current poses of the obstacles
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         """Set a setpoint for each robot, see `Motion.command`."""

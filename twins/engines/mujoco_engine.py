@@ -56,7 +56,7 @@ class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
     def __init__(self, stage: Stage, motor_lag: float) -> None:
         """`motor_lag`: of a thrust [s]; raises BodyError for a kind without a twin, or without MuJoCo."""
         require_models(stage.kinds)
-        self._dt, self._scene, self._copies = stage.dt, stage.scene, max(stage.copy, default=0) + 1
+        self._dt, self._scene = stage.dt, stage.scene
         self._air = [row for row, kind in enumerate(stage.kinds) if kind.flies and not stage.mirrored[row]]
         self.drones = Drones([stage.kinds[row] for row in self._air], stage.dt, scene=stage.scene, motor_lag=motor_lag)
         self.motions: list[Drone | Differential | Mirrored] = []
@@ -68,7 +68,7 @@ class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
                 self.motions.append(self.drones.add(kind, start, yaw))
             else:
                 self.motions.append(Differential(kind, start, yaw))
-        self.obstacles: Sequence[Sequence[Pose]] = [stage.scene.start] * self._copies
+        self.obstacles: list[Pose] = stage.scene.start
         self._update_attitudes()
 
     def place(
@@ -86,7 +86,7 @@ class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
         self.drones.advance()
         self._update_attitudes()
         if any(self._scene.plans):
-            self.obstacles = [self._scene.poses(t)] * self._copies
+            self.obstacles = self._scene.poses(t)
 
     def touches(self) -> list[Touch]:
         """See `Engine.touches`: always empty."""

@@ -26,7 +26,7 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
-        return PointMassEngine(moving_models(stage), stage.dt, stage.scene, max(stage.copy, default=0) + 1)
+        return PointMassEngine(moving_models(stage), stage.dt, stage.scene)
 
 
 TWINLESS: Final = (  # remedy for a kind of which `has_model` is false
@@ -102,12 +102,11 @@ class Orders(Generic[MotionT]):
 class PointMassEngine(Orders[Moving]):
     """Implements `twins.engines.engine.Engine`. Its robots may as well be moved one by one, see `twins.body.Twin`."""
 
-    def __init__(self, motions: list[Moving], dt: float, scene: Scene | None = None, copies: int = 1) -> None:
+    def __init__(self, motions: list[Moving], dt: float, scene: Scene | None = None) -> None:
         self.motions = motions
-        self._dt, self._copies = dt, copies
-        self._scene = scene
+        self._dt, self._scene = dt, scene
         self.moves_obstacles = scene is not None and any(scene.plans)
-        self.obstacles: Sequence[Sequence[Pose]] = [[] if scene is None else scene.start] * copies
+        self.obstacles: list[Pose] = [] if scene is None else scene.start
 
     def advance(self, t: float, wobble: Sequence[Planar]) -> None:
         dt = self._dt
@@ -120,7 +119,7 @@ class PointMassEngine(Orders[Moving]):
     def move_obstacles(self, t: float) -> None:
         """Move obstacles with a plan to where they are at `t` [s] after the common start."""
         if self._scene is not None:
-            self.obstacles = [self._scene.poses(t)] * self._copies
+            self.obstacles = self._scene.poses(t)
 
     def push(self, row: int, velocity: Vector) -> None:
         """Set a velocity [m/s]; of a ground robot the component along its heading."""

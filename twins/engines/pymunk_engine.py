@@ -66,9 +66,6 @@ class PlanarEngine(Orders[Moving]):
     thrust of a tilted quadrotor, change the velocity to that, and pymunk's solver adds the contacts. Without contact a
     tick equals that of the point-mass engine. Pymunk moves bodies at the beginning of a step and computes velocities at
     its end; positions here are therefore one step ahead of pymunk's: those at the beginning of the next step.
-
-    Each copy of the scene has its own space: otherwise the order in which contacts are solved, and so the last digits
-    of a crowd, would depend on other copies.
     """
 
     def __init__(self, stage: Stage, choice: Planar) -> None:
@@ -82,36 +79,31 @@ class PlanarEngine(Orders[Moving]):
         self._layers = _build_layers(stage)
         self._scene = stage.scene
         self._planned_poses: list[Pose] = list(stage.scene.start)
-        self._build_copies(stage, choice)
-        self.obstacles: list[list[Pose]] = [list(stage.scene.start) for _ in self._copies]
+        self._space, self._robots = self._build_space(stage, choice)
+        self._planned = [k for k in self._space.obstacles if stage.scene.plans[k] is not None]
+        self.obstacles: list[Pose] = list(stage.scene.start)
         for robot, motion in zip(self._robots, self.motions, strict=True):
             robot.put(motion.position, motion.yaw)
 
-    def _build_copies(self, stage: Stage, choice: Planar) -> None:
-        """Build the copies of the scene, and find the numbers of each body in them."""
+    def _build_space(self, stage: Stage, choice: Planar) -> tuple[_Space, list[_Robot]]:
+        """Build the scene with its robots, and find the numbers of each body in it."""
         skin = 0.5 * choice.approach * self._step
         surfaces = Surfaces(choice.friction, choice.wall_friction, choice.traction, skin)
-        self._copies: list[_Copy] = []
-        found: dict[int, _Robot] = {}
-        for number in range(max(stage.copy, default=0) + 1):
-            place = Place(surfaces, -1 - len(stage.scene.names))
-            for row, kind in enumerate(stage.kinds):
-                if stage.copy[row] == number:
-                    place.add_robot(row, kind, mirrored=bool(stage.mirrored[row]))
-            place.furnish(stage.scene)
-            contacts = Contacts(
-                place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
-            )
-            copy = _Copy(place, contacts, choice.iterations)
-            for row, body in place.rows.items():
-                wheels = place.wheels.get(row, body)
-                robot = _Robot(copy.cells, copy.begin(body), copy.begin(wheels), stage.kinds[row], self._step)
-                if row in place.feet:
-                    robot.foot, robot.grip = place.feet[row]
-                found[row] = robot
-            self._copies.append(copy)
-        self._robots = [found[row] for row in range(len(stage.kinds))]
-        self._planned = [k for k in self._copies[0].obstacles if stage.scene.plans[k] is not None]
+        place = Place(surfaces, -1 - len(stage.scene.names))
+        for row, kind in enumerate(stage.kinds):
+            place.add_robot(row, kind, mirrored=stage.mirrored[row])
+        place.furnish(stage.scene)
+        contacts = Contacts(
+            place.numbers, self._layers, self._step, skin, choice.restitution, choice.slide, self._found
+        )
+        space, robots = _Space(place, contacts, choice.iterations), list[_Robot]()
+        for row, kind in enumerate(stage.kinds):
+            body = place.rows[row]
+            wheels = place.wheels.get(row, body)
+            robots.append(_Robot(space.cells, space.begin(body), space.begin(wheels), kind, self._step))
+            if row in place.feet:
+                robots[row].foot, robots[row].grip = place.feet[row]
+        return space, robots
 
     def advance(self, t: float, wobble: Sequence[Displacement]) -> None:
         step, dt = self._step, self._dt
@@ -124,16 +116,14 @@ class PlanarEngine(Orders[Moving]):
                 self._show_mirrored(row, robot, motion)
         if self._planned:
             self._move_planned(t)
-        for copy in self._copies:
-            copy.advance(self._ticks * dt, step, self.steps)
+        self._space.advance(self._ticks * dt, step, self.steps)
         self._ticks += 1
         for robot, motion in zip(self._robots, self.motions, strict=True):
             if isinstance(motion, Quadrotor):
                 robot.take_flight(motion, step)
             elif isinstance(motion, Differential):
                 robot.take_drive(motion, step)
-        for copy, poses in zip(self._copies, self.obstacles, strict=True):
-            copy.read_obstacles(poses, step)
+        self._space.read_obstacles(self.obstacles, step)
 
     def place(
         self, rows: Sequence[int], positions: Sequence[Vector], yaws: Sequence[float], flying: Sequence[bool]
@@ -141,8 +131,7 @@ class PlanarEngine(Orders[Moving]):
         super().place(rows, positions, yaws, flying)
         for row, position, yaw in zip(rows, positions, yaws, strict=True):
             self._robots[row].put(position, yaw)
-        for copy in self._copies:
-            copy.contacts.reset_rows(rows)
+        self._space.contacts.reset_rows(rows)
 
     def touches(self) -> list[Touch]:
         found = sorted(self._found, key=lambda touch: (touch.time, touch.first, touch.second))
@@ -171,16 +160,15 @@ class PlanarEngine(Orders[Moving]):
             v_x, v_y = (to_x - x) / self._dt, (to_y - y) / self._dt
             if math.sqrt(v_x * v_x + v_y * v_y) > LEAP:
                 x, y, yaw, v_x, v_y, turn = to_x, to_y, to_yaw, 0.0, 0.0, 0.0
-            for copy in self._copies:
-                cells, at = copy.cells, copy.obstacles[k]
-                cells[at + X], cells[at + Y] = x - self._step * v_x, y - self._step * v_y
-                cells[at + YAW] = yaw - self._step * turn
-                cells[at + V_X], cells[at + V_Y], cells[at + TURN] = v_x, v_y, turn
+            cells, at = self._space.cells, self._space.obstacles[k]
+            cells[at + X], cells[at + Y] = x - self._step * v_x, y - self._step * v_y
+            cells[at + YAW] = yaw - self._step * turn
+            cells[at + V_X], cells[at + V_Y], cells[at + TURN] = v_x, v_y, turn
         self._planned_poses = poses
 
 
 class _Robot:
-    """A robot's body, and its wheels, in the numbers of a copy."""
+    """A robot's body, and its wheels, in the numbers of a space."""
 
     __slots__ = (
         "_at", "_cells", "_drift", "_force", "_stands", "_target", "_wheels", "_wobble", "flies", "foot", "grip",
@@ -280,8 +268,8 @@ def _felt(blow: float, drift: float) -> float:
     return blow - clamp(blow, min(-drift, 0.0), max(-drift, 0.0))
 
 
-class _Copy:
-    """Pymunk space of one copy, and the numbers of its bodies."""
+class _Space:
+    """Pymunk's space, and the numbers of its bodies."""
 
     cells: memoryview[float]  # of all bodies, WIDTH each; pymunk's own memory
     obstacles: dict[int, int]  # index of the first number of each obstacle with a plan or a mass

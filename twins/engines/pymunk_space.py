@@ -1,4 +1,4 @@
-"""Pymunk space of one copy of a scene: robots as discs, wheels with grip, obstacles, walls."""
+"""Pymunk space of a scene: robots as discs, wheels with grip, obstacles, walls."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Surfaces:
 
 @dataclass
 class Place:
-    """One copy of the scene with its robots."""
+    """A scene with its robots."""
 
     surfaces: Surfaces
     walls: int  # number of the arena's walls, −1 − M

@@ -122,7 +122,7 @@ class RangeSensors:
             for name in own:
                 if name not in SENSORS:
                     raise BodyError(f"{robot}: there is no sensor {name}; there are {', '.join(SENSORS)}")
-        self._caster = Caster(world.scene, request.kinds, np.array(world.copy, dtype=np.intp))
+        self._caster = Caster(world.scene, request.kinds)
         fans = [(row, name) for row, own in enumerate(carried) for name in own]
         self._mounted = []
         for name in dict.fromkeys(name for _, name in fans):
@@ -152,7 +152,7 @@ class RangeSensors:
             beams = self._beams[due] = _arrange_beams([self._mounted[k] for k in due])
         position = np.array([motion.position for motion in engine.motions])
         yaw = np.array([motion.yaw for motion in engine.motions])
-        obstacles = np.array(engine.obstacles, dtype=float).reshape(len(engine.obstacles), -1, 3)
+        obstacles = np.array(engine.obstacles).reshape(-1, 3)
         truth = self._caster.cast(beams, position, yaw, obstacles)
         begin = 0
         changed: set[int] = set()

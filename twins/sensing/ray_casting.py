@@ -1,4 +1,4 @@
-"""Ray casting: true distances for all range sensors of all robots in all copies of a scene at once.
+"""Ray casting: true distances for all range sensors of all robots of a scene at once.
 
 Objects are upright: cylinders (robots, round obstacles) and straight edges (boxes, thin walls, the arena's border),
 each from a bottom to a top. Rays are level or vertical; others are not supported, and a robot that tilts still sends
@@ -100,35 +100,24 @@ class Beams:
 
 @dataclass(frozen=True, eq=False)
 class _Geometry:
-    """Current positions: flat arrays of cylinders (C), and edges (copies, S) by both ends."""
+    """Current positions of cylinders (C,), and of edges (S) by both ends."""
 
     x: Array
     y: Array
     bottom: Array
     top: Array
-    ends: Array  # (4, copies, S): x, y of one end, x, y of the other
+    ends: Array  # (4, S): x, y of one end, x, y of the other
 
 
 class Caster:
-    """Casts rays in the copies of a scene; copies do not see each other."""
+    """Casts rays in a scene."""
 
-    def __init__(self, scene: Scene, kinds: Sequence[Kind], copy: Index) -> None:
-        """`kinds` (n) and `copy` (n,) of the rows."""
-        rows, copies = len(kinds), int(copy.max(initial=0)) + 1
-        self._copy = copy
+    def __init__(self, scene: Scene, kinds: Sequence[Kind]) -> None:
+        """`kinds` (n) of the robots. Cylinders are robots, then round obstacles."""
         self._size = np.array([kind.height for kind in kinds])
         self._round = np.flatnonzero(scene.radius > 0.0)
-        pillars = len(self._round)
-        self._span = np.tile(scene.bottom[self._round], copies), np.tile(scene.top[self._round], copies)
-        radius = np.array([kind.radius for kind in kinds])
-        self._radius = np.concatenate([radius, np.tile(scene.radius[self._round], copies), [0.0]])
-        # cylinders of each copy: its rows and its pillars; padded with the last one, which has no position
-        order = np.argsort(copy, kind="stable")
-        crew = np.bincount(copy, minlength=copies)
-        place = np.arange(rows) - np.repeat(np.cumsum(crew) - crew, crew)
-        self._cylinders = np.full((copies, int(crew.max(initial=0)) + pillars), rows + copies * pillars)
-        self._cylinders[copy[order], pillars + place] = order
-        self._cylinders[:, :pillars] = rows + np.arange(copies * pillars).reshape(copies, pillars)
+        self._span = scene.bottom[self._round], scene.top[self._round]
+        self._radius = np.concatenate([[kind.radius for kind in kinds], scene.radius[self._round]])
         self._edges, self._owner = scene.edges()
         border = (scene.low[2], scene.high[2])  # bottom and top; its owner is −1: the last
         self._bottom = np.append(scene.bottom, border[0])[self._owner]
@@ -147,15 +136,15 @@ class Caster:
         Args:
             position: (n, 3) of all rows [m]; a row at NaN neither sees nor is seen.
             yaw: (n,) [rad]
-            obstacles: (copies, M, 3) poses: x, y [m], yaw [rad].
+            obstacles: (M, 3) poses: x, y [m], yaw [rad].
         """
         distance = np.full(beams.size, np.inf)
         geometry = self._place_geometry(position, obstacles)
-        share = self._cylinders.shape[1] + len(self._owner)
+        share = len(self._radius) + len(self._owner)
         step = max(1, BUDGET // (share + CROWDED * beams.widest))
         for begin in range(0, len(beams.row), step):
             fans = np.arange(begin, min(begin + step, len(beams.row)))
-            origins = _FanOrigins(beams, fans, position, yaw, self._copy)
+            origins = _FanOrigins(beams, fans, position, yaw)
             self._cast_on_cylinders(distance, origins, geometry)
             if len(self._owner):
                 self._cast_on_edges(distance, origins, geometry)
@@ -165,34 +154,32 @@ class Caster:
         return distance
 
     def _place_geometry(self, position: Array, obstacles: Array) -> _Geometry:
-        copies = len(obstacles)
-        pillars, nowhere = obstacles[:, self._round, :2].reshape(-1, 2), [np.nan]
-        pose = np.concatenate([obstacles, np.zeros((copies, 1, 3))], axis=1)[:, self._owner]  # last: the world frame
-        c, s = np.cos(pose[..., 2:]), np.sin(pose[..., 2:])
+        pillars = obstacles[self._round]
+        pose = np.concatenate([obstacles, np.zeros((1, 3))])[self._owner]  # last: the world frame
+        c, s = np.cos(pose[:, 2:]), np.sin(pose[:, 2:])
         x, y = self._edges[..., 0], self._edges[..., 1]
-        ends_x, ends_y = pose[..., :1] + c * x - s * y, pose[..., 1:2] + s * x + c * y
+        ends_x, ends_y = pose[:, :1] + c * x - s * y, pose[:, 1:2] + s * x + c * y
         return _Geometry(
-            np.concatenate([position[:, 0], pillars[:, 0], nowhere]),
-            np.concatenate([position[:, 1], pillars[:, 1], nowhere]),
-            np.concatenate([position[:, 2], self._span[0], nowhere]),
-            np.concatenate([position[:, 2] + self._size, self._span[1], nowhere]),
-            np.stack([ends_x[..., 0], ends_y[..., 0], ends_x[..., 1], ends_y[..., 1]]),
+            np.concatenate([position[:, 0], pillars[:, 0]]),
+            np.concatenate([position[:, 1], pillars[:, 1]]),
+            np.concatenate([position[:, 2], self._span[0]]),
+            np.concatenate([position[:, 2] + self._size, self._span[1]]),
+            np.stack([ends_x[:, 0], ends_y[:, 0], ends_x[:, 1], ends_y[:, 1]]),
         )
 
     def _cast_on_cylinders(self, distance: Array, origins: _FanOrigins, geometry: _Geometry) -> None:
-        thing = self._cylinders[origins.copy]
-        dx, dy, radius = geometry.x[thing] - origins.x, geometry.y[thing] - origins.y, self._radius[thing]
+        dx, dy, radius = geometry.x - origins.x, geometry.y - origins.y, self._radius
         square = dx * dx + dy * dy
         near = (square <= (origins.reach + radius) ** 2) & (
             square > radius**2
         )  # not from inside, as from the robot's own disc
-        near &= (geometry.bottom[thing] <= origins.z) & (origins.z <= geometry.top[thing])
+        near &= (geometry.bottom <= origins.z) & (origins.z <= geometry.top)
         which = np.flatnonzero(near)
         if not len(which):
             return
         fan_index = which // near.shape[1]
         x, y = origins.rotate_to_robot(fan_index, dx.ravel()[which], dy.ravel()[which])
-        radius = radius.ravel()[which]
+        radius = radius[which % near.shape[1]]
         half = np.arcsin(radius / np.sqrt(square.ravel()[which]))
         for pair, ray, c, s in origins.beams.within(origins.fans[fan_index], np.arctan2(y, x) - half, 2.0 * half):
             ahead, aside = x[pair] * c + y[pair] * s, x[pair] * s - y[pair] * c
@@ -201,7 +188,7 @@ class Caster:
             np.minimum.at(distance, ray, hit)
 
     def _cast_on_edges(self, distance: Array, origins: _FanOrigins, geometry: _Geometry) -> None:
-        ax, ay, bx, by = geometry.ends[:, origins.copy]
+        ax, ay, bx, by = geometry.ends
         ax, bx, ay, by = ax - origins.x, bx - origins.x, ay - origins.y, by - origins.y
         ex, ey = bx - ax, by - ay
         area = ax * by - ay * bx
@@ -233,15 +220,14 @@ class Caster:
         row = beams.row[fan]
         x, y, z = position[row].T
         height = up * (z + beams.height[fan])
-        thing = self._cylinders[self._copy[row]]
-        over = (geometry.x[thing] - x[:, None]) ** 2 + (geometry.y[thing] - y[:, None]) ** 2 < self._radius[thing] ** 2
-        over &= thing != row[:, None]
+        over = (geometry.x - x[:, None]) ** 2 + (geometry.y - y[:, None]) ** 2 < self._radius**2
+        over &= np.arange(len(self._radius)) != row[:, None]
         nearest = np.where(up > 0.0, self._ceiling - height, -self._floor - height)
-        side = np.where(up[:, None] > 0.0, geometry.bottom[thing], -geometry.top[thing]) - height[:, None]
+        side = np.where(up[:, None] > 0.0, geometry.bottom, -geometry.top) - height[:, None]
         nearest = np.fmin(nearest, np.where(over & (side >= 0.0), side, np.inf).min(axis=1, initial=np.inf))
         solid = np.flatnonzero(self._solid)
         if len(solid):
-            ax, ay, bx, by = geometry.ends[:, self._copy[row]][..., solid]
+            ax, ay, bx, by = geometry.ends[:, solid]
             inner = (ax - x[:, None]) * (by - y[:, None]) > (ay - y[:, None]) * (bx - x[:, None])
             first = np.flatnonzero(np.diff(self._owner[solid], prepend=-1))
             box = solid[first]
@@ -254,9 +240,9 @@ class Caster:
 class _FanOrigins:
     """Positions of some fans: columns (f, 1)."""
 
-    def __init__(self, beams: Beams, fans: Index, position: Array, yaw: Array, copy: Index) -> None:
+    def __init__(self, beams: Beams, fans: Index, position: Array, yaw: Array) -> None:
         row = beams.row[fans]
-        self.beams, self.fans, self.copy = beams, fans, copy[row]
+        self.beams, self.fans = beams, fans
         place = position[row]
         self.x, self.y = place[:, :1], place[:, 1:2]
         self.z = place[:, 2:] + beams.height[fans, None]

@@ -319,7 +319,7 @@ def test_mirrored_robots_are_where_they_are_shown():
 
 def twin(kinds, disturbance=None):
     rows = len(kinds)
-    world = World((0,) * rows, Scene.empty(), "mujoco", ((),) * rows, 1.0, (False,) * rows)
+    world = World(Scene.empty(), "mujoco", ((),) * rows, 1.0, (False,) * rows)
     return TwinBody(request(kinds, disturbance=disturbance), world)
 
 

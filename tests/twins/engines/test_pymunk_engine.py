@@ -216,6 +216,24 @@ def test_jam_does_not_overlap():
     assert max(drive.overlap(a, b) for a in range(16) for b in range(a)) < 1e-3
 
 
+def test_runs_of_a_crowd_are_reproducible():
+    ends = []
+    for _ in range(2):
+        kinds = [KHEPERA4, TURTLEBOT3, CRAZYFLIE, KHEPERA4, KHEPERA4]
+        drive = Drive(stage(kinds, [[-0.5, -0.5], [0.5, -0.5], [0.0, 0.0], [-0.5, 0.5], [0.5, 0.5]]))
+        drive.engine.takeoff([2], [0.05])
+        rng = np.random.default_rng(4)
+        for _ in range(40):
+            x, y, _ = drive.position.T
+            turn = 2.0 * np.sin(np.arctan2(-y, -x) - columns(drive.engine, "yaw")) + rng.normal(size=5)
+            setpoints = np.column_stack([np.full(5, 0.2), turn, np.zeros((5, 2))])
+            setpoints[2] = [0.0, 0.0, 0.05, 0.0]
+            drive.go(0.1, setpoints)
+        ends.append((drive.position.tolist(), columns(drive.engine, "yaw").tolist(), drive.touches))
+    assert ends[0] == ends[1]
+    assert drive.touches
+
+
 # walls and obstacles
 
 
