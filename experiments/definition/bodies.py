@@ -97,10 +97,8 @@ def _is_clear(stands: Scene, place: Array, kind: Kind) -> bool:
     )
 
 
-def shared_world(
-    experiment: Experiment, names: Sequence[str], copies: int = 1, *, sensing: bool | None = None
-) -> World:
-    """World that `names` share, in `copies`; with range sensors where avoidance uses them, or as `sensing` says."""
+def shared_world(experiment: Experiment, names: Sequence[str], *, sensing: bool | None = None) -> World:
+    """World that `names` share; with range sensors where avoidance uses them, or as `sensing` says."""
     used = experiment.avoidance is not None if sensing is None else sensing
     carried = []
     for name in names:
@@ -108,12 +106,11 @@ def shared_world(
         own = OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
         carried.append(own if used or robot.sensors else ())
     return World(
-        copy=np.repeat(np.arange(copies), len(names)),
         scene=scene(experiment),
         engine=experiment.world.engine,
-        sensors=tuple(carried) * copies,
+        sensors=tuple(carried),
         sensor_noise=experiment.world.sensor_noise,
-        mirrored=np.zeros(len(names) * copies, dtype=bool),
+        mirrored=(False,) * len(names),
     )
 
 
@@ -155,9 +152,8 @@ def disturbance(experiment: Experiment, name: str) -> Disturbance:
 def body_request(
     experiment: Experiment, names: Sequence[str], seed: int, endpoints: Sequence[str] = (), *, quiet: bool = False
 ) -> BodyRequest:
-    """Request for the bodies of `names`, one repetition for each seed; `endpoints` are the routers.
+    """Request for the bodies of `names`, without noise if `quiet`; `endpoints` are the routers.
 
-    The first `quiet` repetitions are without noise.
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
     noisy = tuple(disturbance(experiment, name) for name in names)
