@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import threading
 import time
-from math import isfinite
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
 import zenoh
 
-from agents.arrays import Array, Index, Mask, norm, some
 from agents.body.external_pose import External
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState
 from agents.body.measured_positions import MeasuredPositions
@@ -24,6 +24,7 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.shutdown import leave
 from agents.runtime.range_inbox import RangeInbox
+from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, norm
 from bridges.measured_flight import FRESH_S, SETTLED, MeasuredFlight
 
 Action = Literal["drive", "takeoff", "land", "stop"]
@@ -50,6 +51,43 @@ class _RepeatedOrder(msgspec.Struct):
     until: float  # [s]
 
 
+@dataclass(slots=True)
+class _Robot:
+    """What is known of a robot, and what was ordered."""
+
+    name: str
+    address: str
+    flies: bool
+    steers: bool  # by its yaw: setpoints are twists
+    # grows over restarts: a simulator that outlives this process can tell new orders from old
+    seq: int
+    yaw: float  # last measured [rad],
+    yaw_at: float = -inf  # and when
+    pose: External = field(default_factory=External)
+    flight: MeasuredFlight = field(default_factory=MeasuredFlight)
+    stopped_since: float = inf
+    repeated: _RepeatedOrder | None = None
+
+    @property
+    def stopped(self) -> bool:
+        return self.stopped_since < inf
+
+    @property
+    def measured(self) -> float:
+        """Time of the pose; a robot that steers by its yaw has no newer pose than that."""
+        at = self.pose.time
+        return self.yaw_at if self.steers and self.yaw_at < at - FRESH_S else at
+
+    def velocity(self, now: float) -> Vector:
+        """Velocity [m/s]; a robot on wheels without positions stands some time after a halt."""
+        stands = not self.flies and now - self.flight.landing_since > HALT_S and now - self.pose.time > FRESH_S
+        return ZERO if stands else self.pose.velocity
+
+    def goes_on(self, now: float) -> bool:
+        """Whether the robot was stopped, and is not measured to stand."""
+        return self.stopped and (self.flight.flying or norm(self.velocity(now)) > SETTLED)
+
+
 class ExternalBody:
     """Robots of another process; implements `agents.body.interface.Body`.
 
@@ -61,25 +99,18 @@ class ExternalBody:
         for name, device in zip(request.names, request.device, strict=True):
             if device:
                 raise BodyError(f"{name}: device: `{next(iter(device))}` is unknown; an external body has no settings")
-        rows = len(request.names)
-        self._names, self._keys = request.names, request.keys
-        self._endpoints, self._addresses = request.endpoints, request.addresses
-        self._flies = np.array([kind.flies for kind in request.kinds])
-        self._steers = np.array([kind.takes == "twist" for kind in request.kinds])
+        self._names, self._keys, self._endpoints = request.names, request.keys, request.endpoints
         self._zero = uptime()
         self._clock, self._corrected = request.clock, request.clock.correction_s
         self._utc = request.clock.utc()  # one reading, as in the runtime: a step of the wall clock has no effect
-        self._clock_offset = np.inf  # from the caller's clock to this one [s]
-        self._poses = External(rows)
-        self._yaw = np.array(request.yaw, dtype=float)  # last measured
-        self._yaw_at = np.full(rows, -np.inf)
-        self._flight = MeasuredFlight(rows)
-        self._stopped = np.zeros(rows, dtype=bool)
-        self._stopped_since = np.full(rows, np.inf)
-        # sequence numbers grow over restarts: a simulator that outlives this process can tell new orders from old
-        self._seq = [round(1e3 * self._utc)] * rows
-        self._read_at = np.inf  # last call of `read`
-        self._repeated: dict[int, _RepeatedOrder] = {}
+        self._clock_offset = inf  # from the caller's clock to this one [s]
+        self._robots = [
+            _Robot(name, address, kind.flies, kind.takes == "twist", round(1e3 * self._utc), yaw)
+            for name, address, kind, yaw in zip(
+                request.names, request.addresses, request.kinds, request.yaw, strict=True
+            )
+        ]
+        self._read_at = inf  # last call of `read`
         self._next_repeat = 0.0
         self._lock = threading.Lock()  # of the sequence numbers: `land` and `stop` are called from other threads too
         self._session: zenoh.Session | None = None
@@ -108,74 +139,77 @@ class ExternalBody:
             self.close()
             raise BodyError("\n".join(missing))
 
-    def read(self, t: float) -> BodyState:
+    def read(self, t: float) -> Sequence[BodyState]:
         self._outnumber_successor()
         self._clock_offset = min(self._clock_offset, self._now() - t)  # a late call only makes the difference larger
         self._read_positions()
         self._update_flying()
-        rows = len(self._names)
-        nothing = np.full((rows, 3), np.nan)
-        rays = self._ranges.read(self._utc, self._now())
-        return BodyState(
-            time=self._measured() - self._clock_offset,
-            position=self._poses.position.copy(),
-            velocity=self._velocity(),
-            yaw=self._yaw.copy(),
-            true_position=nothing,
-            true_yaw=nothing[:, 0],
-            battery=nothing[:, 0],
-            flying=self._flight.flying.copy(),
-            notes=self._notes(),
-            rays=None if rays is None else msgspec.structs.replace(rays, time=rays.time - self._clock_offset),
-            ahead=self._positions.ahead,
-        )
+        now, offset = self._now(), self._clock_offset
+        states = [
+            BodyState(
+                robot.measured - offset,
+                robot.pose.position,
+                robot.velocity(now),
+                robot.yaw,
+                flying=robot.flight.flying,
+                ahead=self._positions.ahead[row],
+                note=self._note(row, now),
+            )
+            for row, robot in enumerate(self._robots)
+        ]
+        self._ranges.replace_scans(states, self._utc + offset, t)
+        return states
 
-    def command(self, setpoint: Array) -> None:
-        given = np.isfinite(setpoint).all(axis=1) & ~self._stopped
-        values = setpoint.tolist()
-        for row in np.flatnonzero(given).tolist():
-            x, y, z, w = values[row]
-            self._send_setpoint(row, (x, y, z, w))
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        for row, setpoint in enumerate(setpoints):
+            if all(map(isfinite, setpoint)):
+                self._send_setpoint(row, setpoint)
         now = self._now()
-        if self._repeated and now >= self._next_repeat:
+        if now >= self._next_repeat and any(robot.repeated is not None for robot in self._robots):
             self._next_repeat = now + REPEAT_S
             with self._lock:
-                for row, repeated in list(self._repeated.items()):
+                for row, robot in enumerate(self._robots):
+                    repeated = robot.repeated
+                    if repeated is None:
+                        continue
                     if now > repeated.until:
-                        del self._repeated[row]
+                        robot.repeated = None
                     else:
                         self._put(row, msgspec.structs.replace(repeated.order, stamp=self._stamp()))
 
-    def takeoff(self, rows: Index, height: Array) -> None:
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`; no effect on ground robots, or after a stop."""
-        for row, up in zip(rows.tolist(), height.tolist(), strict=True):
-            if self._flies[row] and not self._stopped[row]:
-                self._flight.take_off(row, self._poses.position[row])
-                self._send_order(row, "takeoff", np.inf, up)
+        for row, up in zip(rows, heights, strict=True):
+            robot = self._robots[row]
+            if robot.flies and not robot.stopped:
+                robot.flight.take_off(robot.pose.position)
+                self._send_order(row, "takeoff", inf, up)
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         """See `Body.land`; no effect after a stop."""
-        for row in rows[~self._stopped[rows]].tolist():
-            self._flight.land(row, self._now())
-            self._send_order(row, "land", np.inf if self._flight.flying[row] else HALT_S)
+        for row in rows:
+            robot = self._robots[row]
+            if not robot.stopped:
+                robot.flight.land(self._now())
+                self._send_order(row, "land", inf if robot.flight.flying else HALT_S)
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         """See `Body.stop`; repeated as long as this process lives."""
-        for row in rows.tolist():
-            if not self._stopped[row]:
-                now = self._now()
-                self._stopped[row], self._stopped_since[row] = True, now
+        for row in rows:
+            robot = self._robots[row]
+            if not robot.stopped:
+                robot.stopped_since = now = self._now()
                 # from now on the robot counts as flying until it is measured on the ground
-                self._flight.land(row, now)
-                self._send_order(row, "stop", np.inf)
+                robot.flight.land(now)
+                self._send_order(row, "stop", inf)
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """No effect: this body subscribes to the key `position` itself."""
 
     def close(self) -> None:
         if self._session is not None:
-            until, nothing = self._now() + STANDSTILL_S, np.full((len(self._names), 4), np.nan)
-            while some(self._unconfirmed_stops()) and self._now() < until:
+            until, nothing = self._now() + STANDSTILL_S, [NO_SETPOINT] * len(self._robots)
+            while (now := self._now()) < until and any(robot.goes_on(now) for robot in self._robots):
                 time.sleep(POLL_S)
                 self.command(nothing)
                 self._read_positions()
@@ -193,25 +227,22 @@ class ExternalBody:
 
     def _read_positions(self) -> None:
         for row, taken, position, yaw in self._positions.receive(self._utc, self._now()):
-            if self._poses.update(row, taken, position, yaw) and isfinite(yaw):
-                self._yaw[row], self._yaw_at[row] = yaw, taken
-
-    def _measured(self) -> Array:
-        """Time (n,) of the poses; a robot that steers by its yaw has no newer pose than that."""
-        late = self._steers & (self._yaw_at < self._poses.time - FRESH_S)
-        return np.where(late, self._yaw_at, self._poses.time)
+            robot = self._robots[row]
+            if robot.pose.update(taken, position, yaw) and isfinite(yaw):
+                robot.yaw, robot.yaw_at = yaw, taken
 
     def _missing_positions(self) -> list[str]:
-        """Diagnosis and remedy for each row without a usable position."""
+        """Diagnosis and remedy for each robot without a usable position."""
         self._read_positions()
         now, found = self._now(), []
-        for row, name in enumerate(self._names):
-            key, age = self._keys.position(name), now - float(self._poses.time[row])
+        for row, robot in enumerate(self._robots):
+            name, age = robot.name, now - robot.pose.time
+            key = self._keys.position(name)
             if not isfinite(age):
                 found.append(
                     f"{name}: samples on {key} are not positions: {self._positions.trouble[row]}"
                     if self._positions.malformed[row]
-                    else f"{name}: nothing is published on {key}: is {self._source_name(row)} running and connected to "
+                    else f"{name}: nothing is published on {key}: is {_source_name(robot)} running and connected to "
                     f"{', '.join(self._endpoints)}?"
                 )
             elif age > FRESH_S:
@@ -219,66 +250,51 @@ class ExternalBody:
                     f"{name}: the position on {key} was measured {age:.1f} s ago by its stamp: stamps are UTC seconds, "
                     "not simulation time; if they are UTC, set the clocks of both computers"
                 )
-            elif self._steers[row] and not isfinite(self._poses.yaw[row]):
+            elif robot.steers and not isfinite(robot.pose.yaw):
                 found.append(f"{name}: the position on {key} has no yaw, without which a robot on wheels cannot steer")
         return found
 
-    def _source_name(self, row: int) -> str:
-        return "`./zenpark world serve` with this experiment" if self._addresses[row] == WORLD else "the simulator"
-
-    def _velocity(self) -> Array:
-        """Velocities (n, 3) [m/s]; a robot on wheels without positions stands some time after a halt."""
-        now = self._now()
-        stands = ~self._flies & (now - self._flight.landing_since > HALT_S) & (now - self._poses.time > FRESH_S)
-        return np.where(stands[:, None], 0.0, self._poses.velocity)
-
-    def _unconfirmed_stops(self) -> Mask:
-        """Stopped rows that are not measured to stand."""
-        return self._stopped & (self._flight.flying | (norm(self._velocity()) > SETTLED))
-
     def _update_flying(self) -> None:
-        """Update which rows fly; orders to rows that are down are complete."""
-        climbing = np.isin(np.arange(len(self._names)), list(self._repeated))
-        down = self._flight.update(self._now(), self._poses.time, self._poses.position, self._poses.velocity, climbing)
-        with self._lock:
-            for row in np.flatnonzero(down).tolist():
-                if not self._stopped[row]:
-                    self._repeated.pop(row, None)
+        """Update which robots fly; orders to robots that are down are complete."""
+        now = self._now()
+        for robot in self._robots:
+            pose, climbing = robot.pose, robot.repeated is not None
+            if robot.flight.update(now, pose.time, pose.position, pose.velocity, climbing=climbing):
+                with self._lock:
+                    if not robot.stopped:
+                        robot.repeated = None
 
-    def _notes(self) -> tuple[str, ...]:
-        age, positions = self._now() - self._measured(), self._positions
-        unanswered = self._unconfirmed_stops() & (self._now() - self._stopped_since > ANSWER_S)
-        if not ((age > FRESH_S) | unanswered).any() and not any(positions.malformed) and not self._ranges.malformed:
-            return ()
-        notes = []
-        for row, seconds in enumerate(age.tolist()):
-            parts = [UNANSWERED] if unanswered[row] else []
-            what = "yaw" if self._measured()[row] < self._poses.time[row] else "position"
-            parts += [f"no {what} for {seconds:.0f} s"] if seconds > FRESH_S else []
-            if positions.malformed[row]:
-                parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
-            if self._ranges.malformed:
-                parts.append(f"{self._ranges.malformed} sweeps refused, the last because {self._ranges.trouble}")
-            notes.append("; ".join(parts))
-        return tuple(notes)
+    def _note(self, row: int, now: float) -> str:
+        robot, positions = self._robots[row], self._positions
+        parts = [UNANSWERED] if now - robot.stopped_since > ANSWER_S and robot.goes_on(now) else []
+        if (age := now - robot.measured) > FRESH_S:
+            what = "yaw" if robot.measured < robot.pose.time else "position"
+            parts.append(f"no {what} for {age:.0f} s")
+        if positions.malformed[row]:
+            parts.append(f"{positions.malformed[row]} positions refused, the last because {positions.trouble[row]}")
+        if self._ranges.malformed:
+            parts.append(f"{self._ranges.malformed} sweeps refused, the last because {self._ranges.trouble}")
+        return "; ".join(parts)
 
     # ------------------------------------------------------------------ commands sent
 
-    def _send_setpoint(self, row: int, setpoint: messages.Setpoint) -> None:
+    def _send_setpoint(self, row: int, setpoint: Setpoint) -> None:
+        robot = self._robots[row]
         with self._lock:
-            if self._stopped[row]:
-                return  # stopped while the setpoint was computed
-            self._put(row, self._next_command(row, "drive", setpoint))
-            if (repeated := self._repeated.get(row)) is not None and repeated.order.action == "takeoff":
-                del self._repeated[row]  # setpoints replace a take-off
+            if robot.stopped:
+                return
+            self._put(row, self._next_command(robot, "drive", setpoint))
+            if robot.repeated is not None and robot.repeated.order.action == "takeoff":
+                robot.repeated = None  # setpoints replace a take-off
 
     def _send_order(self, row: int, action: Action, seconds: float, height: float | None = None) -> None:
         """Send an order now, and repeat it for `seconds`."""
+        robot = self._robots[row]
         with self._lock:
-            if action == "takeoff" and self._stopped[row]:
+            if action != "stop" and robot.stopped:
                 return  # stopped meanwhile, by another thread
-            order = self._next_command(row, action, height=height)
-            self._repeated[row] = _RepeatedOrder(order, self._now() + seconds)
+            order = self._next_command(robot, action, height=height)
+            robot.repeated = _RepeatedOrder(order, self._now() + seconds)
             self._put(row, order)
 
     def _outnumber_successor(self) -> None:
@@ -287,13 +303,14 @@ class ExternalBody:
         if self._read_at - before > SUPERSEDED_S:
             least = round(1e3 * (self._utc + self._read_at))
             with self._lock:
-                self._seq = [max(seq, least) for seq in self._seq]
+                for robot in self._robots:
+                    robot.seq = max(robot.seq, least)
 
     def _next_command(
-        self, row: int, action: Action, setpoint: messages.Setpoint | None = None, height: float | None = None
+        self, robot: _Robot, action: Action, setpoint: Setpoint | None = None, height: float | None = None
     ) -> messages.Command:
-        self._seq[row] += 1
-        return messages.Command(self._names[row], self._seq[row], self._stamp(), action, setpoint, height)
+        robot.seq += 1
+        return messages.Command(robot.name, robot.seq, self._stamp(), action, setpoint, height)
 
     def _put(self, row: int, command: messages.Command) -> None:
         if self._session is None:
@@ -303,3 +320,7 @@ class ExternalBody:
             publishers[row].put(messages.encode(command))
         except zenoh.ZError as error:
             self._positions.trouble[row] = f"commands cannot be sent: {error}"
+
+
+def _source_name(robot: _Robot) -> str:
+    return "`./zenpark world serve` with this experiment" if robot.address == WORLD else "the simulator"

@@ -1,13 +1,12 @@
-"""Which robots fly, of bodies that tell no more than positions: known by orders and by measured heights."""
+"""Whether a robot flies, of bodies that tell no more than positions: known by orders and by measured heights."""
 
 from __future__ import annotations
 
+from math import hypot, inf, isfinite, isnan
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Mask, norm, some
 from agents.safety.detection import SLOWEST
+from agents.vectors import ZERO, Vector, norm
 
 FRESH_S: Final = 0.5  # older positions are lost; robots tolerate as much
 LANDING_S: Final = 10.0  # a robot without positions counts as landed so long after `land`, and after a slow descent
@@ -19,63 +18,66 @@ SETTLED: Final = 0.1  # [m/s] slower robots stand
 
 
 class MeasuredFlight:
-    """Flying rows, and since when each lands; all times are on the clock of the body [s].
+    """Flight of a robot, and since when it lands; all times are on the clock of the body [s]."""
 
-    Attributes:
-        flying: Rows that fly.
-        landing_since: Time of the order to land or to stop; infinity without one.
-    """
+    __slots__ = ("_grounded_since", "_highest", "_start", "_still_since", "flying", "landing_since")
 
-    def __init__(self, rows: int) -> None:
-        self.flying: Mask = np.zeros(rows, dtype=bool)
-        self.landing_since: Array = np.full(rows, np.inf)
-        self._start = np.zeros((rows, 3))  # place of the take-off [m]
-        self._highest = np.full(rows, -np.inf)  # [m] since the order to land
-        self._still_since = np.full(rows, np.inf)
-        self._grounded_since = np.full(rows, np.inf)  # measured on the ground although it should fly
+    flying: bool
+    landing_since: float  # order to land or to stop; infinity without one
+    _start: Vector  # place of the take-off [m]
+    _highest: float  # since the order to land [m]
+    _still_since: float
+    _grounded_since: float  # measured on the ground although it should fly
 
-    def take_off(self, row: int, position: Array) -> None:
-        """Begin a flight at a position (3,) [m], NaN if unknown."""
-        self._start[row] = np.where(np.isfinite(position), position, 0.0)
-        self.flying[row], self.landing_since[row], self._highest[row] = True, np.inf, -np.inf
+    def __init__(self) -> None:
+        self.flying, self.landing_since = False, inf
+        self._start, self._highest = ZERO, -inf
+        self._still_since = self._grounded_since = inf
 
-    def land(self, row: int, now: float) -> None:
-        """Note an order to land; a repeated one of a flying row changes nothing."""
-        if not (self.flying[row] and np.isfinite(self.landing_since[row])):
-            self.landing_since[row] = now
+    def take_off(self, position: Vector) -> None:
+        """Begin a flight at a position [m], NaN if unknown."""
+        x, y, z = position
+        self._start = x if isfinite(x) else 0.0, y if isfinite(y) else 0.0, z if isfinite(z) else 0.0
+        self.flying, self.landing_since, self._highest = True, inf, -inf
 
-    def update(self, now: float, measured: Array, position: Array, velocity: Array, climbing: Mask) -> Mask:
-        """Rows (n,) whose flight has ended since the last update.
+    def land(self, now: float) -> None:
+        """Note an order to land; a repeated one in flight changes nothing."""
+        if not (self.flying and isfinite(self.landing_since)):
+            self.landing_since = now
+
+    def update(self, now: float, measured: float, position: Vector, velocity: Vector, *, climbing: bool) -> bool:
+        """Whether the flight has ended since the last update.
 
         Args:
-            measured: Time of the positions.
-            position: (n, 3) [m].
-            velocity: (n, 3) [m/s].
-            climbing: Rows with a take-off under way, which stand before they rise.
+            measured: Time of the position.
+            position: [m].
+            velocity: [m/s].
+            climbing: A take-off is under way: the robot stands before it rises.
         """
-        if not some(self.flying):
-            return np.zeros(len(self.flying), dtype=bool)
-        landing, aged = np.isfinite(self.landing_since), now - measured > FRESH_S
-        z = position[:, 2]
-        still = ~aged & (norm(velocity) < SETTLED)
-        self._still_since = np.where(still, np.minimum(self._still_since, now), np.inf)
-        self._highest = np.where(landing, np.fmax(self._highest, z), -np.inf)
-        grounded = ~aged & self._on_ground(position) & (np.abs(velocity[:, 2]) < SETTLED)
-        self._grounded_since = np.where(
-            grounded & self.flying & ~climbing, np.minimum(self._grounded_since, now), np.inf
-        )
-        alone = ~landing & (now - self._grounded_since > GROUNDED_S)
-        unseen = now - self.landing_since > np.fmax(LANDING_S, z / SLOWEST)
-        # it has come lower and stands: on a table
-        elsewhere = (self._highest - z > AWAY_M) & (now - self._still_since > LANDING_S)
-        down = self.flying & ((landing & np.where(aged, unseen, grounded | elsewhere)) | alone)
-        self.flying &= ~down
+        if not self.flying:
+            return False
+        landing, aged, z = isfinite(self.landing_since), now - measured > FRESH_S, position[2]
+        still = not aged and norm(velocity) < SETTLED
+        self._still_since = min(self._still_since, now) if still else inf
+        if not landing:
+            self._highest = -inf
+        elif z > self._highest:
+            self._highest = z
+        grounded = not aged and self._on_ground(position) and abs(velocity[2]) < SETTLED
+        self._grounded_since = min(self._grounded_since, now) if grounded and not climbing else inf
+        if not landing:
+            down = now - self._grounded_since > GROUNDED_S
+        elif aged:
+            descent = LANDING_S if isnan(z) else max(LANDING_S, z / SLOWEST)
+            down = now - self.landing_since > descent
+        else:  # else it has come lower and stands: on a table
+            down = grounded or (self._highest - z > AWAY_M and now - self._still_since > LANDING_S)
+        self.flying = not down
         return down
 
-    def _on_ground(self, position: Array) -> Mask:
-        """Rows at the height of the floor, or at the place of their take-off."""
-        above = position - self._start
-        table = self._start[:, 2] >= FLOOR_M
-        floor = np.where(table, position[:, 2], above[:, 2]) <= AWAY_M
-        back = (np.abs(above[:, 2]) <= AWAY_M) & (norm(above[:, :2]) < TABLE_M)
-        return floor | (table & back)
+    def _on_ground(self, position: Vector) -> bool:
+        """Whether the robot is at the height of the floor, or at the place of its take-off."""
+        (x, y, z), (x0, y0, z0) = position, self._start
+        if z0 < FLOOR_M:
+            return z - z0 <= AWAY_M
+        return z <= AWAY_M or (abs(z - z0) <= AWAY_M and hypot(x - x0, y - y0) < TABLE_M)

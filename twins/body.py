@@ -283,5 +283,6 @@ class TwinBody:
         for twin, state in self._measured:
             if twin.measure(state):
                 twin.refill()
+            state.note = ""
         for row, external in self._external.items():
             external.fill(self._states[row])

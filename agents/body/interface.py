@@ -1,6 +1,6 @@
 """Interface between the decision for a robot and its body: hardware or a twin, chosen by one word.
 
-A body has rows as everything has: a bridge that serves three Crazyflies on one radio is one body of three rows.
+A body may have several robots: a bridge that serves three Crazyflies on one radio is one body of three rows.
 The runtime finds bodies by the entry-point group `zenpark.bodies`: the word before `://` (or the whole word) names one.
 """
 
@@ -148,7 +148,10 @@ class Body(Protocol):
         ...
 
     def read(self, t: float) -> Sequence[BodyState]:
-        """The newest state of each robot at time `t` [s] of the process's clock. Never blocks; a twin advances itself to `t`."""
+        """The newest state of each robot at time `t` [s] of the process's clock. Never blocks; a twin advances to `t`.
+
+        The states may be the same objects at every call, and others write to them: the body sets its `note` each time.
+        """
         ...
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:

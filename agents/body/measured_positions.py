@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import inf, nan
+from math import inf, isnan, nan
 from typing import Final
 
-import numpy as np
 import zenoh
 
-from agents.arrays import Array
 from agents.body.interface import BodyState
 from agents.network import messages, pubsub, validation
 from agents.network.keys import Keys
+from agents.vectors import Vector
 
 REPEATED_S: Final = 0.3  # [s] without a new pose: the note says so
 SECOND_S: Final = 1.0  # [s] after its last sample a second source is not told of any more
@@ -34,7 +33,7 @@ class MeasuredPositions:
         keys: Keys,
         names: Sequence[str],
         rows: Sequence[int],
-        reach: messages.Vector,
+        reach: Vector,
         *,
         exact: Sequence[int] = (),
         silence_s: float,
@@ -46,17 +45,17 @@ class MeasuredPositions:
             silence_s: Time without a new position after which another source takes over [s].
         """
         self._names, self._reach = tuple(names), reach
-        # (N,) [s] stamp of the last position of each row less the time of its arrival: the clock of its source is ahead
-        # by at least so much, or, where negative, behind or late; NaN before the first
-        self.ahead: Array = np.full(len(self._names), nan)
-        self.malformed = [0] * len(self._names)  # (N,) refused positions
-        self.trouble = [""] * len(self._names)  # (N,) reason of the last refusal
+        # stamp of the last position of each robot less the time of its arrival [s]: the clock of its source is ahead by
+        # at least so much, or, where negative, behind or late; NaN before the first
+        self.ahead = [nan] * len(self._names)
+        self.malformed = [0] * len(self._names)  # refused positions of each robot
+        self.trouble = [""] * len(self._names)  # reason of the last refusal of each robot
         self._exact, self._silence_s = frozenset(exact), silence_s
         self._sources: dict[int, str | None] = {}  # session of the source of each row, None if it names none,
         self._alive_at: dict[int, float] = {}  # and the arrival of its last position that was new [s]
         self._foreign_at: dict[int, float] = {}  # arrival of the last position from a second source [s]
         self._received_at = -inf  # the last call [s]
-        self._last: dict[int, tuple[messages.Vector, float | None]] = {}
+        self._last: dict[int, tuple[Vector, float | None]] = {}
         self._new_at: dict[int, float] = {}  # arrival of the last pose that was new [s],
         self._repeats: dict[int, bool] = {}  # and whether others came since
         self._inboxes = {
@@ -69,10 +68,10 @@ class MeasuredPositions:
             for row in rows
         }
 
-    def receive(self, utc: float, now: float) -> Iterator[tuple[int, float, Array, float]]:
+    def receive(self, utc: float, now: float) -> Iterator[tuple[int, float, Vector, float]]:
         """Positions received until `now` [s] of a clock that was 0 at `utc`.
 
-        Yields row, time of measurement [s], position (3,) [m], and yaw [rad], NaN if unknown.
+        Yields row, time of measurement [s], position [m], and yaw [rad], NaN if unknown.
         """
         if now - self._received_at > self._silence_s:  # a standstill here is no silence of a source
             self._alive_at = dict.fromkeys(self._alive_at, now)
@@ -93,7 +92,7 @@ class MeasuredPositions:
                 if not self._is_new(row, (measured.position, measured.yaw), now):
                     continue
                 yaw = nan if measured.yaw is None else measured.yaw
-                yield row, validation.taken(measured.stamp - utc, now), np.array(measured.position), yaw
+                yield row, validation.taken(measured.stamp - utc, now), measured.position, yaw
 
     def _is_foreign(self, row: int, source: str | None, now: float) -> bool:
         """Whether another source than `source` is there for a row."""
@@ -101,9 +100,7 @@ class MeasuredPositions:
             return False
         return now - self._alive_at[row] <= self._silence_s
 
-    def _note_source(
-        self, row: int, source: str | None, pose: tuple[messages.Vector, float | None], now: float
-    ) -> None:
+    def _note_source(self, row: int, source: str | None, pose: tuple[Vector, float | None], now: float) -> None:
         """A pose of a row from the source that is not foreign; a frozen source is not alive."""
         if row not in self._sources or source != self._sources[row]:
             self._sources[row] = source
@@ -112,7 +109,7 @@ class MeasuredPositions:
         elif row in self._exact or pose != self._last.get(row):
             self._alive_at[row] = now
 
-    def _is_new(self, row: int, pose: tuple[messages.Vector, float | None], now: float) -> bool:
+    def _is_new(self, row: int, pose: tuple[Vector, float | None], now: float) -> bool:
         """Whether a pose was measured; of the first one that is known when the next one differs."""
         if row in self._exact:
             return True
@@ -122,18 +119,17 @@ class MeasuredPositions:
             self._new_at[row] = now
         return before is not None and not self._repeats[row]
 
-    def annotate(self, state: BodyState, now: float) -> None:
-        """Write to the state of the bodies at `now` [s] how far stamps are ahead, and what is wrong with sources."""
-        known = np.isfinite(self.ahead)
-        state.ahead = self.ahead if state.ahead is None else np.where(known, self.ahead, state.ahead)
+    def annotate(self, states: Sequence[BodyState], now: float) -> None:
+        """Write to the states of the bodies at `now` [s] how far stamps are ahead, and what is wrong with sources."""
+        for row, ahead in enumerate(self.ahead):
+            if not isnan(ahead):
+                states[row].ahead = ahead
         frozen = [row for row, repeats in self._repeats.items() if repeats and now - self._new_at[row] > REPEATED_S]
         second = [row for row, at in self._foreign_at.items() if now - at <= SECOND_S]
-        if frozen or second:
-            notes = list(state.notes) or [""] * len(self._names)
-            for what, rows in ((FROZEN, frozen), (SECOND, second)):
-                for row in rows:
-                    notes[row] = "; ".join(filter(None, (what, notes[row])))
-            state.notes = tuple(notes)
+        for what, rows in ((FROZEN, frozen), (SECOND, second)):
+            for row in rows:
+                state = states[row]
+                state.note = f"{what}; {state.note}" if state.note else what
 
     def _check(self, row: int, utc: float, now: float, measured: messages.Position) -> None:
         self.ahead[row] = measured.stamp - utc - now  # also of a stamp that is refused

@@ -10,81 +10,89 @@ restarted shows the error of simulating the whole run: the drift of speed and ya
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import inf, isfinite, isnan, nan
 from typing import Final, Protocol
 
-import numpy as np
-
-from agents.arrays import Array, Index, Mask
 from agents.body.interface import Body, BodyRequest, BodyState, Disturbance, inspect
 from agents.network.messages import Inspection
 from agents.plugins import registry
+from agents.vectors import UNKNOWN, Setpoint, Vector, is_finite
 
 TWIN: Final = "twin"
 FRESH_S: Final = 0.25  # a pose older than this is not where the robot is
 
 
 class Placeable(Body, Protocol):
-    """A body whose rows can be placed, such as a twin."""
+    """A body whose robots can be placed, such as a twin."""
 
-    def place(self, rows: Index, position: Array, yaw: Array, flying: Mask, velocity: Array | None = None) -> None:
-        """Puts rows at (len(rows), 3) [m] with yaw (len(rows),) [rad], in the air or not, moving or at rest."""
+    def place(
+        self,
+        rows: Sequence[int],
+        positions: Sequence[Vector],
+        yaws: Sequence[float],
+        flying: Sequence[bool],
+        velocities: Sequence[Vector] | None = None,
+    ) -> None:
+        """Puts robots at positions [m] with yaws [rad], in the air or not, moving [m/s] or at rest."""
         ...
 
 
 class Shadowed:
-    """A body with twins beside some of its rows; implements `agents.body.interface.Body`, without effect on the robots.
+    """A body with twins beside some of its robots; implements `agents.body.interface.Body`, without effect on them.
 
-    A twin that fails is left alone from then on, and the notes of its rows say so.
+    A twin that fails is left alone from then on, and the notes of its robots say so.
     """
 
-    def __init__(self, body: Body, twin: Placeable, rows: Index, restart_s: Array) -> None:
-        """`twin` has a row for each of `rows` of the body; `restart_s` (len(rows),) [s] is infinite for once."""
-        self._body, self._rows, self._restart = body, rows, restart_s
+    def __init__(self, body: Body, twin: Placeable, rows: Sequence[int], restart_s: Sequence[float]) -> None:
+        """`twin` has a robot for each of `rows` of the body; `restart_s` [s] of each is infinite for once."""
+        self._body, self._rows, self._restart = body, tuple(rows), tuple(restart_s)
         self._twin: Placeable | None = twin
         self._trouble = ""
-        count = len(rows)
-        self._placed, self._driven = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        self._due = np.full(count, -np.inf)
+        count = len(self._rows)
+        self._placed, self._driven = [False] * count, [False] * count
+        self._due = [-inf] * count
 
     def open(self) -> None:
         self._body.open()
         self._try(lambda twin: twin.open())
 
-    def read(self, t: float) -> BodyState:
-        state = self._body.read(t)
-        position, yaw = np.full_like(state.position, np.nan), np.full_like(state.yaw, np.nan)
-        self._try(lambda twin: self._follow(twin, t, state, position, yaw))
-        notes = list(state.notes) or [""] * len(state.time)
-        if self._trouble:
-            for row in self._rows.tolist():
-                notes[row] = "; ".join(part for part in (notes[row], self._trouble) if part)
-        shown = tuple(notes) if any(notes) else ()
-        return replace(state, shadow_position=position, shadow_yaw=yaw, notes=shown)
+    def read(self, t: float) -> Sequence[BodyState]:
+        states = self._body.read(t)
+        for row in self._rows:
+            states[row].shadow_position, states[row].shadow_yaw = UNKNOWN, nan
+        self._try(lambda twin: self._follow(twin, t, states))
+        for row in self._rows if self._trouble else ():
+            state = states[row]
+            state.note = f"{state.note}; {self._trouble}" if state.note else self._trouble
+        return states
 
-    def command(self, setpoint: Array) -> None:
-        self._body.command(setpoint)
-        mine = setpoint[self._rows]
-        self._driven |= np.isfinite(mine).all(axis=1) & (mine != 0.0).any(axis=1)
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        self._body.command(setpoints)
+        mine = [setpoints[row] for row in self._rows]
+        for k, setpoint in enumerate(mine):
+            if all(map(isfinite, setpoint)) and any(setpoint):
+                self._driven[k] = True
         self._try(lambda twin: twin.command(mine))
 
-    def takeoff(self, rows: Index, height: Array) -> None:
-        self._body.takeoff(rows, height)
-        mine, which = self._twin_rows(rows)
-        self._try(lambda twin: twin.takeoff(mine, height[which]))
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
+        self._body.takeoff(rows, heights)
+        to = [height for row, height in zip(rows, heights, strict=True) if row in self._rows]
+        mine = self._twin_rows(rows)
+        self._try(lambda twin: twin.takeoff(mine, to))
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         self._body.land(rows)
-        mine, _ = self._twin_rows(rows)
+        mine = self._twin_rows(rows)
         self._try(lambda twin: twin.land(mine))
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         self._body.stop(rows)
-        mine, _ = self._twin_rows(rows)
+        mine = self._twin_rows(rows)
         self._try(lambda twin: twin.stop(mine))
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """See `Body.locate`; the twin needs no external pose."""
         self._body.locate(row, t, position, yaw)
 
@@ -98,30 +106,39 @@ class Shadowed:
         finally:
             self._try(lambda twin: twin.close())
 
-    def _follow(self, twin: Placeable, t: float, state: BodyState, position: Array, yaw: Array) -> None:
-        """Simulates the twin, restarts rows at the pose of their robot when due, and stores its pose in the state."""
-        shadow = twin.read(t)
-        rows = self._rows
-        known = np.isfinite(state.position[rows]).all(axis=1) & np.isfinite(state.yaw[rows])
-        known &= t - state.time[rows] <= FRESH_S
-        due = np.flatnonzero(known & (~self._placed | (self._driven & (t >= self._due - 1e-9))))
-        if len(due):
-            at = rows[due]
-            velocity = np.nan_to_num(state.velocity[at], nan=0.0)
-            twin.place(due, state.position[at].copy(), state.yaw[at].copy(), state.flying[at].copy(), velocity)
-            self._placed[due] = True
-            begun = due[self._driven[due]]
-            self._due[begun] = t + self._restart[begun]
-            shadow = twin.read(t)
-        shown = np.flatnonzero(self._placed)
-        position[rows[shown]], yaw[rows[shown]] = shadow.position[shown], shadow.yaw[shown]
+    def _follow(self, twin: Placeable, t: float, states: Sequence[BodyState]) -> None:
+        """Simulates the twin, restarts it at the poses of its robots when due, and stores its poses in the states."""
+        shadows = twin.read(t)
+        if due := [k for k, row in enumerate(self._rows) if self._restarts(k, t, states[row])]:
+            robots = [states[self._rows[k]] for k in due]
+            twin.place(
+                due,
+                [robot.position for robot in robots],
+                [robot.yaw for robot in robots],
+                [robot.flying for robot in robots],
+                [_known(robot.velocity) for robot in robots],
+            )
+            for k in due:
+                self._placed[k] = True
+                if self._driven[k]:
+                    self._due[k] = t + self._restart[k]
+            shadows = twin.read(t)
+        for k, row in enumerate(self._rows):
+            if self._placed[k]:
+                states[row].shadow_position, states[row].shadow_yaw = shadows[k].position, shadows[k].yaw
 
-    def _twin_rows(self, rows: Index) -> tuple[Index, Index]:
-        """The twin's rows among those of the body, whose motors come on or go off; and where they stand in `rows`."""
-        which = np.flatnonzero(np.isin(rows, self._rows))
-        mine = np.searchsorted(self._rows, rows[which])
-        self._driven[mine], self._due[mine] = False, -np.inf
-        return mine, which
+    def _restarts(self, k: int, t: float, state: BodyState) -> bool:
+        """Whether a robot of the twin is put onto its robot now, which must know where it is."""
+        if self._placed[k] and not (self._driven[k] and t >= self._due[k] - 1e-9):
+            return False
+        return t - state.time <= FRESH_S and is_finite(state.position) and isfinite(state.yaw)
+
+    def _twin_rows(self, rows: Sequence[int]) -> list[int]:
+        """The twin's robots of those `rows` of the body, whose motors come on or go off."""
+        mine = [self._rows.index(row) for row in rows if row in self._rows]
+        for k in mine:
+            self._driven[k], self._due[k] = False, -inf
+        return mine
 
     def _try(self, act: Callable[[Placeable], None]) -> None:
         twin = self._twin
@@ -136,14 +153,20 @@ class Shadowed:
                 twin.close()
 
 
-def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
+def _known(velocity: Vector) -> Vector:
+    """A velocity with 0 in place of NaN."""
+    x, y, z = velocity
+    return 0.0 if isnan(x) else x, 0.0 if isnan(y) else y, 0.0 if isnan(z) else z
+
+
+def shadowed(body: Body, request: BodyRequest, restart_s: Sequence[float]) -> Body:
     """The body, made for `request`, with undisturbed twins beside it; the body itself without any.
 
-    `restart_s` (n,) is the period with which the twin is put onto its robot [s]: infinite for once, NaN for robots
+    `restart_s` is the period with which the twin of each robot is put onto it [s]: infinite for once, NaN for robots
     without a twin. Raises registry.PluginError if no twin is installed, BodyError if there is none of a robot's kind.
     """
-    rows = np.flatnonzero(~np.isnan(restart_s))
-    if not len(rows):
+    rows = [row for row, period in enumerate(restart_s) if not isnan(period)]
+    if not rows:
         return body
     count = len(rows)
     ideal = replace(
@@ -153,4 +176,4 @@ def shadowed(body: Body, request: BodyRequest, restart_s: Array) -> Body:
         external=(False,) * count,
         device=({},) * count,
     )
-    return Shadowed(body, registry.load(registry.BODIES, TWIN)(ideal), rows, restart_s[rows])
+    return Shadowed(body, registry.load(registry.BODIES, TWIN)(ideal), rows, [restart_s[row] for row in rows])

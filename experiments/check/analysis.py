@@ -233,7 +233,8 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     bare = Plan(msgspec.structs.replace(experiment, avoidance=None, architecture="distributed"))
     assignment, pattern = bare.assignment(), plan.formation
     links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
-    start, _ = bodies.start_poses(experiment, names)
+    starts, _ = bodies.start_poses(experiment, names)
+    start = np.array(starts)
     aloft = start.copy()
     aloft[:, 2] = np.nan_to_num(assignment.hover)
     anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row

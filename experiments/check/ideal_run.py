@@ -145,7 +145,8 @@ def fly(bare: Experiment, seed: int, *, quiet: bool = False) -> Prediction:
     try:
         log = simulation.simulate(bare, seed, quiet=quiet, lean=True, landing=False)
     except conductor.Stuck as stuck:
-        position, _ = bodies.start_poses(bare, tuple(bare.robots))
+        starts, _ = bodies.start_poses(bare, tuple(bare.robots))
+        position = np.array(starts)
         position[:, 2] = [robot.hover or 0.0 for robot in bare.robots.values()]
         return Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))
     run = log.time >= -ROUNDING_S

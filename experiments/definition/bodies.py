@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
+from math import hypot, inf, nan
 from typing import Final
 
 import msgspec
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyError, BodyRequest, Disturbance
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
 from agents.plugins import registry
+from agents.vectors import Vector, clamp
 from experiments.definition.experiment import Experiment
 from twins import scene as outlines
 from twins.scene import Scene, World
@@ -53,45 +54,48 @@ def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
     return tuple(KINDS[experiment.robots[name].kind] for name in names)
 
 
-def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[Array, Array]:
-    """Start poses of robots: position (n, 3) [m] on the floor and yaw (n,) [rad]."""
-    given = [(*experiment.robots[name].start, 0.0)[:3] for name in names]
-    pose = np.array(given, dtype=float).reshape(-1, 3)
-    return np.concatenate([pose[:, :2], np.zeros((len(pose), 1))], axis=1), pose[:, 2]
+def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[list[Vector], list[float]]:
+    """Start poses of robots: positions on the floor [m] and yaws [rad]."""
+    given = [(*map(float, experiment.robots[name].start), 0.0)[:3] for name in names]
+    return [(x, y, 0.0) for x, y, _ in given], [yaw for _, _, yaw in given]
 
 
-def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[Array, Array]:
+def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[list[Vector], list[float]]:
     """Start poses as `start_poses`, scattered by the seed, clear of other robots and of obstacles.
 
     Places are drawn for all robots of the experiment in the order of the file, so that all processes agree.
     """
-    position, yaw = start_poses(experiment, tuple(experiment.robots))
+    everyone = tuple(experiment.robots)
+    positions, yaws = start_poses(experiment, everyone)
     begin = experiment.start
     if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
         rng = np.random.default_rng([seed, 0x73746172])
-        kinds_of, stands = kinds(experiment, tuple(experiment.robots)), scene(experiment)
-        radius = np.array([kind.radius for kind in kinds_of])
-        half = 0.5 * np.array(experiment.arena.size[:2]) - experiment.safety.margin
-        given = position[:, :2].copy()
-        for row in range(len(position)):
-            yaw[row] += begin.scatter_yaw * rng.uniform(-1.0, 1.0)
+        robots, stands = kinds(experiment, everyone), scene(experiment)
+        half_x, half_y = (0.5 * side - experiment.safety.margin for side in experiment.arena.size[:2])
+        for row, (kind, (x, y, _)) in enumerate(zip(robots, tuple(positions), strict=True)):
+            yaws[row] += begin.scatter_yaw * rng.uniform(-1.0, 1.0)
             for _ in range(TRIES):
-                place = np.clip(
-                    given[row] + begin.scatter * rng.uniform(-1.0, 1.0, 2), radius[row] - half, half - radius[row]
+                dx, dy = (begin.scatter * rng.uniform(-1.0, 1.0, 2)).tolist()
+                place = (
+                    clamp(x + dx, kind.radius - half_x, half_x - kind.radius),
+                    clamp(y + dy, kind.radius - half_y, half_y - kind.radius),
                 )
-                gap = np.hypot(*(position[:, :2] - place).T) - radius - radius[row]
-                gap[row] = np.inf
-                if (gap > CLEAR).all() and _is_clear(stands, place, kinds_of[row]):
-                    position[row, :2] = place
+                apart = all(
+                    hypot(other[0] - place[0], other[1] - place[1]) - robots[k].radius - kind.radius > CLEAR
+                    for k, other in enumerate(positions)
+                    if k != row
+                )
+                if apart and _is_clear(stands, place, kind):
+                    positions[row] = (*place, 0.0)
                     break
-    rows = [list(experiment.robots).index(name) for name in names]
-    return position[rows], yaw[rows]
+    rows = [everyone.index(name) for name in names]
+    return [positions[row] for row in rows], [yaws[row] for row in rows]
 
 
-def _is_clear(stands: Scene, place: Array, kind: Kind) -> bool:
-    """Whether a robot that stands at `place` (2,) [m] keeps clear of all obstacles."""
+def _is_clear(stands: Scene, place: tuple[float, float], kind: Kind) -> bool:
+    """Whether a robot that stands at `place` [m] keeps clear of all obstacles."""
     return all(
-        outlines.distance(stands, k, stands.pose[k], place) > kind.radius + CLEAR
+        outlines.distance(stands, k, stands.pose[k], np.array(place)) > kind.radius + CLEAR
         for k in range(len(stands.names))
         if outlines.at_height(stands, k, 0.0, kind.height)
     )
@@ -125,18 +129,13 @@ def scene(experiment: Experiment) -> Scene:
     return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
 
 
-def shadow_periods(experiment: Experiment, names: Sequence[str], copies: int = 1) -> Array:
-    """Period (n,) [s] at which each shadow twin is reset to its robot: infinite for once, NaN without a shadow."""
-    period = []
+def shadow_periods(experiment: Experiment, names: Sequence[str]) -> list[float]:
+    """Period at which each shadow twin is reset to its robot [s]: infinite for once, NaN without a shadow."""
+    periods = []
     for name in names:
         shadow = experiment.robots[name].shadow
-        period.append(np.nan if shadow is None else np.inf if shadow.restart_s is None else shadow.restart_s)
-    return np.tile(np.array(period), copies)
-
-
-def hover_heights(experiment: Experiment, names: Sequence[str]) -> Array:
-    """Heights that robots hold (n,) [m]; NaN for ground robots."""
-    return np.array([experiment.robots[name].hover or np.nan for name in names])
+        periods.append(nan if shadow is None else inf if shadow.restart_s is None else shadow.restart_s)
+    return periods
 
 
 def disturbance(experiment: Experiment, name: str) -> Disturbance:
@@ -156,18 +155,18 @@ def body_request(
 
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
-    noisy = tuple(disturbance(experiment, name) for name in names)
-    position, yaw = scattered_poses(experiment, names, seed)
     robots = [experiment.robots[name] for name in names]
+    given = [disturbance(experiment, name) for name in names]
+    positions, yaws = scattered_poses(experiment, names, seed)
     return BodyRequest(
         names=tuple(names),
         kinds=kinds(experiment, names),
         addresses=tuple(robot.body for robot in robots),
-        start=tuple((x, y, z) for x, y, z in position.tolist()),
-        yaw=tuple(yaw.tolist()),
+        start=tuple(positions),
+        yaw=tuple(yaws),
         rate_hz=experiment.rates.body_hz,
         seeds=(seed,) * len(names),
-        disturbance=tuple(each.without_noise() for each in noisy) if quiet else noisy,
+        disturbance=tuple(each.without_noise() for each in given) if quiet else tuple(given),
         external=tuple(robot.position == "external" for robot in robots),
         device=tuple(robot.device for robot in robots),
         endpoints=tuple(endpoints),

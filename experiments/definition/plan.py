@@ -147,8 +147,7 @@ class Plan:
         """Name of each robot, x and y where it begins [m], and its radius [m]."""
         starts, _ = start_poses(self.experiment, self.names)
         return tuple(
-            (name, float(x), float(y), kind.radius)
-            for name, (x, y, _), kind in zip(self.names, starts.tolist(), self.kinds, strict=True)
+            (name, x, y, kind.radius) for name, (x, y, _), kind in zip(self.names, starts, self.kinds, strict=True)
         )
 
     @cached_property

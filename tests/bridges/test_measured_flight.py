@@ -1,35 +1,37 @@
 """Whether an external robot flies, by its heights and orders alone."""
 
-import numpy as np
+from math import inf
+
 import pytest
 
+from agents.vectors import UNKNOWN
 from bridges.measured_flight import GROUNDED_S, LANDING_S, MeasuredFlight
 
 DT = 0.1
 
 
 class Seen:
-    """One robot that is measured all the time."""
+    """A robot that is measured all the time."""
 
     def __init__(self, start):
-        self.flight, self.now, self.at = MeasuredFlight(1), 0.0, np.array(start, dtype=float)
-        self.flight.take_off(0, self.at)
-        self.climbing = np.array([False])
+        self.flight, self.now, self.at = MeasuredFlight(), 0.0, start
+        self.flight.take_off(self.at)
+        self.climbing = False
 
     def go(self, to, seconds):
         """Fly to a place in so long; returns whether the flight is over."""
-        steps = round(seconds / DT)
-        velocity = (np.array(to) - self.at) / seconds
-        for _ in range(steps):
-            self.now, self.at = self.now + DT, self.at + DT * velocity
-            self.flight.update(self.now, np.array([self.now]), self.at[None], velocity[None], self.climbing)
-        return not self.flight.flying[0]
+        velocity = tuple((there - here) / seconds for there, here in zip(to, self.at, strict=True))
+        for _ in range(round(seconds / DT)):
+            self.now += DT
+            self.at = tuple(here + DT * speed for here, speed in zip(self.at, velocity, strict=True))
+            self.flight.update(self.now, self.now, self.at, velocity, climbing=self.climbing)
+        return not self.flight.flying
 
     def stay(self, seconds):
-        return self.go(self.at.copy(), seconds)
+        return self.go(self.at, seconds)
 
     def land(self):
-        self.flight.land(0, self.now)
+        self.flight.land(self.now)
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.08), (0.0, 0.0, 0.7)])
@@ -71,20 +73,19 @@ def test_hover_that_refuses_to_land_goes_on():
 
 
 def test_repeated_landing_keeps_its_time():
-    flight = MeasuredFlight(1)
-    flight.take_off(0, np.full(3, np.nan))
+    flight = MeasuredFlight()
+    flight.take_off(UNKNOWN)
     over = []
     for step in range(round((LANDING_S + 1.0) / DT)):
         now = step * DT
-        flight.land(0, now)
-        unseen = np.full((1, 3), np.nan)
-        over += flight.update(now, np.array([-np.inf]), unseen, unseen, np.array([False])).tolist()
+        flight.land(now)
+        over.append(flight.update(now, -inf, UNKNOWN, UNKNOWN, climbing=False))
     assert over.index(True) == pytest.approx(LANDING_S / DT, abs=2)
 
 
 def test_stands_before_it_rises():
     seen = Seen((0.0, 0.0, 0.0))
-    seen.climbing[:] = True
+    seen.climbing = True
     assert not seen.stay(30.0)
-    seen.climbing[:] = False
+    seen.climbing = False
     assert seen.stay(GROUNDED_S + 0.2)

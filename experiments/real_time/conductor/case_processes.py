@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-import numpy as np
 
-from agents.arrays import Array
 from experiments.definition import bodies, standby
 from experiments.definition.experiment import Experiment, Robot
 from experiments.file import document
@@ -154,13 +152,13 @@ class CaseProcesses:
         """The robot of a name now: it may be another one, at an address that the file does not know."""
         return self._reached.robots[name]
 
-    def place(self, name: str, robot: Robot | None = None) -> Array:
-        """Start of a robot (2,) [m], or of `robot` under its name."""
+    def place(self, name: str, robot: Robot | None = None) -> tuple[float, float]:
+        """Start of a robot: x, y [m], or of `robot` under its name."""
         robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
-        position, _ = bodies.scattered_poses(
+        positions, _ = bodies.scattered_poses(
             msgspec.structs.replace(self._reached, robots=robots), [name], self._context.experiment.seed
         )
-        return np.asarray(position[0, :2])
+        return positions[0][:2]
 
     def companions(self, name: str) -> list[str]:
         """Robots of the same process, itself included."""

@@ -49,7 +49,7 @@ def stand_in(launch: TwinLaunch) -> int:
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise refusal(launch.file, f"{', '.join(names)} cannot share a protocol twin", hint)
-    request = DeviceRequest(bodies.body_request(experiment, names, [experiment.seed], endpoints), Faults())
+    request = DeviceRequest(bodies.body_request(experiment, names, experiment.seed, endpoints), Faults())
     return _serve(words.pop(), request, experiment, endpoints, lifeline=launch.lifeline)
 
 
@@ -84,7 +84,7 @@ def by_hand(
     experiment = Experiment(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
     injected = msgspec.convert(structure.parse_object("--faults", faults, Faults), Faults)
-    body = bodies.body_request(experiment, list(robots), [experiment.seed], endpoints)
+    body = bodies.body_request(experiment, list(robots), experiment.seed, endpoints)
     request = DeviceRequest(body, injected, by_hand=True)
     return _serve(word, request, experiment, connect, identity=identity)
 

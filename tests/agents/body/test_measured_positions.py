@@ -1,12 +1,13 @@
 """Positions by a clock that is off: what is stamped ahead hides no silence, and people are told how far it is off."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
+from math import inf, isnan
+from random import Random
 
-import numpy as np
 import pytest
 
 from agents.body.fleet import assemble
+from agents.body.interface import BodyState
 from agents.body.measured_positions import FROZEN, SECOND, MeasuredPositions
 from agents.decision.lifecycle import Phase
 from agents.network import messages
@@ -35,7 +36,7 @@ def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_
     net = Net()
     with net.worn():
         heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1], silence_s=0.5)  # type: ignore[arg-type]
-        assert np.isnan(heard.ahead).all()
+        assert all(map(isnan, heard.ahead))
         for ahead, taken in ((-0.02, [7.98]), (2.3, [8.0]), (3600.0, []), (-7.0, [1.0])):
             net.deliver(position(UTC + 8.0 + ahead))
             assert [(row, when) for row, when, *_ in heard.receive(UTC, 8.0)] == [
@@ -50,12 +51,12 @@ def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_
 
 
 def test_the_text_names_robot_and_size() -> None:
-    assert clock_text(("CF01", "CF02"), np.array([0.0, 2.3]), 1) == "positions of CF02 are stamped 2.3 s ahead"
-    assert clock_text(("CF01",), np.array([-0.4]), 0) == "positions of CF01 are stamped 0.4 s behind"
+    assert clock_text("CF02", 2.3) == "positions of CF02 are stamped 2.3 s ahead"
+    assert clock_text("CF01", -0.4) == "positions of CF01 are stamped 0.4 s behind"
 
 
 def flown(
-    ahead: Callable[[float], float | None], seconds: float, frozen_s: float = np.inf
+    ahead: Callable[[float], float | None], seconds: float, frozen_s: float = inf
 ) -> tuple[Runtime, list[tuple[float, str]]]:
     """A Tello at 100 Hz whose positions are stamped so far ahead of `t` (None: there are none), and from `frozen_s` on
     the same; what was said, when.
@@ -64,28 +65,28 @@ def flown(
         robots={"T": Robot(kind="tello", start=[0.1, 0.2], hover=0.5, position="external")}, formation=Formation()
     )
     said: list[tuple[float, str]] = []
-    measured, noise = [0.0] * 3, np.random.default_rng(1)
+    measured, noise = (0.0, 0.0, 0.0), Random(1)
     net = Net()
     with net.worn():
-        body = assemble(bodies.body_request(few, ("T",), [1]))
+        body = assemble(bodies.body_request(few, ("T",), 1))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
-        runtime = Runtime(Plan(few).assignment(("T",)), body, setup)
+        runtime = Runtime([Plan(few).assignment("T")], body, setup)
         body.open()
         runtime._subscribe_to_stops(net.session)  # type: ignore[arg-type]
         runtime._join(net.session)  # type: ignore[arg-type]
         runtime._utc = runtime._telemetry.utc = UTC
-        agent = runtime.agent
+        (robot,) = runtime.robots
         for tick in range(1, round(seconds / DT)):
             t = tick * DT
             if (off := ahead(t)) is not None:
-                seen = np.array([0.1, 0.2, 0.0]) if runtime._state is None else runtime._state.true_position[0]
-                measured = (seen + noise.normal(0.0, 1e-4, 3)).tolist() if t < frozen_s else measured
-                place = messages.Position("T", UTC + t + off, tuple(measured), 0.0)
+                seen = runtime._states[0].true_position if runtime._states else PLACE
+                measured = tuple(value + noise.gauss(0.0, 1e-4) for value in seen) if t < frozen_s else measured
+                place = messages.Position("T", UTC + t + off, measured, 0.0)
                 net.deliver(sent(KEYS.position("T"), place)[0])
             runtime._tick(t)
-            if agent.lifecycle.phase[0] == 1:
-                agent.lifecycle.takeoff(0)
-            worst = agent.hazards.worst(0)
+            if robot.lifecycle.phase == Phase.READY:
+                robot.lifecycle.takeoff()
+            worst = robot.hazards.worst()
             if worst and (not said or said[-1][1] != worst):
                 said.append((t, worst))
     return runtime, said
@@ -113,7 +114,7 @@ def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
 
 def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -> None:
     runtime, _ = flown(lambda _: -3600.0, 0.5)
-    assert runtime.agent.lifecycle.reason[0] == "no position of its own: positions of T are stamped 3.6e+03 s behind"
+    assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 
 
 @pytest.mark.parametrize(("exact", "expected"), [([], [8.3]), ([1], [8.0, 8.1, 8.2, 8.3, 8.4])])
@@ -132,9 +133,8 @@ def test_a_pose_that_repeats_itself_is_none(exact: list[int], expected: list[flo
 @pytest.mark.parametrize(("frozen_s", "phase"), [(0.0, "idle"), (1.2, "done"), (4.0, "done")])
 def test_frozen_motion_capture_lands_what_flies(frozen_s: float, phase: str) -> None:
     runtime, said = flown(lambda _: 0.0, frozen_s + 7.0, frozen_s)
-    assert Phase(runtime.agent.lifecycle.phase[0]).word == phase
-    assert runtime._state is not None
-    assert runtime._state.notes == (FROZEN,)
+    assert Phase(runtime.robots[0].lifecycle.phase).word == phase
+    assert runtime._states[0].note == FROZEN
     if frozen_s:
         (held, text), (landed, _), *_ = [each for each in said if "its own position is lost" in each[1]]
         assert text.startswith("hold: its own position is lost: the last is 0.5")
@@ -157,13 +157,14 @@ def test_the_first_of_two_sources_stays_until_silent() -> None:
         taken = [tell(8.0 + 0.1 * tick, *both) for tick in range(4)]
         assert taken == [[], [1], [1], [1]]
         assert heard.malformed == [4]
-        state = SimpleNamespace(ahead=None, notes=())
-        heard.annotate(state, 8.4)  # type: ignore[arg-type]
-        assert state.notes == (SECOND,)
+        state = BodyState(note="locked")
+        heard.annotate([state], 8.4)
+        assert state.note == f"{SECOND}; locked"
+        assert state.ahead == pytest.approx(0.0, abs=1e-6)
         taken = [tell(8.4 + 0.1 * tick, ("b", 2.0)) for tick in range(8)]
         assert taken == [[]] * 5 + [[2]] * 3
         assert tell(9.2, *both) == [2], "the first one is the second now"
         assert tell(11.0, *reversed(both)) == [2], "nothing was received meanwhile"
-        state = SimpleNamespace(ahead=None, notes=())
-        heard.annotate(state, 12.5)  # type: ignore[arg-type]
-        assert state.notes == ()
+        state = BodyState()
+        heard.annotate([state], 12.5)
+        assert not state.note

@@ -1,29 +1,27 @@
 """A twin beside a robot: it is told the same, put onto it when it should be, and never in its way."""
 
-from dataclasses import replace
+from math import inf, isfinite, isnan, nan
 
-import numpy as np
 import pytest
 
 from agents.body.interface import BodyRequest, BodyState, Disturbance
 from agents.body.kinds import KINDS
 from agents.body.shadow_twin import Shadowed, shadowed
 from agents.network.keys import Keys
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO
 
 DT = 0.1
 
 
 class Driven:
-    """Rows that move as they are told, at a share of the speed and off by a constant; writes down what it is told."""
+    """Robots that move along x as told, at a share of the speed and off by a constant; keeps what it is told."""
 
     def __init__(self, rows, *, share=1.0, off=0.0):
-        self.position, self.yaw = np.zeros((rows, 3)), np.zeros(rows)
-        self.velocity = np.zeros((rows, 3))
+        self.x, self.speed, self.yaw, self.flying = [0.0] * rows, [0.0] * rows, [0.0] * rows, [False] * rows
         self.share, self.off = share, off
         self.told, self.placed = [], []
-        self.t = 0.0
-        self.stale = 0.0
-        self.flying = np.zeros(rows, dtype=bool)
+        self.t = self.stale = 0.0
+        self.note = ""
         self.broken, self.failure = "", RuntimeError
 
     def _may(self, what):
@@ -36,39 +34,32 @@ class Driven:
 
     def read(self, t):
         self._may("read")
-        self.position = self.position + (t - self.t) * self.share * self.velocity
+        self.x = [x + (t - self.t) * self.share * speed for x, speed in zip(self.x, self.speed, strict=True)]
         self.t = t
-        rows = len(self.yaw)
-        nothing = np.full((rows, 3), np.nan)
-        return BodyState(
-            time=np.full(rows, t - self.stale),
-            position=self.position + self.off,
-            velocity=self.velocity.copy(),
-            yaw=self.yaw.copy(),
-            true_position=nothing,
-            true_yaw=nothing[:, 0],
-            battery=nothing[:, 0],
-            flying=self.flying.copy(),
-        )
+        return [
+            BodyState(t - self.stale, (x + self.off, 0.0, 0.0), (speed, 0.0, 0.0), yaw, flying=flying, note=self.note)
+            for x, speed, yaw, flying in zip(self.x, self.speed, self.yaw, self.flying, strict=True)
+        ]
 
-    def command(self, setpoint):
+    def command(self, setpoints):
         self._may("command")
-        self.told.append(("command", setpoint[:, 0].tolist()))
-        given = np.isfinite(setpoint[:, 0])
-        self.velocity[given, 0] = setpoint[given, 0]
+        self.told.append(("command", [setpoint[0] for setpoint in setpoints]))
+        for row, (speed, *_) in enumerate(setpoints):
+            self.speed[row] = speed if isfinite(speed) else self.speed[row]
 
-    def takeoff(self, rows, height):
+    def takeoff(self, rows, heights):
         self._may("takeoff")
-        self.told.append(("takeoff", rows.tolist(), height.tolist()))
-        self.flying[rows] = True
+        self.told.append(("takeoff", rows, heights))
+        for row in rows:
+            self.flying[row] = True
 
     def land(self, rows):
         self._may("land")
-        self.told.append(("land", rows.tolist()))
+        self.told.append(("land", rows))
 
     def stop(self, rows):
         self._may("stop")
-        self.told.append(("stop", rows.tolist()))
+        self.told.append(("stop", rows))
 
     def locate(self, row, t, position, yaw):
         self.told.append(("locate", row))
@@ -77,74 +68,73 @@ class Driven:
         self._may("close")
         self.told.append("close")
 
-    def place(self, rows, position, yaw, flying, velocity=None):
+    def place(self, rows, positions, yaws, flying, velocities=None):
         self._may("place")
-        self.placed.append((round(self.t, 6), rows.tolist(), position[:, 0].tolist(), flying.tolist(), velocity))
-        self.position[rows], self.yaw[rows] = position, yaw
+        self.placed.append((round(self.t, 6), rows, [x for x, _, _ in positions], flying, velocities))
+        for row, (x, _, _), yaw in zip(rows, positions, yaws, strict=True):
+            self.x[row], self.yaw[row] = x, yaw
 
 
-def beside(rows=1, shadows=(0,), restart=np.inf, *, share=1.0, off=0.0):
+def beside(rows=1, shadows=(0,), restart=inf, *, share=1.0, off=0.0):
     """A robot and its twin, which is faster by `share` and measured `off` [m]."""
     robot, twin = Driven(rows, off=off), Driven(len(shadows), share=share)
-    return Shadowed(robot, twin, np.array(shadows), np.full(len(shadows), restart)), robot, twin
+    return Shadowed(robot, twin, shadows, [restart] * len(shadows)), robot, twin
 
 
 def speeds(*values):
     """Setpoints that say how fast to go along x."""
-    setpoint = np.zeros((len(values), 4))
-    setpoint[:, 0] = values
-    return setpoint
+    return [(value, 0.0, 0.0, 0.0) for value in values]
 
 
 def differences(body, duration, speed=0.5):
     """What the twin is ahead, at each tick."""
     ahead = []
     for k in range(round(duration / DT) + 1):
-        state = body.read(k * DT)
-        ahead.append(state.shadow_position[0, 0] - state.position[0, 0])
-        body.command(speeds(*[speed] * len(state.yaw)))
-    return np.array(ahead)
+        states = body.read(k * DT)
+        ahead.append(states[0].shadow_position[0] - states[0].position[0])
+        body.command(speeds(*[speed] * len(states)))
+    return ahead
 
 
-def test_a_twin_that_is_faster_runs_ahead_until_it_is_put_back():
+def test_faster_twin_runs_ahead_until_put_back():
     body, _, twin = beside(restart=1.0, share=1.1)
     ahead = differences(body, 3.05)
     # driven at 0, seen to be driven at 0.1, and put back 1 s and 2 s after that
-    since = np.maximum(np.arange(31) - 1, 0) % 10 * DT
-    np.testing.assert_allclose(ahead, 0.05 * since, atol=1e-12)
+    since = [max(k - 1, 0) % 10 * DT for k in range(31)]
+    assert ahead == pytest.approx([0.05 * seconds for seconds in since], abs=1e-12)
     assert [at for at, *_ in twin.placed] == [0.0, 0.1, 1.1, 2.1]
 
 
 def test_once_is_when_it_is_first_driven():
     body, _, twin = beside(share=1.1)
     ahead = differences(body, 3.05)
-    np.testing.assert_allclose(ahead, 0.05 * np.maximum(np.arange(31) - 1, 0) * DT, atol=1e-12)
+    assert ahead == pytest.approx([0.05 * max(k - 1, 0) * DT for k in range(31)], abs=1e-12)
     assert [at for at, *_ in twin.placed] == [0.0, 0.1]
 
 
-def test_it_is_put_where_the_robot_is_measured_to_be_and_moves_as_it_does():
+def test_twin_takes_measured_place_and_speed():
     body, robot, twin = beside(off=0.25)
     body.read(0.0)
     assert twin.placed[0][2] == [0.25]
-    robot.velocity[0, 0] = 0.3
+    robot.speed[0] = 0.3
     body.command(speeds(0.4))
-    state = body.read(0.1)
-    np.testing.assert_allclose(twin.placed[1][4], [[0.4, 0.0, 0.0]])
-    np.testing.assert_allclose(state.shadow_position, state.position)
+    (state,) = body.read(0.1)
+    assert twin.placed[1][4] == [(0.4, 0.0, 0.0)]
+    assert state.shadow_position == pytest.approx(state.position)
 
 
-def test_only_rows_with_a_shadow_have_one_and_hear_orders_as_rows_of_their_own():
+def test_orders_reach_twins_by_their_own_rows():
     body, robot, twin = beside(rows=3, shadows=(0, 2))
     body.open()
-    state = body.read(0.0)
-    assert np.isnan(state.shadow_position[1]).all()
-    assert np.isnan(state.shadow_yaw).tolist() == [False, True, False]
-    body.takeoff(np.array([1, 2]), np.array([0.5, 0.7]))
+    states = body.read(0.0)
+    assert states[1].shadow_position is UNKNOWN
+    assert [isnan(state.shadow_yaw) for state in states] == [False, True, False]
+    body.takeoff([1, 2], [0.5, 0.7])
     body.command(speeds(0.1, 0.2, 0.3))
-    body.land(np.array([1]))
-    body.land(np.array([2, 0]))
-    body.stop(np.array([0, 1, 2]))
-    body.locate(2, 0.0, np.zeros(3), 0.0)
+    body.land([1])
+    body.land([2, 0])
+    body.stop([0, 1, 2])
+    body.locate(2, 0.0, ZERO, 0.0)
     body.close()
     assert robot.told == [
         "open", ("takeoff", [1, 2], [0.5, 0.7]), ("command", [0.1, 0.2, 0.3]), ("land", [1]), ("land", [2, 0]),
@@ -156,16 +146,16 @@ def test_only_rows_with_a_shadow_have_one_and_hear_orders_as_rows_of_their_own()
     ]  # fmt: skip
 
 
-def test_standing_still_is_not_being_driven_and_a_landing_is_left_alone():
+def test_restarts_wait_while_standing_or_landing():
     body, robot, twin = beside(restart=0.5)
-    robot.flying[:] = True
+    robot.flying[0] = True
     for k in range(10):
         body.read(k * DT)
-        body.command(np.full((1, 4), np.nan) if k % 2 else np.zeros((1, 4)))
+        body.command([NO_SETPOINT] if k % 2 else speeds(0.0))
     assert [at for at, *_ in twin.placed] == [0.0]
     body.command(speeds(0.2))
     body.read(1.0)
-    body.land(np.array([0]))
+    body.land([0])
     for k in range(11, 30):
         body.read(k * DT)
     assert [(at, flying) for at, _, _, flying, _ in twin.placed] == [(0.0, [True]), (1.0, [True])]
@@ -174,34 +164,34 @@ def test_standing_still_is_not_being_driven_and_a_landing_is_left_alone():
 def test_it_waits_for_a_pose_that_is_fresh():
     body, robot, twin = beside()
     robot.stale = 1.0
-    assert np.isnan(body.read(0.0).shadow_position).all()
-    robot.stale, robot.position[0, 0] = 0.0, np.nan
-    assert np.isnan(body.read(0.1).shadow_position).all()
-    robot.position[0, 0] = 2.0
-    assert body.read(0.2).shadow_position[0, 0] == 2.0
+    assert body.read(0.0)[0].shadow_position is UNKNOWN
+    robot.stale, robot.x[0] = 0.0, nan
+    assert body.read(0.1)[0].shadow_position is UNKNOWN
+    robot.x[0] = 2.0
+    assert body.read(0.2)[0].shadow_position[0] == 2.0
     assert len(twin.placed) == 1
 
 
 @pytest.mark.parametrize("what", ["open", "read", "place", "command", "takeoff", "land", "stop", "close"])
-def test_a_twin_that_fails_is_left_alone_and_the_robot_goes_on(what):
+def test_failing_twin_is_left_alone(what):
     body, robot, twin = beside()
     twin.broken = what
     body.open()
-    plain = [robot.read(k * DT) for k in range(3)]
-    robot.t, robot.position[:] = 0.0, 0.0
+    plain = [robot.read(k * DT)[0].position for k in range(3)]
+    robot.t, robot.x[0] = 0.0, 0.0
     for k in range(3):
-        state = body.read(k * DT)
-        np.testing.assert_array_equal(state.position, plain[k].position)
+        (state,) = body.read(k * DT)
+        assert state.position == plain[k]
         if k == 0:
-            body.takeoff(np.array([0]), np.array([1.0]))
-            body.land(np.array([0]))
-            body.stop(np.array([0]))
-            body.command(np.zeros((1, 4)))
+            body.takeoff([0], [1.0])
+            body.land([0])
+            body.stop([0])
+            body.command(speeds(0.0))
     body.close()
     assert robot.told == ["open", ("takeoff", [0], [1.0]), ("land", [0]), ("stop", [0]), ("command", [0.0]), "close"]
     if what != "close":
-        assert state.notes == ("its shadow failed: RuntimeError: no engine",)
-        assert np.isnan(state.shadow_position).all()
+        assert state.note == "its shadow failed: RuntimeError: no engine"
+        assert state.shadow_position is UNKNOWN
 
 
 @pytest.mark.parametrize("failure", [AssertionError, MemoryError, StopIteration, SystemError, Exception])
@@ -209,15 +199,16 @@ def test_shadow_failures_of_any_kind_stay_without_effect(failure):
     body, _, twin = beside()
     twin.broken, twin.failure = "command", failure
     body.read(0.0)
-    body.command(np.ones((1, 4)))
-    assert body.read(DT).notes == (f"its shadow failed: {failure.__name__}: no engine",)
+    body.command(speeds(1.0))
+    assert body.read(DT)[0].note == f"its shadow failed: {failure.__name__}: no engine"
 
 
-def test_what_the_robot_itself_says_is_kept():
-    body, robot, _ = beside(rows=2, shadows=(1,))
-    plain = robot.read
-    robot.read = lambda t: replace(plain(t), notes=("locked", "tumbled"))
-    assert body.read(0.0).notes == ("locked", "tumbled")
+def test_note_of_the_robot_is_kept():
+    body, robot, twin = beside(rows=2, shadows=(1,))
+    robot.note = "locked"
+    assert [state.note for state in body.read(0.0)] == ["locked"] * 2
+    twin.broken = "read"
+    assert [state.note for state in body.read(DT)] == ["locked", "locked; its shadow failed: RuntimeError: no engine"]
 
 
 def test_a_failure_of_the_robot_is_not_hidden():
@@ -233,8 +224,8 @@ def request(*kinds):
         names=tuple(f"R{k}" for k in range(rows)),
         kinds=tuple(KINDS[kind] for kind in kinds),
         addresses=("radio://0/80/2M/E7E7E7E701",) * rows,
-        start=np.zeros((rows, 3)),
-        yaw=np.zeros(rows),
+        start=(ZERO,) * rows,
+        yaw=(0.0,) * rows,
         rate_hz=100.0,
         seeds=(7,) * rows,
         disturbance=(Disturbance(position_sigma=0.1, latency_s=0.1, odometry_drift=0.1),) * rows,
@@ -247,18 +238,18 @@ def request(*kinds):
 
 def test_nobody_with_a_shadow_means_the_body_itself():
     robot = Driven(2)
-    assert shadowed(robot, request("khepera4", "tello"), np.full(2, np.nan)) is robot
+    assert shadowed(robot, request("khepera4", "tello"), [nan, nan]) is robot
 
 
-@pytest.mark.parametrize(("kind", "setpoint"), [("khepera4", [0.2, 0.0, 0.0, 0.0]), ("tello", [0.2, 0.0, 0.0, 0.0])])
-def test_the_twin_is_free_of_all_that_nature_adds(kind, setpoint):
+@pytest.mark.parametrize("kind", ["khepera4", "tello"])
+def test_twin_is_undisturbed(kind):
     robot = Driven(2)
-    robot.flying[:] = kind == "tello"
-    body = shadowed(robot, request("crazyflie", kind), np.array([np.nan, 1.0]))
+    robot.flying = [kind == "tello"] * 2
+    body = shadowed(robot, request("crazyflie", kind), [nan, 1.0])
     for k in range(101):
-        state = body.read(k / 100)
-        body.command(np.array([[np.nan] * 4, setpoint]))
-    assert np.isnan(state.shadow_position[0]).all()
-    assert state.position[1, 0] == pytest.approx(0.2)
-    assert state.shadow_position[1, 0] == pytest.approx(0.2)  # it took over the robot's speed with its place
-    assert state.shadow_position[1, 1:].tolist() == [0.0, 0.0]
+        first, second = body.read(k / 100)
+        body.command([NO_SETPOINT, (0.2, 0.0, 0.0, 0.0)])
+    assert first.shadow_position is UNKNOWN
+    assert second.position[0] == pytest.approx(0.2)
+    # it took over the robot's speed with its place
+    assert second.shadow_position == (pytest.approx(0.2), 0.0, 0.0)
