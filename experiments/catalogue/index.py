@@ -17,6 +17,13 @@ def names() -> list[str]:
     return sorted(file.stem for file in FOLDER.glob("*.toml") if not file.name.endswith(_ARENA))
 
 
+def titles() -> dict[str, str]:
+    """Title of every entry, by name; nothing is checked, so that listing them imports no more."""
+    import tomllib  # noqa: PLC0415 - help is quicker without
+
+    return {name: str(tomllib.loads((FOLDER / f"{name}.toml").read_text("utf-8"))["title"]) for name in names()}
+
+
 def arenas() -> list[str]:
     """Names of all arena files, sorted."""
     return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))

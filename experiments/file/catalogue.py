@@ -14,11 +14,6 @@ from experiments.file.problems import DocumentError, refusal
 from experiments.file.text import reason
 
 
-def names() -> list[tuple[str, str]]:
-    """Name and title of every experiment of the catalogue, by name."""
-    return [(name, str(tomllib.loads(_entry(name).read_text("utf-8"))["title"])) for name in index.names()]
-
-
 def path(name: str) -> Path:
     """The file of a catalogue entry; raises DocumentError if there is none of that name."""
     if name not in index.names():

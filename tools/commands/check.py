@@ -419,7 +419,6 @@ def import_(
 def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
-    from experiments.file import catalogue
 
     plugins = {
         "Bodies": registry.BODIES,
@@ -431,14 +430,14 @@ def list_(as_json: AsJson = False) -> None:
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
     }
-    experiments = catalogue.names()
+    experiments = index.titles()
     found = {title: registry.names(group) for title, group in plugins.items()}
-    width = max(len(name) for name, _ in experiments)
+    width = max(len(name) for name in experiments)
     print_result(
-        {"experiments": [{"name": name, "title": title} for name, title in experiments]}
+        {"experiments": [{"name": name, "title": title} for name, title in experiments.items()]}
         | {title.lower().replace(" ", "_"): names for title, names in found.items()},
         "Experiments (./zenpark run NAME, ./zenpark new NAME):",
-        *(f"  {name:<{width}}  {title}" for name, title in experiments),
+        *(f"  {name:<{width}}  {title}" for name, title in experiments.items()),
         *(f"{title}: {', '.join(names)}" for title, names in found.items()),
         as_json=as_json,
     )
