@@ -149,7 +149,9 @@ Bodies = Annotated[
     ),
 ]
 Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")]
-Report = Annotated[bool, typer.Option(help="Writes the report.")]
+Report = Annotated[
+    bool, typer.Option(help="Writes the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")
+]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
 
