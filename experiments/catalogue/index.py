@@ -27,3 +27,13 @@ def titles() -> dict[str, str]:
 def arenas() -> list[str]:
     """Names of all arena files, sorted."""
     return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))
+
+
+def find_file(name: str | Path) -> Path:
+    """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
+    file = Path(name)
+    known = str(name) in names()
+    try:
+        return FOLDER / f"{name}.toml" if known and not file.is_file() else file
+    except (OSError, ValueError):  # a name too long, or with a character that no name has
+        return file

@@ -73,13 +73,3 @@ def no_entry(name: str) -> DocumentError:
     """Error of a name that is neither a file nor an entry."""
     hint = f"{did_you_mean(name, index.names())} (./zenpark new copies one)"
     return refusal(name, "neither a file nor an experiment of the catalogue", hint)
-
-
-def find_file(name: str | Path) -> Path:
-    """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
-    file = Path(name)
-    known = str(name) in index.names()
-    try:
-        return _entry(str(name)) if known and not file.is_file() else file
-    except (OSError, ValueError):  # a name too long, or with a character that no name has
-        return file
