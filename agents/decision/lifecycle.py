@@ -32,7 +32,8 @@ class Phase(IntEnum):
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
-AT_HEIGHT = 0.05  # [m] from the hover height: arrived
+AT_HEIGHT = 0.05  # [m] below the hover height, and less: arrived,
+ABOVE_HEIGHT = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s to come back
 FINISHED, TOLD_TO_END = "finished", "told to end"  # reasons for a landing that is no fault; orders are others
 SETTLED = 0.1  # [m/s] slower: climbing or rolling has ended
 
@@ -152,9 +153,8 @@ class Lifecycle:
             for row in np.flatnonzero((phase == READY) & ~ready & ~self._climbing):
                 phase[row], self.reason[row] = IDLE, self._waits[row]
         if self._climbing.any():
-            there = ~self._flies | (
-                (np.abs(position[:, 2] - self._hover) < AT_HEIGHT) & (np.abs(velocity[:, 2]) < SETTLED)
-            )
+            above = position[:, 2] - self._hover
+            there = ~self._flies | ((above > -AT_HEIGHT) & (above < ABOVE_HEIGHT) & (np.abs(velocity[:, 2]) < SETTLED))
             arrived = self._climbing & there & ~np.isin(np.arange(len(phase)), self._due["takeoff"])
             phase[arrived] = AIRBORNE
             self._climbing &= ~arrived

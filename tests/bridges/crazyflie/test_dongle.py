@@ -136,7 +136,7 @@ def test_nothing_is_received_any_more(begins):
         for row in range(3):
             assert z[row][t > 3.0].max() < HEIGHT - 0.1, "a hover without command"
             landed = t[np.flatnonzero(z[row] == 0.0)[0]]
-            assert z[row][t > landed].max() == 0.0, "lifted again"
+            assert z[row][t > landed].max() < 1e-3, "lifted again"
         assert descent.fastest.max() < SINKS
         assert not any(supervised(twin, row) == State.LOCKED for row in range(3))
         assert not twin.device.flock.quadrotor.flying[:2].any()
