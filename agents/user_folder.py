@@ -1,4 +1,4 @@
-"""The folder for files of running processes: private to the user, emptied by the system at a restart."""
+"""Folders of the user: for files of running processes, emptied by the system at a restart; and for caches."""
 
 from __future__ import annotations
 
@@ -27,3 +27,13 @@ def runtime_folder() -> Path:
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or stat.S_IMODE(about.st_mode) & ~OWN:
         raise PermissionError(f"{folder} is no folder of yours alone (mode 0700)")
     return folder
+
+
+def cache_folder() -> Path:
+    """The user's folder for what can be made again, which need not exist; raises RuntimeError for a user without one.
+
+    `ZENPARK_CACHE_DIR` names another one.
+    """
+    if chosen := os.environ.get("ZENPARK_CACHE_DIR"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark"

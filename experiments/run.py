@@ -42,7 +42,7 @@ def show(figure: Figure, file: str | Path) -> Figure:
     """A figure for the end of a cell, which shows it if it is a `style.Drawing`; kept as `file`.svg and .pdf."""
     from experiments.report import style  # noqa: PLC0415 - matplotlib takes 0.6 s
 
-    style.save(figure, Path(file).parent, Path(file).name)
+    style.save(figure, Path(file).parent, Path(file).name, pdf=True)
     return figure
 
 

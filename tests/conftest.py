@@ -27,8 +27,9 @@ from tests.waiting import until
 hypothesis_settings.register_profile("zenpark", deadline=None)  # no test depends on how fast this machine is
 hypothesis_settings.register_profile("quick", deadline=None, max_examples=5)  # `./zenpark test --quick`
 hypothesis_settings.load_profile("zenpark")
-# no test may find the runs of whoever uses this machine, least of all to stop them
+# no test may find the runs of whoever uses this machine, least of all to stop them, or the verdicts of former checks
 os.environ["ZENPARK_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="zenpark-tests-")
+os.environ["ZENPARK_CACHE_DIR"] = tempfile.mkdtemp(prefix="zenpark-cache-")
 
 # each call builds all commands anew, 50 ms; a command keeps nothing of a call
 typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)

@@ -18,7 +18,7 @@ from typer.models import CommandInfo
 from agents.errors import ExplainedError
 from tools.bench import bench
 from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
-from tools.commands.options import Group, example, print_json, warn
+from tools.commands.options import Command, Group, example, print_json, warn
 from tools.reliability import chaos, soak
 
 
@@ -117,10 +117,12 @@ def part_for(words: Sequence[str], whole: typer.Typer = app) -> typer.Typer:
 
     def outline(command: CommandInfo) -> CommandInfo:
         name = command.name or getattr(command.callback, "__name__", "")
-        if name in words[:1]:
-            return command
         shown = copy(command)
-        shown.name, shown.help, shown.callback = name, command.help or inspect.getdoc(command.callback), lambda: None
+        if name in words[:1]:
+            shown.cls = Command
+        else:
+            shown.name, shown.help = name, command.help or inspect.getdoc(command.callback)
+            shown.callback = lambda: None
         return shown
 
     part = copy(whole)

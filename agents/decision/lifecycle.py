@@ -32,7 +32,8 @@ class Phase(IntEnum):
 # the members of an enumeration are slow to look up, and every tick asks for them
 IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE = (int(phase) for phase in Phase)
 
-AT_HEIGHT: Final = 0.05  # [m] from the hover height: arrived
+AT_HEIGHT: Final = 0.05  # [m] below the hover height, and less: arrived,
+ABOVE_HEIGHT: Final = 0.1  # or above it: a Crazyflie overshoots, and takes 10 s to come back
 FINISHED: Final = "finished"  # reasons for a landing that is no fault; orders are others
 TOLD_TO_END: Final = "told to end"
 SETTLED: Final = 0.1  # [m/s] slower: climbing or rolling has ended
@@ -134,7 +135,7 @@ class Lifecycle:
         elif self.phase == READY and not (ready or self.climbing):
             self.phase, self.reason = IDLE, self._waits
         if self.climbing and not self.takeoff_due:
-            at_height = abs(position[2] - self._hover) < AT_HEIGHT and abs(velocity[2]) < SETTLED
+            at_height = -AT_HEIGHT < position[2] - self._hover < ABOVE_HEIGHT and abs(velocity[2]) < SETTLED
             if at_height or not self._flies:
                 self.phase, self.climbing = AIRBORNE, False
         if self.phase == AIRBORNE and t >= self.start_at - 1e-6:

@@ -97,6 +97,12 @@ class Keys:
         before, _, session = token.rpartition("/")
         return session if before.endswith("/life") else None
 
+    @staticmethod
+    def session_of(token: str) -> str | None:
+        """The session in the token of an owner or of a claim; None for any other token."""
+        before, _, session = token.rpartition("/")
+        return session if before.endswith("/life") or before.rpartition("/")[0].endswith("/claim") else None
+
     def whose(self, key: str) -> str | None:
         """The robot of `<realm>/<robot>/<what>`; None for any other key, as that of a PUT on many at once (`**`)."""
         realm, _, rest = key.partition("/")

@@ -29,6 +29,7 @@ ROLES: Final[tuple[Role, ...]] = get_args(Role)
 REGISTER: Final = "lab.json"
 AUTHORITY: Final = "ca"
 MARK: Final = "#lab="
+UNUSABLE: Final = ";?"  # in the path of a lab: they separate the parts of an endpoint
 MARK_BYTES: Final = 8  # of an id of 16
 SECURE: Final = ("tls", "quic")
 DEFAULT_SECURE: Final = "tls/127.0.0.1:7447"
@@ -114,11 +115,12 @@ def secured(endpoints: Sequence[str], lab: str | Path | None) -> list[str]:
     """The endpoints, each with the lab that it needs; as they are without a lab.
 
     Without endpoints the usual one on this machine is meant. Those that name a lab already keep it. Raises LabError if
-    one is neither tls/ nor quic/, so that certificates would not be asked for.
+    one is neither tls/ nor quic/, so that certificates would not be asked for, or if Zenoh does not accept the path.
     """
     if lab is None:
         return list(endpoints)
     folder = Path(lab).absolute()
+    check_path(folder)
     made = []
     for endpoint in endpoints or [DEFAULT_SECURE]:
         plain = endpoint.partition(MARK)[0]
@@ -127,6 +129,14 @@ def secured(endpoints: Sequence[str], lab: str | Path | None) -> list[str]:
             raise LabError(f"{plain} asks for no certificate, which a lab needs: write tls/{address} or quic/{address}")
         made.append(endpoint if MARK in endpoint else f"{endpoint}{MARK}{folder}")
     return made
+
+
+def check_path(folder: Path) -> None:
+    """Raises LabError if the path of a lab cannot stand in an endpoint of Zenoh."""
+    found = [character for character in UNUSABLE if character in str(folder.absolute())]
+    if found or not str(folder).isprintable():
+        which = " and ".join(f"'{character}'" for character in found) or "what cannot be printed"
+        raise LabError(f"{str(folder)!r}: Zenoh accepts no path of a lab with {which}: rename or move the folder")
 
 
 def bare(endpoints: Sequence[str]) -> list[str]:

@@ -76,8 +76,8 @@ class GoalReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class State(Message, frozen=True, omit_defaults=True):
     """Telemetry of a body and its decision, for recorder and viewers; unknown numbers are left out.
 
-    Several states of one `seq` are one sample: `payloads` splits those whose `heard` or `followed` is too long for one
-    payload.
+    Several states of one `seq` are one sample: `payloads` splits those whose `received` or `goal_receipts` is too long
+    for one payload.
     """
 
     robot: str

@@ -258,7 +258,7 @@ class RouterWatch:
     for. Members of a mesh are not asked, since their lease is ours.
 
     Where there are several routers, one that is silent for `LEASE_S` is left for the next one, as one of ours would be
-    by its lease (`agents.network.session`).
+    by its lease (`agents.network.zenoh_config.LEASE_S`).
     """
 
     def __init__(self, session: zenoh.Session, key: str, endpoints: Sequence[str] = ()) -> None:

@@ -8,19 +8,21 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
 import zenoh
 from msgspec import Meta
-from zenoh.handlers import Callback
+from zenoh.handlers import Callback, FifoChannel
 
 from agents.errors import ExplainedError
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network.access_control import Rights
 from agents.network.endpoints import DEFAULT_ENDPOINT, EndpointError
+from agents.network.keys import Keys
 from agents.network.session import deserted, forbid_lingering, hang_up_on, prompt_threads
 from agents.network.shutdown import end, held
 from agents.network.zenoh_config import config, reason, settings
@@ -32,7 +34,9 @@ EMPTY_S: Final = 1.0  # no client for this long: a client that lost its connecti
 LOOK_S: Final = 0.1
 PORT_FREE_S: Final = 10.0  # limit for the port of a router that restarts to become free
 AGAIN_S: Final = 0.1
-# Period of the checks for new connections, for revoked certificates and for signals: a signal that the kernel delivers
+MOST_TOKENS: Final = 1000  # of a session: they cost the router 40 ms, three times as many 0.3 s, ten times 4.6 s
+MOST_REPLIES: Final = 1 << 16  # queued
+# Period of the checks for new connections, tokens, revoked certificates and signals: a signal that the kernel delivers
 # to another thread, as after a SIGCONT, does not wake the waiting one.
 LOOK_AGAIN_S: Final = 0.5
 
@@ -103,12 +107,16 @@ def serve_router(
     chosen = config(settings("router", listen=endpoints, connect=link, name="router", rights=rights))
     while True:
         with held(_routing(chosen, endpoints, patience_s, stop)) as (session, declared):
-            if register is not None:
-                declared.append(Guard(session, lab.register(register.parent)))
+            guard = None
+            if register is not None and rights is not None:
+                guard = Guard(session, lab.register(register.parent), rights.realm)
+                declared.append(guard)
             ready(session)
             patience_s = PORT_FREE_S
             while not stop.wait(LOOK_AGAIN_S):
                 forbid_lingering()
+                if guard is not None:
+                    guard.check_tokens()
                 if (now := _stamp(register)) == read:
                     continue
                 read = now
@@ -124,32 +132,79 @@ def serve_router(
 
 
 class Guard:
-    """Disconnects sessions of a lab's router whose ids were taken from others (`lab.session_id`).
+    """Disconnects sessions of a lab's router that pass for others, or hold more tokens than the router can bear.
 
-    Zenoh compares ids with no certificates: who connects first with the id of a robot, as after a restart of the
-    router, keeps that robot out.
+    Zenoh compares ids with no certificates: who connects first with the id of a robot (`lab.session_id`), as after a
+    restart of the router, keeps that robot out. Samples of tokens do not tell their session, the tables of the router
+    do. Each is reported on standard error and as a hazard of the run.
     """
 
-    def __init__(self, session: zenoh.Session, known: lab.Register) -> None:
-        self._known = known
-        self._told: set[tuple[str, str | None, bool]] = set()
+    def __init__(self, session: zenoh.Session, known: lab.Register, realm: str) -> None:
+        self._session, self._known, self._keys = session, known, Keys(realm)
+        self._told: set[str] = set()
+        self._hazards: deque[str] = deque()  # not published yet
+        self._banned: set[str] = set()  # ids of sessions, which a client keeps when it connects again
         # in the receiving thread: each moment that a thief stays is one in which the robot is refused
         callback = Callback(self._check, indirect=False)
         self._listener = session.info.declare_link_events_listener(callback, history=True)
+
+    def check_tokens(self) -> None:
+        """Compare the tokens in the tables of the router with the sessions that declared them; poll it."""
+        # another router declares the tokens of its own clients, which it compares itself
+        links = {str(link.zid): link for link in self._session.info.links() if not self._is_router(link)}
+        held = Counter[str]()
+        for key, declarers in declared_tokens(self._session):
+            named = Keys.session_of(key)
+            for zid in declarers & links.keys():
+                held[zid] += 1
+                if named not in (None, zid):
+                    self._ban(links[zid], f"holds a token of {self._keys.whose(key)} in the name of another session")
+        for zid, count in held.items():
+            if count > MOST_TOKENS:
+                self._ban(links[zid], f"holds more than {MOST_TOKENS} liveliness tokens")
+        while self._hazards:
+            event = messages.Event(time.time(), "hazard", "router", self._hazards.popleft())
+            self._session.put(self._keys.event, messages.encode(event), encoding=messages.JSON)
 
     def _check(self, event: zenoh.LinkEvent) -> None:
         link = event.link
         if event.kind == zenoh.SampleKind.DELETE:
             return
-        victim = lab.robbed(self._known, str(link.zid), link.auth_identifier)
-        if victim is None:
-            return
-        told = (victim, link.auth_identifier, hang_up_on(link))
-        if told not in self._told:
-            self._told.add(told)
-            done = "is disconnected" if told[-1] else f"cannot be disconnected: only TLS can; {victim} is kept out"
-            who = f"with the certificate of {link.auth_identifier}"
-            print(f"router: a session {who} came with the id of {victim}; it {done}", file=sys.stderr, flush=True)
+        if (victim := lab.robbed(self._known, str(link.zid), link.auth_identifier)) is not None:
+            self._disconnect(link, f"came with the id of {victim}")
+        elif str(link.zid) in self._banned:
+            hang_up_on(link)
+
+    def _ban(self, link: zenoh.Link, what: str) -> None:
+        if str(link.zid) not in self._banned:
+            self._banned.add(str(link.zid))
+            self._disconnect(link, what)
+
+    def _disconnect(self, link: zenoh.Link, what: str) -> None:
+        done = "is disconnected" if hang_up_on(link) else "cannot be disconnected, only TLS can: revoke the certificate"
+        text = f"a session with the certificate of {link.auth_identifier} {what}; it {done}"
+        if text not in self._told:
+            self._told.add(text)
+            self._hazards.append(text)
+            print(f"router: {text}", file=sys.stderr, flush=True)
+
+    def _is_router(self, link: zenoh.Link) -> bool:
+        return any(
+            each.role == "router" and each.common_name == link.auth_identifier
+            for each in self._known.identities.values()
+        )
+
+
+def declared_tokens(session: zenoh.Session) -> Iterator[tuple[str, set[str]]]:
+    """Keys of the liveliness tokens in the tables of a router, each with the ids of the sessions that declared it.
+
+    The tables show neither denied tokens nor keys with a chunk that begins with @, such as those of caches.
+    """
+    tables = f"@/{session.zid()}/router/token/"
+    for reply in session.get(f"{tables}**", FifoChannel(MOST_REPLIES)):
+        if reply.ok is not None:
+            sources = msgspec.json.decode(reply.ok.payload.to_bytes(), type=dict[str, set[str]])
+            yield str(reply.ok.key_expr).removeprefix(tables), set().union(*sources.values())
 
 
 def _routing(chosen: zenoh.Config, endpoints: Sequence[str], wait_s: float, stop: threading.Event) -> zenoh.Session:

@@ -8,7 +8,6 @@ of them takes longer than a Crazyflie flies without setpoints.
 from __future__ import annotations
 
 import logging
-import os
 import re
 import struct
 import threading
@@ -23,6 +22,7 @@ from agents.protocols import crtp
 from agents.protocols.crazyflie import dongle_of
 from agents.protocols.crazyradio import software
 from agents.protocols.crtp import HighLevel, Memory, Port
+from agents.user_folder import cache_folder
 from bridges.crazyflie.dongle import plug_in
 from bridges.crazyflie.trajectory import PLACES, PromptRadio, Trajectories
 
@@ -86,7 +86,7 @@ def prepare(addresses: Sequence[str]) -> None:
 
 def cache() -> Path:
     """Folder for the firmwares' tables of contents: with a cached one, connecting is ten times as fast."""
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zenpark" / "crazyflie"
+    folder = cache_folder() / "crazyflie"
     folder.mkdir(parents=True, exist_ok=True)  # else several that connect at once fail in cflib, which creates it too
     return folder
 

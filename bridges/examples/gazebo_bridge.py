@@ -51,7 +51,7 @@ def main(endpoint: str, world: str, names: Sequence[str]) -> None:
                 while (sample := commands[name].handler.try_recv()) is not None:
                     command = json.loads(sample.payload.to_string())
                     if command["seq"] > last_seq[name] or command["action"] == "stop":
-                        last_seq[name], received[name] = command["seq"], time.monotonic()
+                        last_seq[name], received[name] = max(last_seq[name], command["seq"]), time.monotonic()
                         twist = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
                 if twist is None and time.monotonic() - received[name] > PATIENCE_S:
                     twist = (0.0, 0.0)

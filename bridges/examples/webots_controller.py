@@ -33,7 +33,7 @@ def main(name: str, endpoint: str) -> None:
             while (sample := commands.handler.try_recv()) is not None:
                 command = json.loads(sample.payload.to_string())
                 if command["seq"] > last_seq or command["action"] == "stop":
-                    last_seq, received = command["seq"], time.monotonic()
+                    last_seq, received = max(last_seq, command["seq"]), time.monotonic()
                     v, turn = command["setpoint"][:2] if command["action"] == "drive" else (0.0, 0.0)
             if time.monotonic() - received > PATIENCE_S:
                 v = turn = 0.0

@@ -17,6 +17,23 @@ def names() -> list[str]:
     return sorted(file.stem for file in FOLDER.glob("*.toml") if not file.name.endswith(_ARENA))
 
 
+def titles() -> dict[str, str]:
+    """Title of every entry, by name; nothing is checked, so that listing them imports no more."""
+    import tomllib  # noqa: PLC0415 - help is quicker without
+
+    return {name: str(tomllib.loads((FOLDER / f"{name}.toml").read_text("utf-8"))["title"]) for name in names()}
+
+
 def arenas() -> list[str]:
     """Names of all arena files, sorted."""
     return sorted(file.name for file in FOLDER.glob(f"*{_ARENA}"))
+
+
+def find_file(name: str | Path) -> Path:
+    """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
+    file = Path(name)
+    known = str(name) in names()
+    try:
+        return FOLDER / f"{name}.toml" if known and not file.is_file() else file
+    except (OSError, ValueError):  # a name too long, or with a character that no name has
+        return file

@@ -10,14 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from agents.formation.graph import edges
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
-from experiments.check.findings import FORGIVEN, MARK, Finding, first_of_each_code
+from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, Figures, Finding, first_of_each_code
 from experiments.check.ideal_run import predict
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
@@ -25,7 +24,6 @@ from experiments.definition.experiment import Experiment
 from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
-NOT_RANDOM: Final = "not-random"
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 
 
@@ -48,8 +46,8 @@ SUBJECTS: Final = (
         theory.stability,
     ),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
-    *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.encounters),
-    *(motion.speeds, motion.rates, motion.ends),
+    *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling),
+    *(motion.encounters, motion.speeds, motion.rates, motion.ends),
     safety.architecture,
     safety.safety,
     safety.batteries,
@@ -57,42 +55,6 @@ SUBJECTS: Final = (
     safety.devices,
     chance,
 )
-
-
-class Figures(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of one case; None where one has no meaning, as without links."""
-
-    robots: int  # how many
-    arena: tuple[float, float, float]  # its size, x, y, z [m]
-    obstacles: dict[str, str]  # what each is, by name
-    links: int  # directed ones
-    edges: int  # pairs that are linked, directions ignored
-    parts: int  # of the network
-    leaders: tuple[str, ...]  # names
-    algebraic_connectivity: float  # of the network without directions
-    rank: int | None  # of the rigidity matrix when heights are held, `rank_needed` for a rigid formation
-    rank_needed: int | None  # see `rank`
-    rank_space: int | None  # the same in full space
-    rank_space_needed: int | None  # see `rank_space`
-    smallest_singular: float | None  # of the rigidity matrix when heights are held, rigid motions left out [m]
-    smallest_eigenvalue: float | None  # its square [m²]
-    spare_links: int | None  # pairs without any one of which the formation stays rigid; None where that has no meaning
-    vital_links: tuple[str, ...]  # the other pairs
-    spare_robots: int | None  # robots without any one of which it stays rigid
-    vital_robots: tuple[str, ...]  # the other robots
-    residual_mm: float | None  # worst link of the best shape
-    loop_gain: float | None  # h·μ·λ_max; 2 is where the formation hunts
-    slowest_mode_s: float | None  # time constant of the slowest mode that moves
-    free_modes: int  # modes that are slower than the run: nothing brings them back in time
-    speed_needed: float | None  # of the fastest plan [m/s]
-    speed_available: float | None  # of the slowest follower [m/s]
-    acquired_s: float | None  # when the formation keeps within the tolerance, before any plan begins
-    acquired_noisy_s: float | None  # the same, with the noise of the file's seed; None without such a flight as well
-    end_error_mm: float | None  # worst link at the end
-    end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
-    end_inside: bool  # whether all of them are inside the arena then
-    messages_hz: float  # poses that all robots send in a second, estimated
-    predicted_s: float  # how much of the run was predicted
 
 
 def check(given: Document, cases: Sequence[str] = ()) -> list[Finding]:

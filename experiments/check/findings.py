@@ -1,4 +1,4 @@
-"""Findings of the checks: severity, code, message and remedy at a place of the file."""
+"""What a check says: findings with severity, code, message and remedy at a place of the file, and figures."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
+import msgspec
+
 from experiments.file.problems import Path
 
 Severity = Literal["error", "warning", "note"]
 
 SHOWN: Final = 5  # findings of one sort; the others are counted
+NOT_RANDOM: Final = "not-random"  # code of the warning that no seed changes anything
 FORGIVEN: Final = 1e-6  # of rounding
+DELAYED: Final = 1.2  # times the acquisition without noise, from which on the one with noise is given as well
 
 
 MARK: Final[dict[Severity, str]] = {"error": "✗", "warning": "!", "note": "✓"}
@@ -34,6 +38,42 @@ class Finding:
     def __str__(self) -> str:
         """Line for a terminal."""
         return f"{MARK[self.severity]} {self.message}" + (f"; {self.remedy}" if self.remedy else "")
+
+
+class Figures(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one case; None where one has no meaning, as without links."""
+
+    robots: int  # how many
+    arena: tuple[float, float, float]  # its size, x, y, z [m]
+    obstacles: dict[str, str]  # what each is, by name
+    links: int  # directed ones
+    edges: int  # pairs that are linked, directions ignored
+    parts: int  # of the network
+    leaders: tuple[str, ...]  # names
+    algebraic_connectivity: float  # of the network without directions
+    rank: int | None  # of the rigidity matrix when heights are held, `rank_needed` for a rigid formation
+    rank_needed: int | None  # see `rank`
+    rank_space: int | None  # the same in full space
+    rank_space_needed: int | None  # see `rank_space`
+    smallest_singular: float | None  # of the rigidity matrix when heights are held, rigid motions left out [m]
+    smallest_eigenvalue: float | None  # its square [m²]
+    spare_links: int | None  # pairs without any one of which the formation stays rigid; None where that has no meaning
+    vital_links: tuple[str, ...]  # the other pairs
+    spare_robots: int | None  # robots without any one of which it stays rigid
+    vital_robots: tuple[str, ...]  # the other robots
+    residual_mm: float | None  # worst link of the best shape
+    loop_gain: float | None  # h·μ·λ_max; 2 is where the formation hunts
+    slowest_mode_s: float | None  # time constant of the slowest mode that moves
+    free_modes: int  # modes that are slower than the run: nothing brings them back in time
+    speed_needed: float | None  # of the fastest plan [m/s]
+    speed_available: float | None  # of the slowest follower [m/s]
+    acquired_s: float | None  # when the formation keeps within the tolerance, before any plan begins
+    acquired_noisy_s: float | None  # the same, with the noise of the file's seed; None without such a flight as well
+    end_error_mm: float | None  # worst link at the end
+    end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
+    end_inside: bool  # whether all of them are inside the arena then
+    messages_hz: float  # poses that all robots send in a second, estimated
+    predicted_s: float  # how much of the run was predicted
 
 
 def join_names(words: Sequence[str], most: int = 4) -> str:

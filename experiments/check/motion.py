@@ -261,6 +261,23 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
             yield Finding("warning", "lands-on", message, remedy, targets)
 
 
+def ceiling(analysis: Analysis) -> Iterator[Finding]:
+    """Check that the overshoot of a take-off stays below the top of the arena."""
+    top = analysis.experiment.arena.size[2]
+    for name, kind, hover in zip(
+        analysis.names, analysis.assignment.kinds, analysis.assignment.hover.tolist(), strict=True
+    ):
+        highest = (1.0 + kind.overshoot) * hover
+        if kind.overshoot and highest > top + FORGIVEN:
+            message = (
+                f"{name} hovers at {hover:g} m, and the take-off of a {kind.name} overshoots by up to "
+                f"{kind.overshoot:.0%}: to {highest:.2f} m, in an arena {top:g} m high"
+            )
+            lower = math.floor(100.0 * top / (1.0 + kind.overshoot)) / 100.0
+            remedy = f"hover at {lower:g} m at most, or enlarge size in [arena] if the room is higher"
+            yield Finding("warning", "overshoots-arena", message, remedy, ("robots", name, "hover"))
+
+
 def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
     """Time at which a row is first there, and its place then in words."""
     at = int(where.argmax())

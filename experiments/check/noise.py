@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from experiments.check.analysis import Analysis
-from experiments.check.findings import FORGIVEN, Finding
+from experiments.check.findings import DELAYED, FORGIVEN, Finding
 from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, strength
 from experiments.metrics.measure import WINDOW_S
@@ -17,7 +17,6 @@ from experiments.metrics.measure import WINDOW_S
 SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
 LATER: Final = 2.0  # times the time without noise, from which on a formation is acquired late
 NARROW: Final = 0.6  # of the tolerance: noise may move a link that is farther off out of it
-DELAYED: Final = 1.2  # times the time without noise, from which on both times are given
 WITHOUT: Final = {  # findings that noise may refute: what robots do without it
     "acquired-late": "are late",
     "wheels-stop": "on wheels stop short of their goals",

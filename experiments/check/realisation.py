@@ -144,7 +144,7 @@ class Solids:
     radius: Array  # (N,) [m]
     height: Array  # (N,) above the position of a robot [m]
     part: Index  # (N,) of the network; places of robots in different parts say nothing about each other
-    free: Mask  # (N,) rows that a shape places; two others stand where they stand
+    free: Mask  # (N,) rows that a shape places; the others stay where they are
     clearance: float = 0.0  # free height that robots above one another need [m]
 
     @classmethod

@@ -14,11 +14,6 @@ from experiments.file.problems import DocumentError, refusal
 from experiments.file.text import reason
 
 
-def names() -> list[tuple[str, str]]:
-    """Name and title of every experiment of the catalogue, by name."""
-    return [(name, str(tomllib.loads(_entry(name).read_text("utf-8"))["title"])) for name in index.names()]
-
-
 def path(name: str) -> Path:
     """The file of a catalogue entry; raises DocumentError if there is none of that name."""
     if name not in index.names():
@@ -78,13 +73,3 @@ def no_entry(name: str) -> DocumentError:
     """Error of a name that is neither a file nor an entry."""
     hint = f"{did_you_mean(name, index.names())} (./zenpark new copies one)"
     return refusal(name, "neither a file nor an experiment of the catalogue", hint)
-
-
-def find_file(name: str | Path) -> Path:
-    """File of that name, or of the catalogue entry; a folder of the same name does not hide an entry."""
-    file = Path(name)
-    known = str(name) in index.names()
-    try:
-        return _entry(str(name)) if known and not file.is_file() else file
-    except (OSError, ValueError):  # a name too long, or with a character that no name has
-        return file

@@ -15,6 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from agents.plugins.registry import did_you_mean
+from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
@@ -76,7 +77,7 @@ def read(path: str | Path, overrides: Sequence[str] = ()) -> Document:
     Raises:
         DocumentError: With everything that is wrong and where, whatever is in the file.
     """
-    file = catalogue.find_file(path)
+    file = index.find_file(path)
     label = str(path) if file == Path(path) else str(file)
     try:
         text = content(file, label)

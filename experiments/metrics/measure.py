@@ -250,6 +250,7 @@ def _robots(
         **{"messages": sent, "bytes": size, "recorded": recorded, "listeners": listeners, "heard": delivered},
         **{"lost": trace.lost, "missed_deadlines": trace.missed_deadlines, "updates": trace.decisions},
         **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
+        "foreign": np.zeros(rows, dtype=np.intp) if trace.foreign is None else trace.foreign,
     }
     unsure = {"iae": iae, "itae": itae, "rmse": rmse}  # (N,) each, NaN where unknown
     unsure |= zip(("gap_min_s", "gap_median_s", "gap_max_s"), np.array(waits).T, strict=True)

@@ -123,6 +123,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     delay_mean_s: float | None = None  # [s] see `Guidance`; None for robots that decide for themselves
     delay_p95_s: float | None = None  # [s]
     delay_max_s: float | None = None  # [s]
+    foreign: int = 0  # poses in its name that did not come from its process, and were refused
 
     @property
     def by_the_end(self) -> tuple[float | None, str]:

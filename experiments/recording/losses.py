@@ -77,8 +77,19 @@ def count_dropped(plan: Plan, statuses: list[list[Status]], run: tuple[float, fl
     return np.array([found[i][robots[j]] for i, j in ends], dtype=np.intp)
 
 
-def _by_sender(statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped"]) -> Counter[str]:
-    """Poses lost or dropped in the run by one receiver, by sender."""
+def count_foreign(robots: Sequence[str], statuses: list[list[Status]], run: tuple[float, float]) -> Index:
+    """(N,) poses in the name of each robot that came from another source than its process, and were refused.
+
+    One that several receivers refuse counts once: the number is that of the receiver with the most.
+    """
+    found = [_by_sender(reports, run, "foreign") for reports in statuses]
+    return np.array([max((each[name] for each in found), default=0) for name in robots], dtype=np.intp)
+
+
+def _by_sender(
+    statuses: list[Status], run: tuple[float, float], what: Literal["lost", "dropped", "foreign"]
+) -> Counter[str]:
+    """Poses lost, dropped or refused in the run by one receiver, by sender."""
     total: Counter[str] = Counter()
     for life in lives(statuses, _made):
         total += counter_growth([(status.stamp, getattr(status, what)) for status in life], *run)

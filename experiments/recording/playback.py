@@ -23,7 +23,15 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
 from experiments.recording.clocks import Correction
-from experiments.recording.losses import STATUS_S, count_dropped, count_in_run, count_lost, counter_growth, lives
+from experiments.recording.losses import (
+    STATUS_S,
+    count_dropped,
+    count_foreign,
+    count_in_run,
+    count_lost,
+    counter_growth,
+    lives,
+)
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
@@ -256,6 +264,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         lost=count_lost(robots, poses, statuses, (start, start + duration), experiment.rates.pose_hz)
         + (0 if goals is None else goals.lost),
         dropped=count_dropped(plan, statuses, (start, start + duration)),
+        foreign=count_foreign(robots, statuses, (start, start + duration)),
         missed_deadlines=counted("missed"),
         ticks=counted("ticks"),
         decisions=counted("decisions"),

@@ -162,6 +162,7 @@ class Trace:
     shadow_position: Array | None = None  # (T, N, 3) [m] of the twins beside robots, NaN for robots without one
     shadow_yaw: Array | None = None  # (T, N) [rad] of those twins
     dropped: Index | None = None  # (E,) by the modelled network on each of `plan.pose_links`; None if unknown
+    foreign: Index | None = None  # (N,) poses in the name of each robot, refused: not from its process; None if unknown
     goals: Goals | None = None  # of the central controller; None if each robot decides for itself
     clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
     joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start

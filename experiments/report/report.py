@@ -68,6 +68,10 @@ SAME_STARTS: Final = (
     "All seeds begin at the same poses: intervals (±) are of noise and network alone; "
     "start.scatter in the file varies the starts."
 )
+FOR_A_PAPER: Final = (
+    "For a paper: `./zenpark report FOLDER --pdf`, with the folder of this page, writes each figure as PDF beside the "
+    "SVG in figures/; --width 7.16 makes it as wide as both columns."
+)
 DIFFERENCES: Final = (
     "Experiment file, options, seeds, code and versions. What follows is to be read with these in mind."
 )
@@ -130,7 +134,7 @@ def write(
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
         *_results(cases),
-        Section("Figures", pictures=pictures),
+        Section("Figures", (FOR_A_PAPER,), pictures=pictures),
         Section("Events", tables=(short,), more=every_event),
         *_details(cases),
         *_of_worlds(cases, drawings, len(pictures)),

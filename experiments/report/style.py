@@ -8,7 +8,8 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any, Final, ParamSpec
@@ -106,21 +107,37 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-def save(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
-    """Writes `<name>.svg` and `<name>.pdf` into the folder."""
+def save(figure: Figure, folder: Path, name: str, *, pdf: bool = False) -> str:
+    """Writes `<name>.svg` into the folder, and `<name>.pdf` if asked for or there already; returns the SVG."""
     folder.mkdir(parents=True, exist_ok=True)
-    drawing, page = folder / f"{name}.svg", folder / f"{name}.pdf"
-    drawing.write_text(svg(figure), encoding="utf-8")
-    figure.set_layout_engine("none")  # the drawing has laid it out
+    page = folder / f"{name}.pdf"
+    with _laid_out(figure):
+        drawing = svg(figure)
+        (folder / f"{name}.svg").write_text(drawing, encoding="utf-8")
+        if pdf or page.exists():  # one of an earlier report would show something else
+            figure.savefig(page, metadata={"CreationDate": None})
+    return drawing
+
+
+@contextmanager
+def _laid_out(figure: Figure) -> Iterator[None]:
+    """In the style of this project, with a layout that is computed once: matplotlib does so twice for every file."""
+    engine = figure.get_layout_engine()
     with mpl.rc_context(dict(STYLE)):
-        figure.savefig(page, metadata={"CreationDate": None})
-    return drawing, page
+        if engine is not None:
+            engine.execute(figure)
+            figure.set_layout_engine(None)
+        try:
+            yield
+        finally:
+            if engine is not None:
+                figure.set_layout_engine(engine)
 
 
 def svg(figure: Figure) -> str:
     """The figure as SVG, without metadata, so that it holds no date and no address; paths to a hundredth of a point."""
     text = io.StringIO()
-    with mpl.rc_context(dict(STYLE)):
+    with _laid_out(figure):
         figure.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())
 

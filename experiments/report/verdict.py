@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoils
@@ -25,6 +26,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *interruptions(cases),
         *_troubles(cases),
         *_lost_poses(cases),
+        *_of_each_case(cases, _foreign),
         *_of_each_case(cases, _modelled),
         *_deadlines(cases),
         *_gaps(cases),
@@ -125,6 +127,21 @@ def _without_status(cases: Sequence[CaseMetrics]) -> list[str]:
     """Robots of runs in real time without a single status, so that nothing of their counters is known."""
     real = (robot for case in cases if case.clock == "real" for robot in case.robots)
     return list(dict.fromkeys(robot.robot for robot in real if robot.missed_share is None))
+
+
+def _foreign(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
+    """Poses that robots refused since another session sent them."""
+    counts = Counter[str]()
+    for run in runs:
+        counts.update({robot.robot: robot.foreign for robot in run.robots if robot.foreign})
+    if not counts:
+        return None
+    robots = _list([f"{number(count)} of {robot}" for robot, count in counts.items()])
+    return Finding(
+        "bad",
+        f"Poses from other sessions than the robots' own were refused in {name}: {robots}. Look for a second process "
+        "of that name; in a lab, revoke the certificate.",
+    )
 
 
 def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:

@@ -127,13 +127,12 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
 
 
 def pictures(
-    folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH
+    folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH, pdf: bool = False
 ) -> tuple[PageFigure, ...]:
-    """Messages against IAE and against ITAE, so wide [in]; also as files."""
+    """Messages against IAE and against ITAE, so wide [in]; also as files, see `style.save`."""
     drawn = {index: pareto(rows, index, joined=joined, width=width) for index in ("iae", "itae")}
-    for index, each in drawn.items():
-        style.save(each, folder / "figures", f"pareto_{index}")
-    return numbered((each, caption) for each, caption in zip(drawn.values(), CAPTIONS, strict=True))
+    saved = [style.save(each, folder / "figures", f"pareto_{index}", pdf=pdf) for index, each in drawn.items()]
+    return numbered(zip(saved, CAPTIONS, strict=True))
 
 
 def _fewest(rows: Sequence[CellRow]) -> list[Finding]:

@@ -30,6 +30,7 @@ CODES = {"int16_t": "i16", "uint16_t": "u16", "uint8_t": "u8", "int8_t": "i8", "
 TICK = 0.01  # [s] of the twins, and of the robots' loop
 ROOM_S = 0.0005  # between two looks whether the driver has room
 HEIGHT = 0.35
+NEAR = 0.05  # [m] to the floor
 NULL = bytes((0xFF,))
 
 
@@ -173,7 +174,8 @@ class Fleet:
         self.twin = CrazyflieTwin(DeviceRequest(body=asked, faults=Faults()))
         self.twin.flock.estimator.error[:] = self.twin.flock.estimator.turn[:] = 0.0  # set up
         self.drones = [Drone(self, row) for row in range(rows)]
-        self.ages, self.fastest = [], 0.0  # (k, rows) ages of poses [s]; fastest descent [m/s]
+        self.ages = []  # (k, rows) ages of poses [s]
+        self.fastest = self.touch = 0.0  # fastest descent, and fastest near the floor [m/s]
         self._begin = self._next_tick = self._next_exchange = self.now
         for line in self.twin.lines:
             line.heard = 0.0
@@ -236,7 +238,9 @@ class Fleet:
         self.client()
         self.twin.advance(self.now - self._begin)
         self.ages.append(self.now - np.array([drone.telemetry.pose_time for drone in self.drones]))
-        self.fastest = max(self.fastest, -self.twin.flock.quadrotor.velocity[:, 2].min())
+        sinks = -self.twin.flock.quadrotor.velocity[:, 2]
+        self.fastest = max(self.fastest, sinks.max())
+        self.touch = max(self.touch, sinks[self.heights < NEAR].max(initial=0.0))
         for row, drone in enumerate(self.drones):
             angle = speed / 0.3 * self.now + row
             target = (0.3 * math.cos(angle), row + 0.3 * math.sin(angle), HEIGHT, 0.0)

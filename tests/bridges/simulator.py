@@ -26,9 +26,9 @@ class Robot:
     def obey(self, now):
         while (sample := self.commands.handler.try_recv()) is not None:
             order = json.loads(sample.payload.to_string())
-            if order["seq"] <= self.done:
+            if order["seq"] <= self.done and order["action"] != "stop":
                 continue  # said again, or overtaken
-            self.done, action = order["seq"], order["action"]
+            self.done, action = max(self.done, order["seq"]), order["action"]
             if action == "drive":
                 self.setpoint, self.heard = order["setpoint"], now
             elif action == "takeoff":

@@ -15,6 +15,7 @@ from bridges.turtlebot3.body import TurtleBot3
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
 
+STYLES = ["ros2dds", "rmw"]
 FAST = 4.0
 DT = 0.01
 BEGIN = time.monotonic()

@@ -42,7 +42,18 @@ def pose(robot="TB01", seq=1, at=0.0, x=0.0):
 
 
 def status(
-    robot="TB01", at=1.0, *, sent=0, lost=None, dropped=None, started=START, pid=7, ticks=0, missed=0, decisions=0
+    robot="TB01",
+    at=1.0,
+    *,
+    sent=0,
+    lost=None,
+    dropped=None,
+    foreign=None,
+    started=START,
+    pid=7,
+    ticks=0,
+    missed=0,
+    decisions=0,
 ):
     return Status(
         robot=robot,
@@ -54,6 +65,7 @@ def status(
         sent=sent,
         received=0,
         lost=lost or {},
+        foreign=foreign or {},
         dropped=dropped or {},
         malformed=0,
         refused=0,

@@ -38,10 +38,10 @@ def started(*command, **options):
                 stream.close()
 
 
-def zenpark(folder, *more):
+def zenpark(folder, *more, given=GIVEN):
     settings = [part for setting in SETTINGS for part in ("--set", setting)]
     return started(
-        "-m", "tools.guard", "sweep", "triangle", *GIVEN, *settings, "--out", str(folder), "--no-report", *more
+        "-m", "tools.guard", "sweep", "triangle", *given, *settings, "--out", str(folder), "--no-report", *more
     )
 
 
@@ -65,6 +65,20 @@ def whole(tmp_path_factory):
         process.communicate()
         assert process.returncode == 0
     return tables(folder)
+
+
+def test_seeds_of_one_experiment_are_split_over_processes(tmp_path):
+    """The runs, by seed, are the same to the last bit however many processes share them."""
+    found = []
+    for count in ("1", "2", "3"):
+        folder = tmp_path / count
+        with zenpark(folder, "--processes", count, "--case", "event", given=["seeds=9"]) as process:
+            process.communicate()
+            assert process.returncode == 0
+        records = [json.loads(line) for line in (folder / "runs.jsonl").read_text().splitlines()]
+        assert len(records) > int(count)
+        found.append((tables(folder), sorted(json.dumps(run) for record in records for run in record["runs"])))
+    assert found[0] == found[1] == found[2]
 
 
 def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole):

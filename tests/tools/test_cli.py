@@ -118,6 +118,24 @@ def loaded(*words, program=LOADED, cwd=ROOT, **environment):
     return done.stdout, set(done.stderr.split())
 
 
+HEAVY = {"numpy", "matplotlib", "zenoh", "pydantic"}
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["list"], ["list", "--json"], ["check", "--help"], ["explain", "--help"]]
+)
+def test_light_commands_import_no_libraries(words):
+    said, modules = loaded(*words)
+    assert said
+    assert not HEAVY & modules
+
+
+def test_texts_need_no_pydantic(tmp_path):
+    said, modules = loaded("hosts", "check", str(tmp_path / "none.toml"), "--lab", "lab", "--json")
+    assert "none.toml" in json.loads(said)["error"]
+    assert "pydantic" not in modules
+
+
 def test_help_shows_every_command_in_a_panel_with_its_whole_description():
     shown = typer.main.get_command(app).commands
     panels = [name for names in PANELS.values() for name in names.split()]

@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from agents.network.lab import AUTHORITY, REGISTER, ROLES, Identity, LabError, Register, Role, register
+from agents.network.lab import AUTHORITY, REGISTER, ROLES, Identity, LabError, Register, Role, check_path, register
 
 SERVICES: Final[tuple[Role, ...]] = tuple(role for role in ROLES if role != "robot")
 HERE: Final = ("localhost", "127.0.0.1", "::1")
@@ -60,8 +60,9 @@ def create(
         listening: The same for other members that listen, by name: those of a mesh.
 
     Raises:
-        LabError: If there is a lab already, the folder cannot be written, or a name or address is wrong.
+        LabError: If there is a lab already, the folder cannot be written, or its path, a name or an address is wrong.
     """
+    check_path(folder)
     if (folder / REGISTER).exists() or (folder / f"{AUTHORITY}.key").exists():
         raise LabError(
             f"{folder} is a lab already: `./zenpark cert issue {folder} NAME...` adds identities, "

@@ -30,9 +30,8 @@ from tools.commands.options import (
 
 if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
-    from experiments.check.check import Figures
-    from experiments.check.findings import Finding
-    from experiments.file.document import Document
+    from experiments.check.findings import Figures, Finding
+    from experiments.check.kept import KeptVerdict, Verdict
     from experiments.file.reference import Entry
     from experiments.real_time.conductor.preflight_checks import RobotChecks
 
@@ -56,30 +55,46 @@ def check(
     as_json: AsJson = False,
 ) -> int:
     """Check an experiment file and say what theory says of it; exit code 2 for errors of the file, 1 of theory."""
-    from experiments.check.check import analyses, examine, unreadable
-    from experiments.file import document
+    from experiments.check.kept import KeptVerdict
     from experiments.file.problems import DocumentError
 
     if plot is not None and plot.suffix not in {".svg", ".pdf", ".png"}:
         raise typer.BadParameter(f"{plot}: the name must end in .svg, .pdf or .png", param_hint="--plot")
-    try:
-        given = document.read(file, settings or [])
-    except DocumentError as error:
-        if not as_json:
-            raise
-        _print_json(file, [unreadable(each) for each in error.problems], {})
-        return 2
-    analysed = analyses(given)
-    found, numbers = examine(given, analysed)
+    kept = KeptVerdict(file, settings or [])
+    verdict = kept.read() if plot is None and not fix else None
+    analysed: dict[str, Analysis] = {}
+    if verdict is None or verdict.figures is None:
+        try:
+            verdict, analysed = _examined(file, settings or [], kept)
+        except DocumentError as error:
+            if not as_json:
+                raise
+            from experiments.check.check import unreadable
+
+            _print_json(file, [unreadable(each) for each in error.problems], {})
+            return 2
     if as_json:
-        _print_json(str(given.path), found, numbers)
+        _print_json(verdict.path, verdict.findings, verdict.figures or {})
     else:
-        _print_table(given, found, numbers)
+        _print_table(verdict)
     if fix and not as_json:
         _print_fitting(analysed)
     if plot is not None:
         _draw(analysed, plot)
-    return 1 if any(each.severity == "error" for each in found) else 0
+    return 1 if any(each.severity == "error" for each in verdict.findings) else 0
+
+
+def _examined(file: str, settings: Sequence[str], kept: KeptVerdict) -> tuple[Verdict, dict[str, Analysis]]:
+    """Verdict on a file, which is kept, and what is known of each case; raises DocumentError."""
+    from experiments.check.check import analyses, examine
+    from experiments.check.kept import Verdict
+    from experiments.file import document
+
+    given = document.read(file, settings)
+    analysed = analyses(given)
+    verdict = Verdict(str(given.path), given.experiment.title, *examine(given, analysed))
+    kept.keep(verdict)
+    return verdict, analysed
 
 
 def _print_fitting(analysed: Mapping[str, Analysis]) -> None:
@@ -207,20 +222,20 @@ def _print_json(file: str, found: Sequence[Finding], numbers: Mapping[str, Figur
     print_json({"file": file, "ok": ok, "findings": found, "figures": numbers})
 
 
-def _print_table(given: Document, found: Sequence[Finding], numbers: Mapping[str, Figures]) -> None:
+def _print_table(verdict: Verdict) -> None:
     from experiments.check.findings import MARK
 
     width = _width()
-    lines = [f"{given.path}: {given.experiment.title}", ""]
-    for each in found:
+    lines = [f"{verdict.path}: {verdict.title}", ""]
+    for each in verdict.findings:
         lines += textwrap.wrap(each.message, width, initial_indent=f"{MARK[each.severity]} ", subsequent_indent="  ")
         if each.severity != "note":
             remedy = f"{each.where}: {each.remedy}" if each.where else each.remedy
             lines += textwrap.wrap(
                 remedy, width, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False
             )
-    lines += ["", *_rows(numbers), ""]
-    count = {severity: sum(each.severity == severity for each in found) for severity in MARK}
+    lines += ["", *_rows(verdict.figures or {}), ""]
+    count = {severity: sum(each.severity == severity for each in verdict.findings) for severity in MARK}
     lines.append(f"{_counted(count['error'], 'error')}, {_counted(count['warning'], 'warning')}")
     _print_text("\n".join(lines))
 
@@ -274,7 +289,7 @@ def _formatted(of: Figures) -> dict[str, str]:
 
 def _differs(ideal: float | None, noisy: float | None) -> bool:
     """Whether the time with noise says something else than the one without."""
-    from experiments.check.noise import DELAYED
+    from experiments.check.findings import DELAYED
 
     return noisy is not None and (ideal is None or noisy > max(DELAYED * ideal, ideal + 1.0))
 
@@ -419,7 +434,6 @@ def import_(
 def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
-    from experiments.file import catalogue
 
     plugins = {
         "Bodies": registry.BODIES,
@@ -431,14 +445,14 @@ def list_(as_json: AsJson = False) -> None:
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
     }
-    experiments = catalogue.names()
+    experiments = index.titles()
     found = {title: registry.names(group) for title, group in plugins.items()}
-    width = max(len(name) for name, _ in experiments)
+    width = max(len(name) for name in experiments)
     print_result(
-        {"experiments": [{"name": name, "title": title} for name, title in experiments]}
+        {"experiments": [{"name": name, "title": title} for name, title in experiments.items()]}
         | {title.lower().replace(" ", "_"): names for title, names in found.items()},
         "Experiments (./zenpark run NAME, ./zenpark new NAME):",
-        *(f"  {name:<{width}}  {title}" for name, title in experiments),
+        *(f"  {name:<{width}}  {title}" for name, title in experiments.items()),
         *(f"{title}: {', '.join(names)}" for title, names in found.items()),
         as_json=as_json,
     )

@@ -127,12 +127,13 @@ def _members(given: list[str]) -> tuple[dict[str, None], dict[str, list[str]]]:
     from difflib import get_close_matches
 
     from agents.network.lab import LabError
+    from experiments.catalogue import index
     from experiments.definition import mesh
-    from experiments.file import catalogue, document
+    from experiments.file import document
 
     robots: dict[str, None] = {}
     listening: dict[str, list[str]] = {}
-    names = [name for name, _ in catalogue.names()]
+    names = index.names()
     for each in given:
         if each in names or Path(each).suffix or Path(each).exists():
             for case in document.read(each).cases().values():

@@ -8,10 +8,10 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self, get_type_hints
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from tools import completion
 from tools.terminal import say
@@ -31,8 +31,50 @@ PANELS: Final = {
 }
 
 
+class _Coercion:
+    """Value of a parameter as its type; by typer's pydantic (70 ms of imports) only where it is no text already."""
+
+    def __init__(self, parameter: Any) -> None:  # noqa: ANN401 - of typer's private click
+        self._build = parameter.get_runtime_param
+
+    def itself(self) -> Self:
+        """Stands in the place of typer's `get_runtime_param`."""
+        return self
+
+    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:  # noqa: ANN401 - likewise
+        """Coerce a value; raises typer.BadParameter for one that is not of the type."""
+        several = param.multiple or param.nargs == -1
+        if value is None:
+            return () if several else None
+        wanted = param.type_descriptor.annotation
+        if wanted is str and isinstance(value, str):
+            return value
+        if wanted == list[str] and isinstance(value, list | tuple):
+            return list(value)
+        return self._build().coerce(value, param=param, ctx=ctx)
+
+
+def _quick(parameters: list[Any]) -> list[Any]:
+    for each in parameters:
+        if "get_runtime_param" not in vars(each):
+            each.get_runtime_param = _Coercion(each).itself
+    return parameters
+
+
+class Command(TyperCommand):
+    """A command that imports pydantic for numbers and paths alone."""
+
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - of typer's private click
+        """Parameters, that of help included."""
+        return _quick(super().get_params(ctx))
+
+
 class Group(TyperGroup):
     """Commands of one subject; help shows the whole first sentence of each, those of zenpark itself in panels."""
+
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - of typer's private click
+        """Options of the group itself."""
+        return _quick(super().get_params(ctx))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - of typer's private click
         """Write the commands into the help."""
@@ -107,7 +149,9 @@ Bodies = Annotated[
     ),
 ]
 Here = Annotated[bool, typer.Option("--here", help="All robots on this machine, whatever [hosts] says.")]
-Report = Annotated[bool, typer.Option(help="Writes the report.")]
+Report = Annotated[
+    bool, typer.Option(help="Writes the report; `./zenpark report FOLDER --pdf` adds its figures as PDF.")
+]
 Anyway = Annotated[bool, typer.Option("--anyway", help="Runs it although the check finds errors.")]
 OpenReport = Annotated[bool, typer.Option("--open", help="Opens it in the browser.")]
 

@@ -46,6 +46,7 @@ def report(
     width: Annotated[
         float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
     as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs) instead.")] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     metrics: Annotated[
@@ -63,9 +64,11 @@ def report(
 
     if metrics and not (as_latex or as_markdown):
         raise refusal("--metrics", "chooses numbers of a printed table", "add --latex or --markdown")
+    if pdf and (as_latex or as_markdown):
+        raise refusal("--pdf", "writes figures", "leave out --latex or --markdown")
     if len(runs) == 1 and (Path(runs[0]) / SWEEP).is_file():
         form = partial(typeset.latex, width=width) if as_latex else typeset.markdown if as_markdown else None
-        return _report_sweep(Path(runs[0]), out, width, metrics, form, as_json=as_json)
+        return _report_sweep(Path(runs[0]), out, width, metrics, form, pdf=pdf, as_json=as_json)
     labels = label or [chr(ord("A") + k) if k < 26 else f"{k + 1}" for k in range(len(runs))]
     if len(labels) != len(runs):
         message = f"{len(labels)} labels for {len(runs)} runs"
@@ -77,6 +80,8 @@ def report(
     own = runs[0]
     if pool and len(runs) > 1:
         read, labels, own = [_pooled(runs, read)], labels[:1], f"{Path(own)}-pooled"
+    if pdf and len(read) > 1:
+        raise refusal("--pdf", "writes the figures of one run", "report each run by itself, or pool them (--pool)")
     named = [
         (name, [case for each in seeds for case in each.metrics.values()])
         for name, seeds in zip(labels, read, strict=True)
@@ -91,7 +96,7 @@ def report(
     try:
         if len(read) == 1:
             write_figures_of_merit(read[0], target)
-            page = write_report(read[0], target, width)
+            page = write_report(read[0], target, width, pdf=pdf)
         else:
             titles = "; ".join(dict.fromkeys(seeds[0].title for seeds in read))
             page = pages.compare(target, named, source=titles, differences=_differences(labels, runs))
@@ -129,6 +134,7 @@ def _report_sweep(
     metrics: str | None,
     form: Callable[[Sequence[Table]], str] | None,
     *,
+    pdf: bool,
     as_json: bool,
 ) -> int:
     """The table of a sweep for a paper in some form, or its figures anew, so wide [in]."""
@@ -154,7 +160,7 @@ def _report_sweep(
             raise RecordingError(f"{folder}: a search of another version; make it again") from None
         rows = [*(row for row in rows if row.reference), *tried]
     target = Path(out or folder)
-    pages.pictures(target, rows, joined=not searched, width=width)
+    pages.pictures(target, rows, joined=not searched, width=width, pdf=pdf)
     figures = target / "figures"
     print_result({"figures": figures, "cells": len(rows)}, str(figures), as_json=as_json)
     return 0
@@ -396,7 +402,7 @@ def summary(runs: Sequence[Run]) -> dict[str, Any]:
     return found | ({"across": across_seeds([each.summary() for each in runs])} if len(runs) > 1 else {})
 
 
-def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
+def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: bool = False) -> Path:
     """Write figures and report of a run into its folder; return the report.
 
     Of seeds that are not recorded the figure of errors is drawn from the table that the run has left beside it.
@@ -415,7 +421,7 @@ def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5) -> Path:
     drawn = figures.every(every, traces, width, bands)
     stays = [] if of_all else ["errors"]  # the one that is there is of all seeds
     drawings = {
-        name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name)[0].read_text("utf-8")
+        name: style.svg(figure) if name in stays else style.save(figure, folder / "figures", name, pdf=pdf)
         for name, figure in drawn.items()
     }
     if len(runs) > 1 and of_all:

@@ -36,6 +36,7 @@ from tools.commands.results import summary, write_figures_of_merit, write_report
 from tools.terminal import say
 
 if TYPE_CHECKING:
+    from experiments.check.kept import KeptVerdict
     from experiments.file.document import Document
     from experiments.metrics.results import CaseMetrics
     from experiments.real_time.conductor.conduct import RunOptions
@@ -132,15 +133,17 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         former: Folder with the same run, with which results in virtual time are compared.
         bundle: Archive from which it comes.
     """
+    from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.recording.cleaning import using
     from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
     from experiments.report import verdict
 
+    kept = KeptVerdict(origin.file, origin.changes, options.cases)
     read = load(origin.file, *origin.changes)
     check_folder(show.out)
     _refuse(options, show, virtual=origin.virtual, seeds=origin.seeds)
-    if not sound(read, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
+    if not sound(read, kept, options.cases, seeds=origin.seeds, as_json=show.as_json, anyway=origin.anyway):
         return 2
     if not origin.virtual:
         from experiments.real_time.conductor.conduct import embody
@@ -336,11 +339,14 @@ def _refuse(options: RunOptions, show: _Shown, *, virtual: bool, seeds: int) -> 
             raise refusal("--seeds", "one run is viewed", "leave out --view or --seeds")
 
 
-def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool) -> bool:
+def sound(
+    read: Document, kept: KeptVerdict, cases: Sequence[str] = (), *, seeds: int, as_json: bool, anyway: bool
+) -> bool:
     """Print the warnings and errors of the check of a run of so many seeds; False if errors keep it from being run.
 
     Args:
         read: The experiment.
+        kept: What an earlier check said of it.
         cases: Names of the cases to be run; all if none is named.
         seeds: How many are run.
         as_json: Whether errors that keep it from being run are on standard output as JSON too.
@@ -349,9 +355,16 @@ def sound(read: Document, cases: Sequence[str] = (), *, seeds: int, as_json: boo
     Raises:
         DocumentError: If there is no such case.
     """
-    from experiments.check.check import NOT_RANDOM, check
+    from experiments.check.findings import NOT_RANDOM
+    from experiments.check.kept import Verdict
 
-    found = [finding for finding in check(read, cases) if finding.severity != "note"]
+    verdict = kept.read()
+    if verdict is None:
+        from experiments.check.check import check
+
+        verdict = Verdict(str(read.path), read.experiment.title, check(read, cases), None)
+        kept.keep(verdict)
+    found = [finding for finding in verdict.findings if finding.severity != "note"]
     if seeds == 1:
         found = [finding for finding in found if finding.code != NOT_RANDOM]
     say(*map(str, found), to=sys.stderr)

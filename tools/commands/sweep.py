@@ -71,12 +71,14 @@ def sweep(
     open_report: OpenReport = False,
 ) -> int:
     """Run cases x values x seeds in virtual time on all cores; finished runs are never repeated."""
+    from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
     from experiments.sweep import table as tables
     from tools.commands.run import sound
 
     changes = settings or []
-    if not sound(load(file, *changes), seeds=2, as_json=as_json, anyway=anyway):
+    kept = KeptVerdict(file, changes)
+    if not sound(load(file, *changes), kept, seeds=2, as_json=as_json, anyway=anyway):
         return 2
     options = {"settings": changes, "cases": case or [], "out": out, "scheduler": scheduler, "processes": processes}
     if optimize is None:

@@ -128,7 +128,6 @@ class Conductor(CaseRun):
                     self._leave_behind(name, "its process hung after the landing, and was killed")
         except RunFailed as failure:
             self._progress.phase = str(failure).partition(";")[0]  # ending the others takes a while: show it now
-            self._progress.events.append(messages.Event(self._clock.utc(), "failed", "conductor", self._progress.phase))
             self._show(self._progress)
             raise
         finally:
@@ -385,8 +384,10 @@ class Conductor(CaseRun):
     def _start_failure(self, names: Sequence[str], what: str) -> str:
         lines = [f"{', '.join(names)}: {what}; nothing has moved or all have landed"]
         for name in names:
-            last = self._processes.last_line(name)
-            lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))
+            gone = self._robots[name].gone  # then the event of its end has told the last line of its output
+            if not gone or self._robots[name].status is not None:
+                last = "" if gone else self._processes.last_line(name)
+                lines.append(f"  {name}: {self._reason(name)}" + (f"\n    {last}" if last else ""))
         ended = all(self._robots[name].gone for name in names)
         remedy = "mend that" if ended else "mend that, give them more time with start.deadline_s"
         lines.append(f"  {remedy}, or go on without them with start.missing = 'go-on'")

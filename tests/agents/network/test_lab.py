@@ -1,22 +1,27 @@
+from contextlib import ExitStack, contextmanager
 from threading import Event, Thread
 
 import pytest
 import zenoh
+from zenoh.handlers import FifoChannel
 
-from agents.network import lab
+from agents.network import lab, messages
 from agents.network.access_control import Grant, Rights
 from agents.network.endpoints import EndpointError, free_endpoint
+from agents.network.keys import Keys
 from agents.network.lab import LabError, bare, files, lab_of, options, register, require, secured
-from agents.network.session import connected
+from agents.network.session import connected, tokens_present
 from agents.network.shutdown import leave
 from agents.network.zenoh_config import config, settings
-from agents.runtime.router import serve_router
+from agents.runtime.router import MOST_TOKENS, serve_router
 from tools.commands import authority
+
+KEYS = Keys()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    made = tmp_path_factory.mktemp("labs") / "our lab #1; a=b"  # nothing in it may mean anything to Zenoh
+    made = tmp_path_factory.mktemp("labs") / "our lab #1, a=b"  # nothing in it may mean anything to Zenoh
     authority.create(made, {"router": "router", "operator": "operator", "CF01": "robot"})
     return made
 
@@ -29,6 +34,15 @@ def test_endpoints_carry_their_lab(folder):
     assert lab_of(made) == folder
     assert options(made[0]) == f"--connect tls/127.0.0.1:7447 --lab {folder}"
     assert options("tcp/127.0.0.1:7447") == "--connect tcp/127.0.0.1:7447"
+
+
+@pytest.mark.parametrize("character", [";", "?", "\n"])
+def test_lab_path_with_reserved_character_is_refused(tmp_path, character):
+    unusable = tmp_path / f"our{character}lab"
+    for use in (lambda: secured([], unusable), lambda: authority.create(unusable, {"router": "router"})):
+        with pytest.raises(LabError, match=r"rename or move the folder"):
+            use()
+    assert not unusable.exists()
 
 
 def test_without_endpoints_a_lab_is_on_this_machine(folder):
@@ -119,35 +133,87 @@ def test_an_id_belongs_to_one_certificate():
 @pytest.mark.system
 def test_a_thief_of_an_id_keeps_nobody_out(tmp_path, eventually):
     """The thief comes first, as at a restart of the router, and again and again."""
-    folder = tmp_path / "lab"
-    authority.create(folder, {"router": "router", "operator": "operator", "CF01": "robot"})
+    with routing(tmp_path / "lab") as endpoint:
+        zid = lab.session_id("CF01")
+        thief, owner = (client(endpoint, name, id=zid) for name in ("operator", "CF01"))
+        opened = {}
+
+        def let_in(name, chosen):
+            try:
+                opened[name] = zenoh.open(chosen)
+            except zenoh.ZError:  # the thief may be disconnected before it is in
+                return False
+            return True
+
+        let_in("thief", thief)
+        try:
+            eventually(lambda: let_in("owner", owner))
+            eventually(lambda: connected(opened["owner"]) and not ("thief" in opened and connected(opened["thief"])))
+        finally:
+            for session in opened.values():
+                leave(session)
+
+
+@contextmanager
+def routing(folder):
+    """The endpoint of the router of a new lab with the robots CF01 and KH01."""
+    authority.create(folder, {"router": "router", "operator": "operator", "CF01": "robot", "KH01": "robot"})
     (endpoint,) = secured([free_endpoint(preferred_port=0, protocol="tls")], folder)
-    rights, stop, ready = Rights("park", {"CF01": Grant(publish=["park/CF01/**"])}, {}), Event(), Event()
+    own = {name: Grant([f"park/{name}/**"], tokens=KEYS.owner_tokens(KEYS.alive(name))) for name in ("CF01", "KH01")}
+    rights = Rights("park", own, {"operator": Grant(subscribe=["park/**"], watch=["park/**"])})
+    stop, ready = Event(), Event()
     router = Thread(
         target=serve_router, args=([endpoint], stop), kwargs={"rights": rights, "ready": lambda _: ready.set()}
     )
     router.start()
-    assert ready.wait(30.0)
-    zid = lab.session_id("CF01")
-    made = [
-        config({**settings("client", connect=[endpoint], name=name, identity=name), "id": zid})
-        for name in ("operator", "CF01")
-    ]
-    thief = zenoh.open(made[0])
-    opened = []
-
-    def let_in():
-        try:
-            opened.append(zenoh.open(made[1]))
-        except zenoh.ZError:
-            return False
-        return True
-
     try:
-        eventually(let_in)
-        eventually(lambda: connected(opened[0]) and not connected(thief))
+        assert ready.wait(30.0)
+        yield endpoint
     finally:
-        for session in (thief, *opened):
-            leave(session)
         stop.set()
         router.join()
+
+
+def client(endpoint, name, **more):
+    return config({**settings("client", connect=[endpoint], name=name, identity=name), **more})
+
+
+CF01 = KEYS.alive("CF01")
+OTHERS = KEYS.life(CF01, "f00d")
+FORGED = "holds a token of CF01 in the name of another session"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("tokens", "reason"),
+    [
+        pytest.param(lambda _: [OTHERS], FORGED, marks=pytest.mark.mechanism("forged liveliness token")),
+        (lambda _: [KEYS.claim(CF01, KEYS.rank(1.0, "f00d"))], FORGED),
+        (lambda _: [KEYS.life(CF01, "*")], FORGED),
+        (lambda zid: [KEYS.claim(CF01, KEYS.rank(n, zid)) for n in range(MOST_TOKENS)], "more than 1000 liveliness"),
+    ],
+    ids=["life", "claim", "wildcard", "many"],
+)
+def test_router_disconnects_holder_of_forged_tokens(tmp_path, eventually, tokens, reason):
+    with routing(tmp_path / "lab") as endpoint, ExitStack() as stack:
+        forger, honest, operator = (zenoh.open(client(endpoint, name)) for name in ("CF01", "KH01", "operator"))
+        for session in (forger, honest, operator):
+            stack.callback(leave, session)
+        hazards = operator.declare_subscriber(KEYS.event, FifoChannel(16))
+        kept = [honest.liveliness().declare_token(key) for key in honest_tokens("KH01", honest)]
+        # no table has a token that the certificate does not allow
+        kept += [honest.liveliness().declare_token(key) for key in (OTHERS, CF01)]
+        declared = [*honest_tokens("CF01", forger), *tokens(str(forger.zid()))]
+        kept += [forger.liveliness().declare_token(key) for key in declared]
+        eventually(lambda: not connected(forger))
+        told = messages.decode(hazards.recv().payload.to_bytes(), messages.JSON, messages.Event)
+        assert (told.kind, told.source) == ("hazard", "router")
+        assert "certificate of CF01" in told.text
+        assert reason in told.text
+        eventually(lambda: tokens_present(operator, "park/**") == {*honest_tokens("KH01", honest)})
+        assert connected(honest)
+
+
+def honest_tokens(name, session):
+    alive, zid = KEYS.alive(name), str(session.zid())
+    return [alive, KEYS.life(alive, zid), KEYS.claim(alive, KEYS.rank(1e9, zid))]

@@ -100,7 +100,7 @@ class Session:
 
 @pytest.fixture
 def faked(monkeypatch):
-    """Makes `naming` use a table in place of a network, and its clock."""
+    """Makes `name_ownership` use a table in place of a network, and its clock."""
 
     def fake(table: Table) -> Table:
         def declared(session: Session, key: str) -> Token:

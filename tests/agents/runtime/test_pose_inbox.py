@@ -64,6 +64,12 @@ class Robot:
             self.tell(Keys.life(KEYS.alive("B"), session), gone=gone)
         self.tell(KEYS.alive("B"), gone=gone)
 
+    def begin(self, session: str | None, seq: int = 1) -> None:
+        """A process of B takes the name and sends its first pose."""
+        self.token(session)
+        self.pose(seq, 0.4, session=session)
+        self.after()
+
     def after(self, seconds: float = 0.02) -> None:
         self.neighbours.deliver(self.t, UTC)
         self.agent.goal_computer.update_links(self.t)
@@ -100,9 +106,7 @@ def test_a_pose_without_a_token_is_not_believed(robot):
 
 
 def test_a_late_sample_revives_nobody(robot):
-    robot.token("one")
-    robot.pose(1, 0.4, session="one")
-    robot.after()
+    robot.begin("one")
     robot.token("one", gone=True)
     robot.after(4.0)
     robot.pose(2, 0.5, session="one", age=2.5)
@@ -138,9 +142,7 @@ def test_a_neighbour_that_is_restarted_is_heard_at_once_whatever_its_clock_says(
 
 
 def test_a_neighbour_that_was_cut_off_is_believed_where_it_was(robot):
-    robot.token("one")
-    robot.pose(7, 0.4, session="one")
-    robot.after()
+    robot.begin("one", 7)
     robot.token("one", gone=True)
     robot.after(2.0)
     assert robot.live  # known so far to be gone for no time at all
@@ -153,9 +155,7 @@ def test_a_neighbour_that_was_cut_off_is_believed_where_it_was(robot):
 
 
 def test_a_robot_of_another_make_begins_anew_with_its_token_or_with_a_clock_that_is_set_back(robot):
-    robot.token(None)
-    robot.pose(7, 0.4, session=None)
-    robot.after()
+    robot.begin(None, 7)
     robot.token(None, gone=True)
     robot.after(1.0)
     robot.token(None)
@@ -171,9 +171,7 @@ def test_a_robot_of_another_make_begins_anew_with_its_token_or_with_a_clock_that
 
 
 def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
-    robot.token("one")
-    robot.pose(1, 0.4, session="one")
-    robot.after()
+    robot.begin("one")
     for source in ("other", None):  # another process, or a tool that puts old poses again
         robot.pose(9, 3.0, session=source)
         robot.pose(10, 3.0, session=source, age=100.0)
@@ -182,9 +180,7 @@ def test_no_other_session_speaks_for_a_robot_whose_token_is_there(robot):
 
 
 def test_superseded_session_is_heard_again(robot):
-    robot.token("one")
-    robot.pose(7, 0.4, session="one")
-    robot.after()
+    robot.begin("one", 7)
     robot.token("one", gone=True)  # it stands still
     robot.after(2.0)
     robot.token("two")  # a second process of its name comes,
@@ -273,9 +269,7 @@ def test_cached_pose_of_the_session_is_kept(robot):
 
 
 def test_after_reconnection_tokens_may_come_in_any_order(robot):
-    robot.token("one")
-    robot.pose(7, 0.4, session="one")
-    robot.after()
+    robot.begin("one", 7)
     robot.token("one", gone=True)
     robot.after()
     robot.tell(KEYS.alive("B"))
@@ -288,9 +282,7 @@ def test_after_reconnection_tokens_may_come_in_any_order(robot):
 
 
 def test_new_process_is_heard_although_its_token_comes_later(robot):
-    robot.token("one")
-    robot.pose(7, 0.4, session="one")
-    robot.after()
+    robot.begin("one", 7)
     robot.token("one", gone=True)  # the router dies; meanwhile B is restarted
     robot.after(3.0)
     robot.pose(1, 0.6, session="two")
@@ -301,9 +293,7 @@ def test_new_process_is_heard_although_its_token_comes_later(robot):
 
 
 def test_robot_of_another_make_may_take_the_name(robot):
-    robot.token("one")
-    robot.pose(7, 0.4, session="one")
-    robot.after()
+    robot.begin("one", 7)
     robot.token("one", gone=True)
     robot.after(3.0)
     robot.token(None)
@@ -314,9 +304,7 @@ def test_robot_of_another_make_may_take_the_name(robot):
 
 @pytest.mark.parametrize("sends", [True, False])
 def test_neighbour_whose_poses_are_all_refused_is_lost(robot, sends):
-    robot.token("one")
-    robot.pose(1, 0.4, session="one")
-    robot.after()
+    robot.begin("one")
     for seq in range(2, 72):
         if sends:
             robot.pose(seq, 0.4, session="one", age=-8.0)  # this process, or that one, has a wrong clock
@@ -456,9 +444,7 @@ def test_a_pose_that_is_stamped_ahead_was_measured_when_it_arrived(robot, ahead)
 
 
 def test_replay_on_the_key_is_a_hazard_with_its_number(robot):
-    robot.token("one")
-    robot.pose(1, 0.4, session="one")
-    robot.after()
+    robot.begin("one")
     robot.pose(9000, 3.0, session=None, age=100.0)
     robot.after()
     assert hazards(robot) == ["FOREIGN: 1 poses of B came from another source, and were not used"]

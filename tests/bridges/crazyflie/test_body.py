@@ -27,7 +27,7 @@ SWEEP = "{phase: 0.1, tilt: 0.02, curve: 0.0, gibmag: 0.0, gibphase: 1.0, ogeema
 @pytest.fixture(autouse=True)
 def toc_cache(monkeypatch, tmp_path_factory):
     """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 def lighthouse_file(folder: Path, *numbers: int) -> str:

@@ -25,7 +25,7 @@ SINKS = 0.5  # [m/s] a landing is slower, a fall from this height six times as f
 @pytest.fixture(autouse=True)
 def toc_cache(monkeypatch, tmp_path_factory):
     """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
     if link._KNOWN_TABLES:
         return
     with Served(CrazyflieTwin, request("crazyflie", ["x"])) as twin:  # over UDP a thousand entries are read in no time
@@ -136,7 +136,7 @@ def test_nothing_is_received_any_more(begins):
         for row in range(3):
             assert z[row][t > 3.0].max() < HEIGHT - 0.1, "a hover without command"
             landed = t[np.flatnonzero(z[row] == 0.0)[0]]
-            assert z[row][t > landed].max() == 0.0, "lifted again"
+            assert z[row][t > landed].max() < 1e-3, "lifted again"
         assert descent.fastest.max() < SINKS
         assert not any(supervised(twin, row) == State.LOCKED for row in range(3))
         assert not twin.device.flock.quadrotor.flying[:2].any()
@@ -317,7 +317,7 @@ def test_recovery_from_a_crash_is_asked_for():
 @pytest.mark.timeout(120)
 def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
     """Connected from a cold cache, taken off, led and landed; no command is refused. `test_budget` has the ages."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(link, "_KNOWN_TABLES", {})
     rows = 8
     with flown(rows=rows, device=RADIO | {"stream_hz": 5.0}) as (twin, process):

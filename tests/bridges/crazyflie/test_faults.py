@@ -29,7 +29,7 @@ RADIO = "radio://0/80/2M/E7E7E7E70{}"
 @pytest.fixture(autouse=True)
 def toc_cache(monkeypatch, tmp_path_factory):
     """cflib's cache, kept from one test to the next and away from the user's."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.mark.system

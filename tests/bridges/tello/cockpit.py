@@ -48,11 +48,15 @@ class Cockpit:
             self.pilot.step(self.now, self.now if self.attended else 100.0)
         return self
 
+    def take_off(self, height, *, at=(0.0, 0.0, 0.0), rested_s=0.2):
+        """Order a take-off to `height` [m] at a position, after a rest on the ground."""
+        self.pass_(rested_s)
+        self.pilot.position = at
+        self.pilot.take_off(height, self.now)
+
     def fly(self):
         """In the air, at its place, its motors' clock running."""
-        self.pass_(0.2)
-        self.pilot.position = (1.0, 2.0, 0.0)
-        self.pilot.take_off(0.6, self.now)
+        self.take_off(0.6, at=(1.0, 2.0, 0.0))
         self.pass_(3.0, h=80, time=3)
         self.drone.responses.append(b"ok")
         self.pass_(0.05)

@@ -107,9 +107,7 @@ def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before():
     assert drone.sticks == [(0, 0, 0, 0)]
     assert (pilot.duty, drone.said[-1]) == (Duty.LAND, "land")
     rising = Cockpit()
-    rising.pass_(0.2)
-    rising.pilot.position = (1.0, 2.0, 0.0)
-    rising.pilot.take_off(0.6, rising.now)
+    rising.take_off(0.6, at=(1.0, 2.0, 0.0))
     rising.drone.said.clear()
     rising.pilot.step(rising.now + 8.0, rising.now)
     assert rising.drone.said == ["land"]
@@ -165,9 +163,7 @@ def test_the_sticks_keep_it_alive():
 @pytest.mark.parametrize("answer", [b"error", b"out of range", b"unknown command: takeoff"])
 def test_a_drone_that_refuses_says_so(answer):
     cockpit = Cockpit()
-    cockpit.pass_(0.2)
-    cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.take_off(0.6, cockpit.now)
+    cockpit.take_off(0.6)
     cockpit.drone.responses.append(answer)
     cockpit.pass_(0.1)
     assert cockpit.pilot.duty is Duty.REST
@@ -194,9 +190,7 @@ def test_lost_answers_and_lost_commands():
 
 def test_a_second_take_off_that_is_refused_means_that_it_flies():
     cockpit = Cockpit()
-    cockpit.pass_(0.2)
-    cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.take_off(0.6, cockpit.now)
+    cockpit.take_off(0.6)
     cockpit.pass_(2.0, h=80)
     cockpit.drone.responses.append(b"error")
     cockpit.pass_(0.1)
@@ -205,9 +199,7 @@ def test_a_second_take_off_that_is_refused_means_that_it_flies():
 
 def test_a_drone_that_never_gets_up_is_landed():
     cockpit = Cockpit()
-    cockpit.pass_(0.2)
-    cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.take_off(0.6, cockpit.now)
+    cockpit.take_off(0.6)
     cockpit.pass_(20.2)
     assert cockpit.drone.said[-1] == "land"
     cockpit.pass_(1.2)  # it may have obeyed the last of the orders to take off, 3 s ago
@@ -272,9 +264,7 @@ def test_a_drone_that_stands_answers_a_stop_at_once():
 
 def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
     cockpit = Cockpit()
-    cockpit.pass_(5.0)
-    cockpit.pilot.position = (1.0, 2.0, 0.0)
-    cockpit.pilot.take_off(0.6, cockpit.now)
+    cockpit.take_off(0.6, at=(1.0, 2.0, 0.0), rested_s=5.0)
     cockpit.pass_(0.1)
     cockpit.pilot.cut(cockpit.now)  # its motors' clock has not moved yet
     cockpit.pass_(1.4)

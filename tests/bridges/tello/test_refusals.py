@@ -45,9 +45,7 @@ class Climber(Cockpit):
 
 def test_refused_landing_is_repeated_until_down():
     climber = Climber()
-    climber.fly_on(5.0)
-    climber.pilot.position = (0.0, 0.0, 0.0)
-    climber.pilot.take_off(0.8, climber.now)
+    climber.take_off(0.8, rested_s=5.0)
     climber.fly_on(0.7)
     climber.pilot.land(climber.now, "told to land")
     climber.fly_on(0.3)
@@ -62,9 +60,7 @@ def test_refused_landing_is_repeated_until_down():
 def test_landing_before_the_motors_start_is_repeated():
     """A drone that rested for long and has just been told to take off is not on the ground for that."""
     cockpit = Cockpit()
-    cockpit.pass_(10.0)
-    cockpit.pilot.position = (0.0, 0.0, 0.0)
-    cockpit.pilot.take_off(0.8, cockpit.now)
+    cockpit.take_off(0.8, rested_s=10.0)
     cockpit.pass_(0.1)
     cockpit.pilot.land(cockpit.now)
     cockpit.drone.responses.append(b"ok")  # of anything but a landing: no drone is down again so soon
@@ -109,9 +105,7 @@ def test_height_of_motion_capture_counts_in_the_air():
     """A drone without a counter of motor seconds whose own height stays at zero."""
     cockpit = Cockpit()
     del cockpit.report["time"]
-    cockpit.pass_(0.2)
-    cockpit.pilot.position = (0.0, 0.0, 0.05)
-    cockpit.pilot.take_off(1.0, cockpit.now)
+    cockpit.take_off(1.0, at=(0.0, 0.0, 0.05))
     cockpit.pass_(3.0)
     cockpit.drone.responses.append(b"ok")
     cockpit.pilot.position = (0.0, 0.0, 1.0)

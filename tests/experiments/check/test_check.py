@@ -17,7 +17,8 @@ from agents.arrays import norm
 from agents.decision.position_control import REACHED
 from agents.plugins import registry
 from experiments.check.analysis import analyse
-from experiments.check.check import Figures, check, examine, figures
+from experiments.check.check import check, examine, figures
+from experiments.check.findings import Figures
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot

@@ -240,6 +240,23 @@ def test_a_robot_at_the_wall_is_held_back():
     assert found["near-wall"].startswith("A comes within the margin of 0.05 m of a wall at 32.")
 
 
+@pytest.mark.parametrize(("hover", "top", "warned"), [(1.0, 1.05, True), (0.94, 1.05, False), (2.4, 2.5, True)])
+def test_overshoot_above_the_arena(hover, top, warned):
+    """A Crazyflie overshoots its take-off by up to 11 %."""
+    made = Experiment(
+        title="Low",
+        robots={"F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=hover)},
+        arena=Arena(size=(4.0, 4.0, top)),
+        duration_s=5.0,
+    )
+    found = {each.code: each for each in check(of(made))}
+    assert ("overshoots-arena" in found) == warned
+    if warned:
+        assert found["overshoots-arena"].severity == "warning"
+        assert f"to {1.11 * hover:.2f} m" in found["overshoots-arena"].message
+        assert f"hover at {int(100 * top / 1.11) / 100:g} m at most" in found["overshoots-arena"].remedy
+
+
 def test_a_plan_for_ever_is_not_cut_off():
     plan = {"kind": "circle", "radius": 0.5, "period_s": 40.0}
     assert ground({}, timeline=[Leg(at_s=1.0, robot="D", plan=plan)]) == {}

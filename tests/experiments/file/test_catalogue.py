@@ -27,7 +27,7 @@ PARK = index.FOLDER / "robotic-park.toml"
 
 
 def test_names_and_titles():
-    found = dict(entries.names())
+    found = index.titles()
     assert list(found) == sorted(found)
     assert {"convoy", "robotic-park", "triangle"} <= set(found)
     assert found["robotic-park"] == tomllib.loads(PARK.read_text("utf-8"))["title"]

@@ -14,7 +14,7 @@ from agents.network.messages import Event
 from experiments.definition.experiment import Anchor
 from experiments.metrics import measure, statistics
 from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics
-from experiments.metrics.signals import formation_errors, net_rotation
+from experiments.metrics.signals import belief_errors, formation_errors, net_rotation
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files, verdict
 from tests.experiments.traces import STEP, cut, experiment, pair, park, trace
@@ -50,6 +50,33 @@ def test_acquired_when_the_one_second_mean_stays_inside():
     # a window of 50 samples lags 24.5 of them: 1 − 0.0625 (t − 0.49) = 0.05
     assert follower(measured).acquired_s == pytest.approx(15.69, abs=STEP)
     assert measured.acquired_s == (follower(measured).acquired_s,)
+
+
+def test_foreign_poses_are_named_in_the_verdict():
+    clean = pair(np.ones_like(T))
+    assert not any("other sessions" in each.text for each in verdict.findings([measure.measure(clean)]))
+    forged = np.zeros(len(clean.robots), dtype=np.intp)
+    forged[clean.robots.index("F")] = 12
+    measured = measure.measure(dataclasses.replace(clean, foreign=forged))
+    assert {robot.robot: robot.foreign for robot in measured.robots} == {"F": 12, "L": 0}
+    (found,) = [each for each in verdict.findings([measured]) if "other sessions" in each.text]
+    assert found.mark == "bad"
+    assert "12 of F" in found.text
+
+
+def test_belief_before_the_first_pose_is_no_error():
+    known = pair(np.ones_like(T), sent={"L": np.arange(0.0, 20.0, 0.5)})
+    first = np.flatnonzero(known.received.arrival >= 10.0)
+    late = dataclasses.replace(known, received=known.received.take(first))
+    net = late.plan.links
+    error = belief_errors(late, net)
+    begun = late.received.arrival.min()
+    assert np.isnan(error[late.time < begun]).all()
+    assert np.isfinite(error[late.time >= begun]).any()
+    silent = measure.measure(dataclasses.replace(known, received=known.received.take(first[:0])))
+    assert silent.belief_rms is None
+    assert silent.belief_max is None
+    assert all(each.rms is None for each in silent.belief)
 
 
 def test_never_acquired_is_none_also_in_the_mean():

@@ -10,7 +10,7 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from agents.network.messages import Event, HostClock, PoseReceipt
-from experiments.definition.experiment import Formation, Rates
+from experiments.definition.experiment import Formation, Rates, Robot
 from experiments.recording.playback import NotStarted, read
 from experiments.recording.reader import RecordingError, recover
 from experiments.scene import tracks
@@ -241,6 +241,18 @@ def test_what_the_modelled_network_dropped_is_no_loss(path):
     trace = read(path).trace
     assert trace.dropped.tolist() == [0, 7]  # TB01 listens to CF01; CF01 to TB01
     assert trace.lost.tolist() == [0, 0]
+
+
+def test_foreign_poses_count_once_for_all_receivers(path):
+    robots = {name: Robot("tello", [float(k), 0.0]) for k, name in enumerate("ABC")}
+    said = [
+        status(name, at=at, foreign={"A": count} if count else {})
+        for name, counts in (("B", (2, 5, 9)), ("C", (0, 1, 3)))
+        for at, count in zip((-0.5, 0.4, 1.0), counts, strict=True)
+    ]
+    three = msgspec.structs.replace(PAIR, robots=robots, formation=Formation(links={"A > B": 0.5, "A > C": 0.5}))
+    write(path, begun(), *(state(name) for name in robots), *said, landed(), experiment=three)
+    assert read(path).trace.foreign.tolist() == [7, 0, 0]
 
 
 def test_only_poses_of_the_run_are_sent(path):

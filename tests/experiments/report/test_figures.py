@@ -3,11 +3,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
+from collections import Counter
 
 import msgspec
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
@@ -269,10 +272,11 @@ def test_whatever_is_unknown_can_be_drawn(draw):
 
 def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path):
     figure = figures.intervals([park(duration=3.0)])
-    drawing, page = style.save(figure, tmp_path / "figures", "intervals")
-    assert drawing.read_text() == figures.svg(figures.intervals([park(duration=3.0)]))
-    assert "<text" not in drawing.read_text()
-    assert set(re.findall(r"https?://[^\"]*", drawing.read_text().split("<svg")[1])) <= {
+    page, drawing = tmp_path / "figures" / "intervals.pdf", tmp_path / "figures" / "intervals.svg"
+    text = style.save(figure, tmp_path / "figures", "intervals", pdf=True)
+    assert text == drawing.read_text() == figures.svg(figures.intervals([park(duration=3.0)]))
+    assert "<text" not in text
+    assert set(re.findall(r"https?://[^\"]*", text.split("<svg")[1])) <= {
         "http://www.w3.org/2000/svg",
         "http://www.w3.org/1999/xlink",
     }
@@ -280,6 +284,30 @@ def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path
     assert content.startswith(b"%PDF")
     assert b"/Type3" not in content
     assert b"/CreationDate" not in content
+
+
+def test_pdf_is_written_where_asked_and_kept_up_to_date(tmp_path):
+    page = tmp_path / "intervals.pdf"
+    style.save(figures.intervals([park(duration=3.0)]), tmp_path, "intervals")
+    assert not page.exists()
+    style.save(figures.intervals([park(duration=3.0)]), tmp_path, "intervals", pdf=True)
+    narrow = page.read_bytes()
+    style.save(figures.intervals([park(duration=3.0)], 7.16), tmp_path, "intervals")
+    assert page.read_bytes() != narrow
+
+
+@pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
+def test_figure_is_laid_out_once_for_both_files(draw, tmp_path, monkeypatch):
+    counted = Counter()
+    execute, drawn = ConstrainedLayoutEngine.execute, Figure.draw
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lambda *args: counted.update(["layout"]) or execute(*args))
+    monkeypatch.setattr(Figure, "draw", lambda *args: counted.update(["draw"]) or drawn(*args))
+    figure = draw([park(duration=3.0)])
+    engine = figure.get_layout_engine()
+    counted.clear()
+    style.save(figure, tmp_path, "figure", pdf=True)
+    assert counted == {"layout": 1, "draw": 2} if engine else {"draw": 2}
+    assert figure.get_layout_engine() is engine
 
 
 def test_a_picture_of_space_is_as_high_as_what_it_shows():

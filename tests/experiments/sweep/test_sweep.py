@@ -259,9 +259,7 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     page = (done.folder / "sweep.html").read_text()
     assert "./zenpark sweep triangle trigger.threshold=0.005,0.02 seeds=3 --set duration_s=4.0" in page
     assert page.count("<svg") == 2
-    assert {file.name for file in (done.folder / "figures").iterdir()} == {
-        f"pareto_{index}.{kind}" for index in ("iae", "itae") for kind in ("svg", "pdf")
-    }
+    assert {file.name for file in (done.folder / "figures").iterdir()} == {"pareto_iae.svg", "pareto_itae.svg"}
     assert typed(done.folder, AXIS, "seeds=3", as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
 

@@ -53,6 +53,19 @@ def test_a_report_made_again_keeps_the_seeds_that_are_not_recorded(three: tuple[
     assert (again / "figures/errors.csv").read_bytes() == (three[0] / "figures/errors.csv").read_bytes()
 
 
+def test_figures_are_pdf_on_demand(three: tuple[Path, str], tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(three[0], again)
+    assert not list(again.glob("figures/*.pdf"))
+    assert "./zenpark report FOLDER --pdf" in (again / "report.html").read_text()
+    assert "./zenpark report FOLDER --pdf" in " ".join(zenpark("run", "--help").split())
+    zenpark("report", str(again), "--pdf")
+    assert {file.stem for file in again.glob("figures/*.pdf")} == {file.stem for file in again.glob("figures/*.svg")}
+    for more in (["--latex"], [str(three[0])]):
+        done = CliRunner().invoke(app, ["report", str(again), *more, "--pdf"])
+        assert isinstance(done.exception, DocumentError)
+
+
 def test_without_the_errors_of_all_seeds_their_figure_stays(three: tuple[Path, str], tmp_path: Path) -> None:
     again = tmp_path / "run"
     shutil.copytree(three[0], again)
@@ -105,6 +118,9 @@ def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp
     narrow = (folder / "figures" / "pareto_iae.svg").read_text()
     assert zenpark("report", str(folder), "--width", "7.16").strip() == str(folder / "figures")
     assert (folder / "figures" / "pareto_iae.svg").read_text() != narrow
+    assert not list((folder / "figures").glob("*.pdf"))
+    zenpark("report", str(folder), "--pdf")
+    assert {file.stem for file in (folder / "figures").glob("*.pdf")} == {"pareto_iae", "pareto_itae"}
     text = zenpark("report", str(folder), "--latex")
     assert r"\caption{Cases, Two, for three seconds." in text
     assert "event & 0.05 & " in text

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from agents.arrays import Array, Mask
 from twins.models.quadrotor import GRAVITY
 
-HOVER_THRUST: Final = 36000.0  # about what a Crazyflie hovers with
 STEEPEST: Final = np.radians(20.0)  # the firmware's default limit of roll and pitch
 NEITHER: Final = (np.nan, np.nan, np.nan)
 

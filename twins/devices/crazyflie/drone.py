@@ -24,7 +24,6 @@ from agents.protocols.crtp import (
     Status,
     Toc,
 )
-from twins.devices.crazyflie.commander import HOVER_THRUST
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.logs import LogBlocks
 from twins.devices.crazyflie.memory import ANCHORS
@@ -110,7 +109,7 @@ class Drone:
                 self.values[self.parameters.number[name]] = int(deck)
         for number, value in self.stored.items():
             self.values[number] = value
-        flock.set_least_thrust(row, self.value(LEAST))
+        flock.vertical.least[row] = self.value(LEAST)
         self.logs.reset()
 
     def value(self, name: str) -> float:
@@ -250,7 +249,7 @@ class Drone:
             yaw = self.value("kalman.initialYaw") - flock.quadrotor.yaw[self.row]
             flock.estimator.reset(self.row, place - flock.place[self.row], yaw)
         elif name == LEAST:
-            flock.set_least_thrust(self.row, value)
+            flock.vertical.least[self.row] = value
         elif name == "lighthouse.systemType" and value != before:
             self.memories.clear_stations()
         elif name == "stabilizer.stop" and value:
@@ -294,7 +293,7 @@ class Drone:
         roll, pitch, turn, thrust = _numbers(crtp.THRUST, data)
         self.thrust_locked = self.thrust_locked and thrust > 0
         on = thrust >= LEAST_THRUST and not self.thrust_locked
-        climb = (min(thrust, MOST_THRUST) - HOVER_THRUST) / CLIMB_THRUST
+        climb = (min(thrust, MOST_THRUST) - self.flock.vertical.hover[self.row]) / CLIMB_THRUST
         lean = math.radians(roll), math.radians(pitch)
         self._command(on=on, velocity=(math.nan, math.nan, climb), turn=math.radians(turn), lean=lean)
 

@@ -17,6 +17,7 @@ from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import Plan, Planner
 from twins.devices.crazyflie.supervisor import Supervisor
+from twins.devices.crazyflie.vertical import VerticalLoops
 from twins.devices.device import Faults
 from twins.models.disturbance import HoverJitter, Latency, Measurement
 from twins.models.noise import Noise
@@ -88,10 +89,6 @@ SAG_V: Final = 0.3  # under the load of hovering: 2 A through 0.15 ohm
 LOW_V: Final = 3.2  # the firmware's own threshold
 LOW_S: Final = 5.0  # from the first voltage below it to the state "low"
 IMPACT: Final = 4.2  # [m/s] a robot that hits the floor faster (a fall of 0.9 m) ends on its side
-# share of the weight that the motors carry with the firmware's default of the least thrust, 20,000
-CARRIED: Final = {"crazyflie": 0.51, "brushless": 0.63}
-DEFAULT_THRUST: Final = 20000.0
-SLIDES: Final = 0.4  # share of the weight: a robot of which the motors carry more slides over the floor
 SKATING: Final = 2.0  # [m/s] largest speed of that
 TRIM: Final = np.radians([0.4, -0.3])  # roll, pitch of a robot at rest [rad]: none is exactly level
 LEANING_S: Final = 0.05  # time constant of the attitude
@@ -144,8 +141,7 @@ class Flock:
         self._speed_gain = np.array(response.velocity)
         self.estimator.error[:] = -self.quadrotor.position  # it believes to be where it was switched on,
         self.estimator.turn[:] = -self.quadrotor.yaw  # and to look along x
-        self._carried = np.array([CARRIED[each.platform] for each in settings]) / DEFAULT_THRUST
-        self._slides: Mask = self._carried * DEFAULT_THRUST > SLIDES
+        self.vertical = VerticalLoops([each.platform for each in settings], self.dt)
         self.place = self.quadrotor.position.copy()  # (N, 3) true positions [m]
         self.estimate = self.place + self.estimator.error  # (N, 3) reported positions [m]
         self.velocity = np.zeros((rows, 3))  # reported, from measured positions [m/s]
@@ -160,10 +156,6 @@ class Flock:
     def estimated_yaw(self, row: int) -> float:
         """Estimated yaw of a row [rad]."""
         return float(self.quadrotor.yaw[row] + self.estimator.turn[row])
-
-    def set_least_thrust(self, row: int, thrust: float) -> None:
-        """Set the least thrust of a row's controller, of 65,535."""
-        self._slides[row] = self._carried[row] * thrust > SLIDES
 
     @property
     def volts(self) -> Array:
@@ -253,13 +245,15 @@ class Flock:
             turn_gain=self._turn_gain,
         )
         setpoint = self._true_setpoint(setpoint)
-        quadrotor.command(self._latency.delay(setpoint) if self._latency.present else setpoint)
+        delayed = self._latency.delay(setpoint) if self._latency.present else setpoint
+        quadrotor.command(delayed)
         before, place = quadrotor.velocity, quadrotor.position.copy()
         quadrotor.advance()
+        self._climb(before, place, np.nan_to_num(delayed[:, 2] - place[:, 2]))
         if some(quadrotor.flying):
             # the controller takes what the estimate does not see of the velocity for none
-            quadrotor.velocity = quadrotor.velocity - np.where(
-                quadrotor.flying[:, None], self.dt * self._speed_gain * self.estimator.rate, 0.0
+            quadrotor.velocity[:, :2] -= np.where(
+                quadrotor.flying[:, None], self.dt * self._speed_gain[:2] * self.estimator.rate[:, :2], 0.0
             )
         self._touch_floor(before, place, setpoint)
         self._update_attitude(before)
@@ -274,6 +268,16 @@ class Flock:
         self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
         self._last_measured = measured
         return locked
+
+    def _climb(self, before: Array, place: Array, offset: Array) -> None:
+        """Move rows with motors on vertically, from `before` (N, 3) [m/s] and `place` (N, 3) [m] by `offset` (N,)."""
+        quadrotor = self.quadrotor
+        wanted = np.where(np.isnan(self.commander.target[:, 2]), self._gain[2] * offset, np.nan)
+        climb = before[:, 2] + self.estimator.rate[:, 2]
+        acceleration = self.vertical.advance(quadrotor.flying, offset, climb, wanted)
+        speed = before[:, 2] + self.dt * acceleration
+        quadrotor.velocity[:, 2] = np.where(quadrotor.flying, speed, quadrotor.velocity[:, 2])
+        quadrotor.position[:, 2] = np.where(quadrotor.flying, place[:, 2] + self.dt * speed, quadrotor.position[:, 2])
 
     def _true_setpoint(self, setpoint: Array) -> Array:
         """Setpoints (N, 4) of positions and yaws as they are flown: the controller uses the estimate, not the truth."""
@@ -297,7 +301,7 @@ class Flock:
         floor = quadrotor.position[:, 2] <= 0.0
         self.supervisor.tumbled |= floor & (before[:, 2] < -IMPACT)
         below = quadrotor.position[:, 2] < 0.0
-        sliding = below & quadrotor.flying & self._slides
+        sliding = below & quadrotor.flying & self.vertical.sliding
         wanted = np.clip(self._gain[:2] * (setpoint[:, :2] - place[:, :2]), -SKATING, SKATING)
         speed = before[:, :2] + self.dt * self._speed_gain[:2] * (wanted - before[:, :2])
         quadrotor.position[below, 2] = 0.0

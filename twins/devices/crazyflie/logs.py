@@ -13,7 +13,6 @@ import numpy as np
 from agents.arrays import Array
 from agents.protocols import crtp
 from agents.protocols.crtp import Info, Log, Status
-from twins.devices.crazyflie.commander import HOVER_THRUST
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, Table, pack
 from twins.models.quadrotor import GRAVITY
@@ -149,7 +148,7 @@ def _motion(flock: Flock, row: int) -> dict[str, Read]:
         )
 
     def thrust() -> float:
-        return HOVER_THRUST * float(force()[2]) if quadrotor.flying[row] else 0.0
+        return float(flock.vertical.thrust[row])
 
     def target() -> Array:
         return np.asarray(np.nan_to_num(flock.commander.target[row]))

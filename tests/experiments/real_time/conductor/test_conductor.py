@@ -130,3 +130,14 @@ def test_a_recorder_that_stands_still_is_killed() -> None:
     course._view.recorder_stands_still = True
     course._update()
     assert course.killed == 1
+
+
+def test_output_of_a_lost_robot_is_told_once():
+    course = Course({})
+    lost, late = list(course._robots)[:2]
+    course._processes.last_line = lambda name: f"last words of {name}"
+    course._robots[lost].left_because = "lost"
+    told = course._start_failure([lost, late], "could not start")
+    assert told.count("could not start") == 1
+    assert f"last words of {late}" in told
+    assert f"last words of {lost}" not in told  # the event of its end has them

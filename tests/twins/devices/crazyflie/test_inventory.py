@@ -68,7 +68,7 @@ def test_values_of_a_drone_that_flies():
     assert qy > 0.04
     assert abs(qx) < 0.01
     assert qw == pytest.approx(1.0, abs=0.02)
-    assert logged(wire, "motor.m1")[0] == pytest.approx(36000.0, rel=0.1)
+    assert logged(wire, "motor.m1")[0] == pytest.approx(39300.0, rel=0.01)
 
 
 # ---------------------------------------------------------------------- a lab's own tables

@@ -1,0 +1,81 @@
+"""Heights of the Crazyflie twin: figures of the maker's firmware, compiled and run on a rigid body."""
+
+import numpy as np
+import pytest
+
+from agents.protocols.crtp import Status
+from tests.twins.crazyflie_wire import DT, Wire
+
+SHARE = 0.01  # of a height: settled
+
+
+def climb(height, span, platform="crazyflie", seconds=20.0):
+    """Heights of a take-off on every tick [m]."""
+    wire = Wire({"platform": platform})
+    if platform == "brushless":
+        wire.arm()
+        wire.wait(0.6)
+    assert wire.takeoff(height, span) == Status.OK
+    return heights(wire, seconds)
+
+
+def heights(wire, seconds, each=None):
+    reached = []
+    for _ in range(round(seconds / DT)):
+        wire.wait(DT, each)
+        reached.append(wire.position[2])
+    return np.array(reached)
+
+
+@pytest.mark.parametrize("platform", ["crazyflie", "brushless"])
+@pytest.mark.parametrize(("height", "span"), [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)])
+def test_take_off_overshoots_and_returns(height, span, platform):
+    """By 7 to 11 %, for 10 to 15 s: the integral of the height was charged on the floor and on the way."""
+    reached = climb(height, span, platform)
+    assert 0.07 < reached.max() / height - 1.0 < 0.11
+    away = DT * np.flatnonzero(np.abs(reached / height - 1.0) > SHARE)[-1]
+    assert 10.0 < away < 15.0
+
+
+@pytest.mark.parametrize(("step", "rise_ms", "overshoot"), [(0.3, 566.0, 0.09), (1.0, 733.0, 0.13)])
+def test_steps_in_height(step, rise_ms, overshoot):
+    wire = Wire().hovering()
+    begin = wire.position[2]
+    reached = (heights(wire, 3.0, lambda: wire.goal(0.0, 0.0, begin + step)) - begin) / step
+    rise = 1e3 * DT * ((reached > 0.9).argmax() - (reached > 0.1).argmax())
+    assert rise == pytest.approx(rise_ms, rel=0.04)
+    assert reached.max() - 1.0 == pytest.approx(overshoot, abs=0.01)
+
+
+@pytest.mark.parametrize("wait", [1.0, 2.5, 3.3, 6.0])
+def test_landing_from_the_overshoot_ends_on_the_floor(wait):
+    """Ordered as by the bridge; the motors stop on the floor, and it does not hit it."""
+    wire = Wire()
+    wire.takeoff(1.0, 2.5)
+    wire.wait(wait)
+    wire.land(1.1 / 0.22)
+    lowest = []
+    while wire.motors:
+        lowest.append(wire.position[2])
+        wire.wait(DT)
+    assert lowest[-1] < 0.005
+    assert np.diff(lowest).min() / DT > -0.5
+
+
+def test_thrust_in_hover_carries_the_weight():
+    """29 g, and 39.3 g of a Brushless with guards, each with a deck, by the firmware's curves of thrust."""
+    assert Wire().hovering().flock.vertical.thrust == pytest.approx([39300.0], rel=0.002)
+    brushless = Wire({"platform": "brushless"})
+    brushless.arm()
+    brushless.wait(0.6)
+    assert brushless.hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
+
+
+def test_second_flight_overshoots_as_the_first():
+    """Motors off, the loops forget."""
+    wire = Wire().hovering(0.8)
+    wire.land(4.0)
+    wire.wait(9.0)
+    assert not wire.motors
+    assert wire.takeoff(0.8, 2.0) == Status.OK
+    np.testing.assert_allclose(heights(wire, 10.0), climb(0.8, 2.0, seconds=10.0), atol=1e-9)
