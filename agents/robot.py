@@ -41,11 +41,12 @@ class Robot:
     """Decision of one robot."""
 
     __slots__ = (
-        "_asked", "_blind", "_continuity", "_controller", "_decided", "_detector", "_external", "_filter",
-        "_ordered", "_origin", "_perception", "_place", "_preflight", "_status", "assignment", "avoided", "begun",
-        "changed", "decision_due", "decisions", "error", "goal", "goal_yaw", "goals", "guidance", "hazards", "health",
-        "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position", "sent_velocity", "setpoint",
-        "stops", "takes_off", "tick", "transmitter", "updates",
+        "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt", "_external",
+        "_filter", "_flies", "_ordered", "_origin", "_perception", "_place", "_pose_every", "_predicts", "_preflight",
+        "_status", "assignment", "avoided", "begun", "causes", "changed", "decision_due", "decisions", "error",
+        "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards", "health", "interventions", "keeping", "landing",
+        "lands", "lifecycle", "neighbours", "now", "sent_position", "sent_velocity", "setpoint", "stops", "takes_off",
+        "tick", "transmitter", "updates",
     )  # fmt: skip
 
     tick: int  # number of the next tick; 0 at the common start, so that robots decide together
@@ -63,6 +64,9 @@ class Robot:
     sent_velocity: Vector  # [m/s]
     decisions: int  # since the common start
     updates: int  # decisions at which the goal was computed anew; of a guided robot, received goals
+    interventions: int  # ticks on which safety changed the setpoint, from the common start on
+    evasions: int  # ticks on which avoidance did, likewise
+    causes: int  # of hazards on this tick, a bit for each
     decision_due: bool  # whether the goal is decided on this tick; known from its first half on
     begun: bool  # whether the robot has begun to run
 
@@ -82,11 +86,14 @@ class Robot:
         self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), Status()
         self._controller, self._filter = PositionController(kind), SetpointFilter(kind, limits)
         self._continuity, self._external = Continuity(kind), ExternalPositions(kind)
+        self._flies, self._predicts = kind.flies, assignment.predictor is not HOLD
+        self._decide_every, self._pose_every = assignment.decide_every, assignment.pose_every
+        self._dt = 1.0 / assignment.body_hz
         avoids = assignment.avoidance is not None and assignment.avoids
         self._perception = Perception(assignment) if avoids else None
         self.now = Situation()
         self.goal, self.goal_yaw, self.error, self.setpoint = UNKNOWN, nan, 0.0, NO_SETPOINT
-        self.tick = self.decisions = self.updates = 0
+        self.tick = self.decisions = self.updates = self.interventions = self.evasions = self.causes = 0
         self.changed = self.avoided = self.takes_off = self.lands = self.stops = False
         self.begun = self.decision_due = self._ordered = self._blind = False
         self.sent_position, self.sent_velocity, self._place = UNKNOWN, UNKNOWN, UNKNOWN
@@ -179,40 +186,63 @@ class Robot:
 
     def transmit(self, t: float, state: BodyState) -> bool:
         """First half of a tick at `t` [s]: advance the phase; returns whether the robot transmits its pose now."""
+        self.now.state = state
+        self.observe(t)
+        if t >= self.lifecycle.settled_until:
+            self._live(t)
+        return self.question(t)
+
+    def observe(self, t: float) -> None:
+        """Take the state of the body, without what jumped; quiet."""
         self.goals.update_links(t)
         life, now = self.lifecycle, self.now
-        now.take(t, state)
-        external = self._external
-        now.jump = self._continuity.jump(state.time, state.position, state.yaw, life.in_motion)
+        life.moved = self.takes_off = self.lands = self.stops = False
+        now.begin(t)
+        state = now.state
+        moves = life.climbing or AIRBORNE <= life.phase <= LANDING
+        now.jump = self._continuity.jump(state.time, state.position, state.yaw, moves)
         now.turned = self._continuity.turned
-        if external.doubted:
-            now.jump = external.jump if isnan(now.jump) else max(now.jump, external.jump)
-        if isfinite(now.jump) or external.deceived:
+        if self._external.doubted:
+            self._doubt()
+        if now.jump == now.jump:
             now.position = UNKNOWN
         self._filter.judge(now)
+
+    def _doubt(self) -> None:
+        """Its external positions jumped, or deceive."""
+        now, external = self.now, self._external
+        now.jump = external.jump if isnan(now.jump) else max(now.jump, external.jump)
+        if external.deceived:
+            now.position = UNKNOWN
+
+    def _live(self, t: float) -> None:
+        """Advance the phase, with what follows; not while the robot runs, and goes on."""
+        life, now = self.lifecycle, self.now
         ready = life.phase <= READY and self._ready()
-        life.advance(t, now.position, now.velocity, flying=state.flying, ready=ready)
+        life.advance(t, now.position, now.velocity, flying=now.state.flying, ready=ready)
         self._take_commands()
         if life.moved and not self.begun and life.phase == RUNNING:
             self._decided = self._asked = -1
             # 0, unless it joins a run under way
             self.begun, self.tick = True, round((t - life.start_at) * self.assignment.body_hz)
+
+    def question(self, t: float) -> bool:
+        """Whether the robot transmits its pose now; quiet."""
         # by number, not by remainder: a decision due on a skipped tick is made on the next one
-        decision, question = self.tick // self.assignment.decide_every, self.tick // self.assignment.pose_every
+        decision, question = self.tick // self._decide_every, self.tick // self._pose_every
         self.decision_due, self._decided = decision != self._decided, decision
         if question == self._asked:
             return False
         self._asked = question
-        goals, transmitter = self.goals, self.transmitter
+        goals, transmitter, now = self.goals, self.transmitter, self.now
         goals.errors(t, now.position)
         self.error = nan if now.invalid else goals.error
         due = transmitter.transmits(
-            t, now.position, now.velocity,
-            error=self.error, energy=goals.energy, since_start=max(t - life.start_at, 0.0), offset=goals.offset,
-            setpoint=self.setpoint,
+            t, now.position, now.velocity, self.error, goals.energy, max(t - self.lifecycle.start_at, 0.0),
+            goals.offset, self.setpoint,
         )  # fmt: skip
         self.sent_position, self.sent_velocity = transmitter.position, transmitter.velocity
-        if self.assignment.predictor is not HOLD:
+        if self._predicts:
             due = self._stands_blind() or due
         return due
 
@@ -241,11 +271,29 @@ class Robot:
 
     def act(self, t: float) -> None:
         """Second half of the tick at `t` [s]: goal, setpoint and commands."""
-        life, now, landing = self.lifecycle, self.now, self.landing
-        causes = self._causes(t)
-        troubled = causes != 0 or self.hazards.under_way
+        troubled = self.detect(t)
         if troubled:
-            self._apply_hazards(causes)
+            self._apply_hazards(self.causes)
+        self.pursue(t, troubled)
+
+    def detect(self, t: float) -> bool:
+        """Find the causes of hazards on this tick; returns whether there are any, or hazards under way. Quiet."""
+        life, status, guidance = self.lifecycle, self._status, self.guidance
+        phase = life.phase
+        status.ordered, status.setpoint, status.not_finite = self._ordered, self.setpoint, self._filter.not_finite
+        status.goal_height, status.aside = self.goal[2], self.landing.aside
+        status.cruising, status.climbing = AIRBORNE <= phase <= RUNNING, life.climbing
+        status.landing = phase == LANDING
+        status.unstarted = life.start_at == inf and (life.climbing or phase == AIRBORNE)
+        status.alone = self.neighbours.incomplete and self.goals.without_neighbours()
+        if guidance is not None:
+            status.unguided, status.goal_stamp = phase == RUNNING and guidance.unguided(t), guidance.stamp
+        self.causes = self._detector.causes(self.now, status, self.neighbours, self.health)
+        return self.causes != 0 or self.hazards.under_way
+
+    def pursue(self, t: float, troubled: bool) -> None:
+        """Goal and setpoint of this tick; quiet."""
+        life, now, landing = self.lifecycle, self.now, self.landing
         if self.decision_due:
             self._decide(t)
         elif life.moved or troubled:
@@ -253,30 +301,32 @@ class Robot:
             held = life.phase == RUNNING and self.hazards.held
             self._stay(held or self.keeping.held or life.phase == AIRBORNE)
         if self.guidance is not None:
-            self._follow(self.guidance)
+            self._follow()
         goal = landing.place if landing.aside else self.goal
         self.avoided = False
-        if self._perception is None:
+        if self._perception is not None:
+            setpoint = self._avoid(t, goal)
+        else:
             setpoint = self._controller.setpoint(goal, self.goal_yaw, now.position, now.yaw)
             setpoint = self._filter.limit(setpoint, now)
-        else:
-            setpoint = self._avoid(self._perception, t, goal)
         self.changed = self._filter.changed
-        if life.phase != RUNNING and life.phase != AIRBORNE and not landing.aside:
-            setpoint = NO_SETPOINT if self.assignment.kind.flies else HALT
+        if not (AIRBORNE <= life.phase <= RUNNING or landing.aside):
+            setpoint = NO_SETPOINT if self._flies else HALT
             self.changed = self.avoided = self._filter.not_finite = False
         self.tick, self.setpoint = self.tick + 1, setpoint
+        if self.begun:
+            self.interventions += self.changed
+            self.evasions += self.avoided
 
-    def _avoid(self, perception: Perception, t: float, goal: Vector) -> Setpoint:
+    def _avoid(self, t: float, goal: Vector) -> Setpoint:
         """Setpoint toward a goal, with avoidance."""
-        now, avoidance = self.now, perception.avoidance
+        now, perception = self.now, self._perception
         perception.sense(t, now, self.neighbours)
-        own, near = perception.own, perception.near
-        shifted = avoidance.deviate(goal, own, near, 1.0 / self.assignment.body_hz)
-        setpoint = self._controller.setpoint(shifted, self.goal_yaw, now.position, now.yaw)
+        own, near, avoidance = perception.own, perception.near, perception.avoidance
+        x, y, z = avoidance.deviate(goal, own, near, self._dt)
+        setpoint = self._controller.setpoint((x, y, z), self.goal_yaw, now.position, now.yaw)
         setpoint = self._filter.check(setpoint, now, avoidance, own, near)
-        x, y, z = goal
-        moved = abs(shifted[0] - x) > 0.0 or abs(shifted[1] - y) > 0.0 or abs(shifted[2] - z) > 0.0
+        moved = abs(x - goal[0]) > 0.0 or abs(y - goal[1]) > 0.0 or abs(z - goal[2]) > 0.0
         self.avoided = self._filter.avoided or moved
         return setpoint
 
@@ -296,20 +346,6 @@ class Robot:
             life.set_missing("its law wants something that is not finite")
             return False
         return True
-
-    def _causes(self, t: float) -> int:
-        """Causes of hazards on this tick, a bit for each."""
-        life, status, guidance = self.lifecycle, self._status, self.guidance
-        phase = life.phase
-        status.ordered, status.setpoint, status.not_finite = self._ordered, self.setpoint, self._filter.not_finite
-        status.goal_height, status.aside = self.goal[2], self.landing.aside
-        status.cruising, status.climbing = phase == RUNNING or phase == AIRBORNE, life.climbing
-        status.landing = phase == LANDING
-        status.unstarted = life.start_at == inf and (life.climbing or phase == AIRBORNE)
-        status.alone = self.neighbours.incomplete and self.goals.without_neighbours()
-        if guidance is not None:
-            status.unguided, status.goal_stamp = phase == RUNNING and guidance.unguided(t), guidance.stamp
-        return self._detector.causes(self.now, status, self.neighbours, self.health)
 
     def _apply_hazards(self, causes: int) -> None:
         """Apply outcomes of hazards: the robot holds, lands, or has its motors cut."""
@@ -334,10 +370,10 @@ class Robot:
         running = life.phase == RUNNING
         if running:
             self.decisions += 1
-            if self.guidance is None and not now.invalid:
-                if goals.decide(t, now.position, now.velocity, now.yaw, life.start_at):
-                    self.goal, self.goal_yaw = goals.goal, goals.yaw
-                    self.updates += 1
+        if running and self.guidance is None and not now.invalid:  # noqa: SIM102 - the decision changes the robot
+            if goals.decide(t, now.position, now.velocity, now.yaw, life.start_at):
+                self.goal, self.goal_yaw = goals.goal, goals.yaw
+                self.updates += 1
         self._stay((running and self._holds()) or life.phase == AIRBORNE)
         if self.keeping.held or not running:
             goals.require_update()  # its goal is old when it returns
@@ -352,9 +388,9 @@ class Robot:
         """Whether a running robot must stay: for its safety, or because no link of the law is active."""
         return self.hazards.held or self.goals.without_neighbours()
 
-    def _follow(self, guidance: Guidance) -> None:
+    def _follow(self) -> None:
         """A guided robot takes its received goal, on the tick of reception."""
-        running = self.lifecycle.phase == RUNNING
+        guidance, running = self.guidance, self.lifecycle.phase == RUNNING
         held = (running and self._holds()) or self.lifecycle.phase == AIRBORNE
         if held != self.keeping.held:
             self._stay(held)

@@ -43,13 +43,14 @@ class Lifecycle:
     """Phases of one robot."""
 
     __slots__ = (
-        "_before", "_duration", "_flies", "_hover", "_settled_until", "_waits", "climbing", "failing", "land_due",
-        "moved", "phase", "reason", "start_at", "stop_due", "takeoff_due",
+        "_before", "_duration", "_flies", "_hover", "_waits", "climbing", "failing", "land_due",
+        "moved", "phase", "reason", "settled_until", "start_at", "stop_due", "takeoff_due",
     )  # fmt: skip
 
     phase: int  # of `Phase`
     climbing: bool  # on its way up
     start_at: float  # the common start on the process's clock [s]; infinity before it is known
+    settled_until: float  # the robot runs, and goes on, until then [s]: there is no need to advance
     moved: bool  # whether the phase changed on the last tick, or by an order since the one before
     takeoff_due: bool  # commands that the body has not received yet
     land_due: bool
@@ -61,7 +62,7 @@ class Lifecycle:
         """Of a robot that hovers at `hover` [m], in an experiment of `duration` [s]."""
         self._flies, self._hover, self._duration = kind.flies, hover, duration
         self.phase = self._before = IDLE
-        self.start_at, self._settled_until = inf, -inf
+        self.start_at, self.settled_until = inf, -inf
         self.climbing = self.moved = self.takeoff_due = self.land_due = self.stop_due = False
         self.reason = self._waits = self.failing = ""
 
@@ -90,14 +91,14 @@ class Lifecycle:
         if self.phase < LANDING:
             self.phase, self.climbing, self.reason = LANDING, False, reason
             self.takeoff_due, self.land_due = False, True
-            self._settled_until = -inf
+            self.settled_until = -inf
 
     def stop(self, reason: str) -> None:
         """Motors off."""
         self.phase, self.climbing, self.reason = DONE, False, reason
         self.takeoff_due = self.land_due = False  # the body would get them after the stop
         self.stop_due = True
-        self._settled_until = -inf
+        self.settled_until = -inf
 
     def set_missing(self, reason: str) -> None:
         """Store why an idle robot is not ready, or why a ready one will not be any more on this tick."""
@@ -120,14 +121,11 @@ class Lifecycle:
 
         `ready`: nothing is missing; a ready robot that loses this is idle again, unless it climbs already.
         """
-        if t < self._settled_until:  # it runs, and goes on
-            self.moved = False
-            return
         self._advance(t, position, velocity, flying, ready)
         self.moved = self.phase != self._before  # orders between ticks count as well
         self._before = self.phase
         if self.phase == RUNNING:
-            self._settled_until = self.start_at + self._duration - 1e-6
+            self.settled_until = self.start_at + self._duration - 1e-6
 
     def _advance(self, t: float, position: Vector, velocity: Vector, flying: bool, ready: bool) -> None:
         if self.phase == IDLE and ready:

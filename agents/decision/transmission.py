@@ -34,12 +34,11 @@ class Transmitter:
         """Use another trigger of the same kind from now on; what was remembered stays."""
         self.asking.trigger, self._smooths = trigger, trigger.smoothing_s > 0.0
 
-    def transmits(
+    def transmits(  # noqa: PLR0917 - one caller, on every tick
         self,
         t: float,
         position: Vector,
         velocity: Vector,
-        *,
         error: float,
         energy: float,
         since_start: float,

@@ -63,7 +63,7 @@ class Barrier(Avoidance, frozen=True):
     ] = 1.0
 
     def bound(self, thing: Thing, share: float) -> float:
-        """b [m/s] of the half-plane −n·u ≤ b that a measured thing asks of the velocity, if this `share` of α is used."""
+        """b [m/s] of the half-plane −n·u ≤ b that a measured thing asks for, if this `share` of α is used."""
         left = thing.gap - self.margin
         coming = max(thing.away_x * thing.velocity_x + thing.away_y * thing.velocity_y, 0.0)
         used = self.alpha * share * left
@@ -167,10 +167,8 @@ def along_heading(v: float, own: OwnState, near: Nearby) -> float:
     if not any_bars:
         return v
     if low > high:  # it should go both ways: only as far as what is not touched yet allows
-        v = high if high >= 0.0 else low if low <= 0.0 else 0.0
-    else:
-        v = clamp(v, low, high)
-    return clamp(v, -own.speed, own.speed)
+        return clamp(high if high >= 0.0 else low if low <= 0.0 else 0.0, -own.speed, own.speed)
+    return clamp(clamp(v, low, high), -own.speed, own.speed)
 
 
 def tightest(near: Nearby) -> int:
@@ -227,7 +225,7 @@ def candidate(x: float, y: float, near: Nearby, count: int, raised: float) -> Ca
     return best
 
 
-def better(
+def better(  # noqa: PLR0917 - numbers alone
     best: Candidate, x: float, y: float, wanted_x: float, wanted_y: float, near: Nearby, count: int, raised: float
 ) -> Candidate:
     """The point x, y in place of the `best` so far if it obeys all planes and is nearer to what is wanted."""

@@ -542,11 +542,9 @@ class Runtime:
         for row, robot in enumerate(self.robots):
             if robot.transmit(t, states[row]) and row not in self._retired:
                 self._send_pose(row, robot, states[row].yaw, t)
-        for row, robot in enumerate(self.robots):
+        for robot in self.robots:
             robot.act(t)
             running = running and robot.lifecycle.phase == Phase.RUNNING
-            counts.interventions[row] += robot.changed
-            counts.avoided[row] += robot.avoided
         self._act()
         if not begun and self.robots[0].decisions:
             counts.begin()

@@ -35,16 +35,12 @@ class Counts:
 
     def __init__(self, rows: int) -> None:
         self.sent = [0] * rows  # (n) poses
-        self.interventions = [0] * rows  # (n) ticks on which safety changed the decision
-        self.avoided = [0] * rows  # (n) ticks on which avoidance did
         self.refused = self.ticks = self.missed = 0  # orders, ticks, skipped ticks
         self.late_s = 0.0  # [s] largest lateness of a tick since the last status
 
     def begin(self) -> None:
         """Resets the counters that begin at the common start."""
         self.ticks = self.missed = 0
-        count = len(self.sent)
-        self.interventions, self.avoided = [0] * count, [0] * count
 
 
 class Telemetry:
@@ -176,8 +172,8 @@ class Telemetry:
             ticks=counts.ticks,
             missed=counts.missed,
             decisions=robot.updates,
-            interventions=counts.interventions[row],
-            avoided=counts.avoided[row],
+            interventions=robot.interventions,
+            avoided=robot.evasions,
             late_s=counts.late_s,
             started=self.utc + life.start_at if isfinite(life.start_at) else 0.0,
             missing=missing,

@@ -84,15 +84,15 @@ class Situation:
 
     def __init__(self) -> None:
         self.t, self.state, self.jump, self.turned = 0.0, BodyState(), nan, nan
-        self.take(0.0, self.state)
+        self.begin(0.0)
         self.sound = True
         self.invalid = self.outside_wall = self.outside = self.flyaway = False
         self.excess = 0.0
 
-    def take(self, t: float, state: BodyState) -> None:
-        """Begin a tick at `t` [s]."""
-        self.t, self.state = t, state
-        self.position, self.velocity, self.yaw = state.position, state.velocity, state.yaw
+    def begin(self, t: float) -> None:
+        """Begin a tick at `t` [s] with the state of the body."""
+        state = self.state
+        self.t, self.position, self.velocity, self.yaw = t, state.position, state.velocity, state.yaw
 
     @property
     def jumped(self) -> bool:

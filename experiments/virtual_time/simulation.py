@@ -130,7 +130,6 @@ class Flight:
         self._dt = 1.0 / experiment.rates.body_hz
         self._tick = 0
         self._samples: list[dict[str, Any]] = []
-        self._interventions, self._avoided = [0] * len(names), [0] * len(names)
         self._touches: list[Touch] = []
 
     def fly(self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Instant], object]) -> None:
@@ -167,7 +166,6 @@ class Flight:
             network.centre.decide(t)
             if network.centre.instant:
                 network.centre.deliver(t)
-        begun = robots[0].begun
         for row, robot in enumerate(robots):
             robot.act(t)
             if robot.takes_off:
@@ -176,9 +174,6 @@ class Flight:
                 body.land((row,))
             if robot.stops:
                 body.stop((row,))
-            if begun:
-                self._interventions[row] += robot.changed
-                self._avoided[row] += robot.avoided
         body.command([robot.setpoint for robot in robots])
         if touches := self._twin.touches():
             self._touches += touches
@@ -215,8 +210,8 @@ class Flight:
             time=np.array([sample["time"] for sample in self._samples]) - begin,
             decisions=max(robot.decisions for robot in self.robots),
             updates=np.array([robot.updates for robot in self.robots], dtype=np.intp),
-            interventions=np.array(self._interventions, dtype=np.intp),
-            avoided=np.array(self._avoided, dtype=np.intp),
+            interventions=np.array([robot.interventions for robot in self.robots], dtype=np.intp),
+            avoided=np.array([robot.evasions for robot in self.robots], dtype=np.intp),
             touches=tuple(replace(touch, time=touch.time - begin) for touch in self._touches),
             ticks=round(self._experiment.duration_s / self._dt),
             airborne=conductor.airborne_at - begin,
