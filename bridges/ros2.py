@@ -11,6 +11,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import inf, isfinite, isnan, nan, radians, remainder, tau
 from typing import Annotated, Final
 
@@ -19,7 +20,6 @@ import numpy as np
 import zenoh
 from msgspec import Meta
 
-from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -236,10 +236,12 @@ def scan(types: Types, ranges: messages.Ranges, frame: str) -> Message | None:
     flat = [(remainder(bearing, tau), distance) for bearing, up, distance in found if abs(up) < DEGREE]
     if not flat:
         return None
-    start, step, place = steps(np.array([bearing for bearing, _ in flat]))
-    values = np.full(int(place.max()) + 1, nan, np.float32)
-    # of two rays at one place the nearer hit counts
-    np.fmin.at(values, place, np.array([inf if distance is None else distance for _, distance in flat], np.float32))
+    start, step, places = steps([bearing for bearing, _ in flat])
+    values = [nan] * (max(places) + 1)
+    for place, (_, distance) in zip(places, flat, strict=True):
+        hit = inf if distance is None else distance
+        if not values[place] <= hit:  # of two rays at one place the nearer hit counts
+            values[place] = hit
     return types.make(
         ros2.LASER_SCAN,
         header=types.header(ranges.stamp, frame),
@@ -250,26 +252,26 @@ def scan(types: Types, ranges: messages.Ranges, frame: str) -> Message | None:
         scan_time=0.0,
         range_min=0.0,
         range_max=validation.MAX_RANGE,
-        ranges=values,
+        ranges=np.array(values, np.float32),
         intensities=np.zeros(0, np.float32),
     )
 
 
-def steps(bearing: Array) -> tuple[float, float, Index]:
+def steps(bearings: Sequence[float]) -> tuple[float, float, list[int]]:
     """The first angle [rad] and the step [rad] of a scan with these bearings [rad], and the place of each in it.
 
     Where the bearings are no multiples of the smallest gap between two, the step is one degree.
     """
-    start = float(bearing.min())
-    along = bearing - start
-    span, step = float(along.max()), DEGREE
-    gaps = np.diff(np.sort(along))
-    gap = float(gaps.min(where=gaps > SAME, initial=inf))
+    start = min(bearings)
+    along = [bearing - start for bearing in bearings]
+    span, step = max(along), DEGREE
+    gaps = [after - before for before, after in pairwise(sorted(along))]
+    gap = min((each for each in gaps if each > SAME), default=inf)
     if tau / validation.MAX_RAYS - SAME < gap < inf:
         equal = span / round(span / gap)
-        if np.abs(along - equal * np.rint(along / equal)).max() < SAME:
+        if max(abs(each - equal * round(each / equal)) for each in along) < SAME:
             step = equal
-    return start, step, np.rint(along / step).astype(np.intp)
+    return start, step, [round(each / step) for each in along]
 
 
 def velocity(types: Types, state: messages.State, linear: messages.Vector) -> Message:

@@ -13,9 +13,6 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
-
-from agents.arrays import Array
 
 PARK_PORT: Final = 50000
 GAP_S: Final = 0.010  # between two park commands: glued in one segment, the second is lost
@@ -26,8 +23,10 @@ FASTEST: Final = 1200  # units: 0.81 m/s
 CENTIMETRE: Final = 0.01
 
 RIM: Final = 0.070  # [m] from the robot's centre to its sensors
-SOUND_BEARING: Final = np.radians([90.0, 45.0, 0.0, -45.0, -90.0])  # ultrasonic, in the order of both protocols
-LIGHT_BEARING: Final = np.radians([135.0, 90.0, 45.0, 0.0, -45.0, -90.0, -135.0, 180.0])  # infrared; four look down
+# [rad] ultrasonic, in the order of both protocols
+SOUND_BEARING: Final = tuple(map(math.radians, (90.0, 45.0, 0.0, -45.0, -90.0)))
+# [rad] infrared; four look down
+LIGHT_BEARING: Final = tuple(map(math.radians, (135.0, 90.0, 45.0, 0.0, -45.0, -90.0, -135.0, 180.0)))
 SOUND_NOTHING: Final = 1000  # [cm] nothing between 25 and 250 cm; 2000: switched off
 SOUND_NEAREST: Final = 0.25  # [m] nearer than this it reads 0
 LIGHT_NOTHING: Final = 100  # reflected light of nothing at all
@@ -185,17 +184,18 @@ def scanned(text: str) -> list[float]:
     return [max(-1e6, min(1e6, float(word))) for word in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)", text)[:3]]
 
 
-def sound_distance(centimetres: Array) -> Array:
-    """Ultrasonic readings [cm] as distances from the robot's centre [m]; NaN for nothing, or switched off."""
-    near = np.where(centimetres <= 0.0, SOUND_NEAREST, centimetres * CENTIMETRE)
-    return np.where(centimetres >= SOUND_NOTHING, np.nan, RIM + near)
+def sound_distance(centimetres: float) -> float:
+    """An ultrasonic reading [cm] as distance from the robot's centre [m]; NaN for nothing, or switched off."""
+    if centimetres >= SOUND_NOTHING:
+        return math.nan
+    return RIM + (SOUND_NEAREST if centimetres <= 0.0 else centimetres * CENTIMETRE)
 
 
-def light_distance(reflected: Array) -> Array:
-    """Infrared readings (0 to 1023) as rough distances from the robot's centre [m]; NaN for nothing.
+def light_distance(reflected: float) -> float:
+    """An infrared reading (0 to 1023) as rough distance from the robot's centre [m]; NaN for nothing.
 
     Reflected light falls with the square of the distance from the emitter behind the rim; a choice, not a calibration.
     """
-    light = np.maximum(reflected, LIGHT_NOTHING)
-    near = LIGHT_SCALE * (np.sqrt(LIGHT_TOUCHING / light) - 1.0)
-    return np.where(reflected <= LIGHT_NOTHING, np.nan, RIM + np.maximum(near, 0.0))
+    if reflected <= LIGHT_NOTHING:
+        return math.nan
+    return RIM + max(LIGHT_SCALE * (math.sqrt(LIGHT_TOUCHING / reflected) - 1.0), 0.0)

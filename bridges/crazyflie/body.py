@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from math import isfinite
+from collections.abc import Sequence
+from math import inf, isfinite
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan, Rays
+from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan
 from agents.network.messages import Inspection, number
 from agents.protocols.crazyflie import (
     Lighthouse,
@@ -24,6 +22,7 @@ from agents.protocols.crazyflie import (
     overload,
     radio_loads,
 )
+from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.crazyflie.link import prepare
 from bridges.crazyflie.pilot import CrazyfliePilot
 from bridges.crazyflie.telemetry import BEARING, ELEVATION, Telemetry
@@ -70,15 +69,14 @@ class CrazyflieBody:
                 where,
                 each,
                 self._telemetry[row],
-                place=(request.start[row], float(request.yaw[row])),
+                place=(request.start[row], request.yaw[row]),
                 turn=turns.get(dongles[row], threading.Lock()),
             )
             for row, (name, where, each) in enumerate(zip(request.names, addresses, settings, strict=True))
         ]
-        self._external_rows = np.flatnonzero(request.external)
-        self._external = External(rows)
+        self._outside = request.external
+        self._external = [External() for _ in addresses]
         self._zero = time.monotonic()  # zero of the process's clock on the monotonic clock [s]
-        self._ranging = [row for row, each in enumerate(settings) if each.multiranger]
 
     def open(self) -> None:
         """See `Body.open`. Unreachable drones are left out, retried in the background, and named in the notes.
@@ -122,64 +120,60 @@ class CrazyflieBody:
     def _exchanges(self, rows: list[int]) -> int:
         return sum(self._pilots[row].exchanges for row in rows)
 
-    def read(self, t: float) -> BodyState:
+    def read(self, t: float) -> Sequence[BodyState]:
         """See `Body.read`."""
         now = time.monotonic()
         self._zero = now - t
-        telemetry = self._telemetry
-        heard = np.array([one.pose_time for one in telemetry]) - self._zero
-        settled = np.array([one.settled for one in telemetry])
-        pose = np.array([one.pose for one in telemetry])
-        yaw = pose[:, 6].copy()
-        pose[~settled] = np.nan
-        unknown = np.full_like(pose[:, :3], np.nan)
+        return [self._state(row, now) for row in range(len(self._pilots))]
+
+    def _state(self, row: int, now: float) -> BodyState:
+        telemetry, pilot = self._telemetry[row], self._pilots[row]
+        settled, heard = telemetry.settled, telemetry.pose_time - self._zero
+        x, y, z, vx, vy, vz, yaw = telemetry.pose
         state = BodyState(
-            time=heard.copy(),
-            position=pose[:, :3].copy(),
-            velocity=pose[:, 3:6].copy(),
-            yaw=yaw,
-            true_position=unknown,
-            true_yaw=unknown[:, 0],
-            battery=np.array([one.battery for one in telemetry]),
-            flying=np.array([one.airborne for one in telemetry]),
-            notes=tuple(self._note(row, now) for row in range(len(self._pilots))),
-            refusals=tuple(pilot.refusal for pilot in self._pilots),
+            heard,
+            (x, y, z) if settled else UNKNOWN,
+            (vx, vy, vz) if settled else UNKNOWN,
+            yaw,
+            battery=telemetry.battery,
+            flying=telemetry.airborne,
             heard=heard,
-            rays=Rays.gather([self._scan(row) for row in range(len(self._pilots))]) if self._ranging else None,
+            note=self._note(row, now),
+            refusal=pilot.refusal,
+            scan=self._scan(telemetry) if self._settings[row].multiranger else None,
         )
-        if len(self._external_rows):
-            rows = self._external_rows
-            self._external.fill(state, rows)
-            state.position[rows[~settled[rows]]] = np.nan  # no flight before the estimator on board has settled
-            # a drone without telemetry is lost as well
-            state.time[rows] = np.minimum(state.time, heard)[rows]
+        if self._outside[row]:
+            self._external[row].fill(state)
+            if not settled:
+                state.position = UNKNOWN  # no flight before the estimator on board has settled
+            state.time = min(state.time, heard)  # a drone without telemetry is lost as well
         return state
 
-    def command(self, setpoint: Array) -> None:
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
         """See `Body.command`."""
         now = time.monotonic()
-        for pilot, (x, y, z, yaw) in zip(self._pilots, setpoint.tolist(), strict=True):
-            pilot.set_target(now, (x, y, z, yaw) if isfinite(x + y + z + yaw) else None)
+        for pilot, setpoint in zip(self._pilots, setpoints, strict=True):
+            pilot.set_target(now, setpoint if isfinite(sum(setpoint)) else None)
 
-    def takeoff(self, rows: Index, height: Array) -> None:
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`."""
-        for row, up in zip(rows.tolist(), height.tolist(), strict=True):
+        for row, up in zip(rows, heights, strict=True):
             self._telemetry[row].airborne = True  # at once: callers wait for a landing as long as this is set
             self._pilots[row].give_order("takeoff", up)
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         """See `Body.land`."""
-        for row in rows.tolist():
+        for row in rows:
             self._pilots[row].give_order("land")
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         """See `Body.stop`. Drones on the ground get no command: an emergency stop locks them until a restart."""
-        for row in rows.tolist():
+        for row in rows:
             self._pilots[row].give_order("stop")
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """See `Body.locate`."""
-        if self._external.update(row, t, position, yaw):
+        if self._external[row].update(t, position, yaw):
             self._pilots[row].locate(self._zero + t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
@@ -202,11 +196,10 @@ class CrazyflieBody:
 
     def _note(self, row: int, now: float) -> str:
         age = now - self._telemetry[row].pose_time
-        stale = f"no pose for {age:.1f} s" if STALE_S < age < np.inf else ""
+        stale = f"no pose for {age:.1f} s" if STALE_S < age < inf else ""
         return "; ".join(part for part in (self._pilots[row].note, stale) if part)
 
-    def _scan(self, row: int) -> RangeScan | None:
-        one = self._telemetry[row]
-        if not isfinite(one.ranges_time):
+    def _scan(self, telemetry: Telemetry) -> RangeScan | None:
+        if not isfinite(telemetry.ranges_time):
             return None
-        return RangeScan(one.ranges_time - self._zero, BEARING, ELEVATION, one.ranges)
+        return RangeScan(telemetry.ranges_time - self._zero, BEARING, ELEVATION, telemetry.ranges)

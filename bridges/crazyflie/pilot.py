@@ -7,11 +7,11 @@ import time
 from math import cos, inf, isfinite, sin
 from typing import Final
 
-from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols.crazyflie import CrazyflieSettings, Outside
 from agents.protocols.crtp import Info
 from agents.ticks import Ticks
+from agents.vectors import Vector
 from bridges.crazyflie.flight import LANDING_GAP_S, Flight, Phase
 from bridges.crazyflie.link import CrazyflieLink, LinkError, SilentError
 from bridges.crazyflie.positioning import Convergence, configure
@@ -58,10 +58,10 @@ class CrazyfliePilot:
         settings: CrazyflieSettings,
         telemetry: Telemetry,
         *,
-        place: tuple[Array, float],
+        place: tuple[Vector, float],
         turn: threading.Lock,
     ) -> None:
-        """`place`: start position (3,) [m] and yaw [rad]; `turn`: held while a drone of the radio connects."""
+        """`place`: start position [m] and yaw [rad]; `turn`: held while a drone of the radio connects."""
         self.opened = threading.Event()  # connected and set up once; position settled, unless it comes from outside
         self.failure: BodyError | None = None  # reason why the first connection failed
         self._name, self._address, self._settings, self._telemetry = name, address, settings, telemetry
@@ -75,7 +75,7 @@ class CrazyfliePilot:
         self._lock = threading.Lock()
         self._wake = threading.Event()
         self._ending = threading.Event()
-        self._external_pose: tuple[float, Array, float] | None = None
+        self._external_pose: tuple[float, Vector, float] | None = None
         self._forwarded_at = -inf
         self._convergence: Convergence | None = None
         self._settle_deadline = inf
@@ -107,8 +107,8 @@ class CrazyfliePilot:
         """See `Flight.set_target`."""
         self._flight.set_target(now, target)
 
-    def locate(self, now: float, position: Array, yaw: float) -> None:
-        """Store an external position (3,) [m] and yaw [rad], or NaN, for the estimator on board."""
+    def locate(self, now: float, position: Vector, yaw: float) -> None:
+        """Store an external position [m] and yaw [rad], or NaN, for the estimator on board."""
         self._external_pose = now, position, yaw
         self._flight.note_external(float(position[2]), yaw)
 
@@ -455,7 +455,7 @@ class CrazyfliePilot:
             measured, position, yaw = pose
             if time.monotonic() - measured > EXTERNAL_AGE_S:
                 return
-            x, y, z = position.tolist()
+            x, y, z = position
             if system.attitude and isfinite(yaw):
                 link.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, sin(0.5 * yaw), cos(0.5 * yaw))
             else:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.protocols import crtp
 from agents.protocols.crazyflie import CrazyflieSettings, Lighthouse, Loco, Outside
+from agents.vectors import Vector
 from bridges.crazyflie.link import REPEAT_S, CrazyflieLink, LinkError
 
 ESTIMATORS: Final = {"auto": 0, "complementary": 1, "kalman": 2, "ukf": 3}
@@ -24,6 +24,7 @@ LOCO_MODES: Final = {"auto": 0, "twr": 1, "tdoa2": 2, "tdoa3": 3}
 UPLOAD_S: Final = 8.0
 ANCHORS_S: Final = 5.0  # an anchor gets its position by radio, and confirms it once per second
 AGREE: Final = 1e-3  # [m]
+SINGLE: Final = 1e-5  # relative tolerance of what a Crazyflie stores in single precision
 RESET_S: Final = 0.1  # duration of the estimator's reset
 VARIANCE_HZ: Final = 10.0  # beside poses, for which the budget of the radio is meant
 SETTLED_SPREAD: Final = 1e-3  # [m²] settled: the variances of half a second differ by less,
@@ -108,15 +109,15 @@ def configure(link: CrazyflieLink, settings: CrazyflieSettings) -> None:
 class Convergence:
     """Reset of the position estimator and the wait until it has settled; never blocks."""
 
-    def __init__(self, link: CrazyflieLink, start: Array, yaw: float, *, absolute: bool) -> None:
-        """`start` (3,) [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw.
+    def __init__(self, link: CrazyflieLink, start: Vector, yaw: float, *, absolute: bool) -> None:
+        """`start` [m] and `yaw` [rad]: pose on the ground; only positioning with attitude measures the yaw.
 
         `absolute`: positions are measured, so that their variance falls; a Flow deck measures velocities only.
         """
         self.done = False  # settled
-        self._link, self._below = link, SETTLED_BELOW if absolute else np.inf
+        self._link, self._below = link, SETTLED_BELOW if absolute else inf
         self._variances: deque[tuple[float, ...]] = deque(maxlen=SAMPLES)
-        place = {f"kalman.initial{axis}": float(value) for axis, value in zip("XYZ", start, strict=True)}
+        place = {f"kalman.initial{axis}": value for axis, value in zip("XYZ", start, strict=True)}
         self._to_set = deque((place | {"kalman.initialYaw": yaw, "kalman.resetEstimation": 1.0}).items())
         self._to_set.append(("kalman.resetEstimation", 0.0))
         self._sent_at: float | None = None  # time of the last question about the first of these
@@ -126,8 +127,9 @@ class Convergence:
         while self._to_set and not self._set(now, *self._to_set[0]):
             return False
         if not self.done and len(self._variances) == SAMPLES:
-            variances = np.array(self._variances)
-            if np.ptp(variances, axis=0).max() < SETTLED_SPREAD and variances.max() < self._below:
+            spread = [max(axis) - min(axis) for axis in zip(*self._variances, strict=True)]
+            low = all(variance < self._below for sample in self._variances for variance in sample)  # NaN is not
+            if low and max(spread) < SETTLED_SPREAD:
                 self.done = True
                 self._link.stop_log("variance")
         return self.done
@@ -191,8 +193,8 @@ def _same_geometry(found: Mapping[int, Any], wanted: StationFile) -> bool:
     return all(
         number in found
         and found[number].valid
-        and np.allclose(found[number].origin, geometry.origin, atol=AGREE)
-        and np.allclose(found[number].rotation_matrix, geometry.rotation, atol=AGREE)
+        and _agree(found[number].origin, geometry.origin)
+        and all(map(_agree, found[number].rotation_matrix, geometry.rotation))
         for number, geometry in wanted.geos.items()
     )
 
@@ -204,11 +206,16 @@ def _same_calibration(found: Mapping[int, Any], wanted: StationFile) -> bool:
         and found[number].valid
         and found[number].uid == calibration.uid
         and all(
-            np.allclose([getattr(has, name) for name in Sweep.__struct_fields__], msgspec.structs.astuple(sweep))
+            _agree([getattr(has, name) for name in Sweep.__struct_fields__], msgspec.structs.astuple(sweep), 1e-8)
             for has, sweep in zip(found[number].sweeps, calibration.sweeps, strict=True)
         )
         for number, calibration in wanted.calibs.items()
     )
+
+
+def _agree(found: Sequence[float], wanted: Sequence[float], within: float = AGREE) -> bool:
+    """Whether numbers that were read back are the wanted ones, `within` and single precision."""
+    return all(abs(has - want) <= within + SINGLE * abs(want) for has, want in zip(found, wanted, strict=True))
 
 
 def _prepare_loco(link: CrazyflieLink, system: Loco) -> None:
@@ -227,9 +234,7 @@ def _prepare_loco(link: CrazyflieLink, system: Loco) -> None:
         time.sleep(RESET_S)
         known = _anchors(link, memories[0])
         missing = {
-            anchor: place
-            for anchor, place in wanted.items()
-            if anchor not in known or not np.allclose(known[anchor], place, atol=AGREE)
+            anchor: place for anchor, place in wanted.items() if anchor not in known or not _agree(known[anchor], place)
         }
         if missing and time.monotonic() > deadline:
             raise BodyError(f"anchor {min(missing)} did not store its position: is it on, in mode {system.mode}?")

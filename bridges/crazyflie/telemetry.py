@@ -11,9 +11,6 @@ from collections.abc import Mapping
 from math import exp, inf, isfinite, nan, radians
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array
 from agents.protocols.crtp import MM, Info, Power
 from bridges.crazyflie.link import CrazyflieLink
 
@@ -37,8 +34,8 @@ STATE: Final = (
     | dict.fromkeys(OLD_INFO, "uint8_t")
 )
 RANGES: Final = {f"range.{side}": "uint16_t" for side in ("front", "back", "left", "right", "up")}
-BEARING: Final = np.radians([0.0, 180.0, 90.0, -90.0, 0.0])
-ELEVATION: Final = np.radians([0.0, 0.0, 0.0, 0.0, 90.0])
+BEARING: Final = tuple(map(radians, (0.0, 180.0, 90.0, -90.0, 0.0)))
+ELEVATION: Final = tuple(map(radians, (0.0, 0.0, 0.0, 0.0, 90.0)))
 OUT_OF_REACH_MM: Final = 8000.0
 # voltages of a full and an empty cell at rest, and how much less they are in the air [V]
 FULL_V, EMPTY_V, SAG_V = 4.2, 3.5, 0.3
@@ -102,7 +99,7 @@ class Telemetry:
         self.battery = nan  # charge, 0 to 1
         self.volts = nan  # of the battery [V]
         self.stations = -1  # lighthouse.status, or -1
-        self.ranges: Array = np.full(len(RANGES), nan)  # front, back, left, right, up [m]; NaN: nothing in reach
+        self.ranges = (nan,) * len(RANGES)  # front, back, left, right, up [m]; NaN: nothing in reach
         self.airborne = False  # motors on, as far as the bridge knows
         self._lighthouse = lighthouse
 
@@ -166,5 +163,5 @@ class Telemetry:
 
     def _ranges(self, t: float, stamp: int, values: Mapping[str, float]) -> None:
         measured = (values.get(name, OUT_OF_REACH_MM) for name in RANGES)
-        self.ranges = np.array([nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured])
+        self.ranges = tuple(nan if mm >= OUT_OF_REACH_MM else MM * mm for mm in measured)
         self.ranges_time = self._stamped(t, stamp)

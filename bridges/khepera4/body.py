@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, Rays, settings
+from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, settings
 from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
+from agents.vectors import Setpoint, Vector
 from bridges.khepera4.link import Address, Khepera4Link
 
 OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and of the first answer
@@ -30,19 +29,17 @@ class KheperaBody:
             settings(protocol.Khepera4Settings, *row) for row in zip(request.names, request.device, strict=True)
         ]
         self._claims = Claims(request.names, [address.device for address in self._addresses])
-        self._start = np.column_stack([request.start[:, :2], request.yaw])
-        self._external_rows = np.flatnonzero(request.external)
-        self._external = External(len(self._names))
+        self._start = [(x, y, yaw) for (x, y, _), yaw in zip(request.start, request.yaw, strict=True)]
+        self._outside = request.external
+        self._external = [External() for _ in self._names]
         self._links: list[Khepera4Link] = []
         self._read_at = -math.inf  # [s, `uptime`] the state on which the next command is decided
 
     def open(self) -> None:
         """See `Body.open`. Robots without answer are retried while the others drive."""
         self._claims.take()
-        for name, address, device, (x, y, yaw) in zip(
-            self._names, self._addresses, self._settings, self._start.tolist(), strict=True
-        ):
-            self._links.append(Khepera4Link(name, address, device, (x, y, yaw)))
+        for place in zip(self._names, self._addresses, self._settings, self._start, strict=True):
+            self._links.append(Khepera4Link(*place))
             self._links[-1].start()
         deadline, pause = uptime() + OPEN_S, threading.Event()
         while uptime() < deadline and any(
@@ -54,53 +51,49 @@ class KheperaBody:
             self.close()
             raise BodyError("no Khepera answers: " + "; ".join(reasons))
 
-    def read(self, t: float) -> BodyState:
+    def read(self, t: float) -> Sequence[BodyState]:
         now, self._read_at = uptime(), uptime()
-        odometry = [link.odometry for link in self._links]
-        rows = len(odometry)
-        # unknown before the first odometry: the pose is counted by the robot, not read from the file
-        position = np.array([(h.x, h.y, 0.0 * h.x) for h in odometry])
-        velocity = np.array([(*h.velocity, 0.0 * h.velocity[0]) for h in odometry])
-        odometry_time = np.array([h.stamp for h in odometry]) - now + t
+        return [self._state(row, link, t, now) for row, link in enumerate(self._links)]
+
+    def _state(self, row: int, link: Khepera4Link, t: float, now: float) -> BodyState:
+        odometry = link.odometry
+        x, (vx, vy), heard = odometry.x, odometry.velocity, odometry.stamp - now + t
         state = BodyState(
-            odometry_time,
-            position,
-            velocity,
-            np.array([h.yaw for h in odometry]),
-            np.full((rows, 3), np.nan),
-            np.full(rows, np.nan),
-            np.array([link.battery for link in self._links]),
-            np.zeros(rows, dtype=bool),
-            tuple(self._note(link, now) for link in self._links),
-            Rays.gather([self._scan(link, now, t) for link in self._links]),
-            heard=odometry_time,
+            heard,
+            # unknown before the first odometry: the pose is counted by the robot, not read from the file
+            (x, odometry.y, 0.0 * x),
+            (vx, vy, 0.0 * vx),
+            odometry.yaw,
+            battery=link.battery,
+            heard=heard,
+            note=self._note(link, now),
+            scan=self._scan(link, now, t),
         )
-        if len(self._external_rows):
-            state.time = odometry_time.copy()
-            self._external.fill(state, self._external_rows)
-            lost = np.array([now - h.stamp > s.silence_s for h, s in zip(odometry, self._settings, strict=True)])
+        if self._outside[row]:
+            self._external[row].fill(state)
             # a robot without odometry cannot be driven, even if its external position is fresh
-            state.time[lost] = np.minimum(state.time, odometry_time)[lost]
+            if now - odometry.stamp > self._settings[row].silence_s:
+                state.time = min(state.time, heard)
         return state
 
-    def command(self, setpoint: Array) -> None:
-        for link, (v, turn, _, _) in zip(self._links, setpoint.tolist(), strict=True):
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
+        for link, (v, turn, _, _) in zip(self._links, setpoints, strict=True):
             if math.isfinite(v + turn):
                 link.drive(v, turn, self._read_at)
 
-    def takeoff(self, rows: Index, height: Array) -> None:
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`: no effect on a ground robot."""
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         now = uptime()
-        for row in rows.tolist() if self._links else ():
+        for row in rows if self._links else ():
             self._links[row].halt(now)
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         self.land(rows)
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        self._external.update(row, t, position, yaw)
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
+        self._external[row].update(t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
         server = self._links[row].server if self._links else ""
@@ -132,4 +125,4 @@ class KheperaBody:
         if link.scan is None:
             return None
         stamp, bearing, distance = link.scan
-        return RangeScan(stamp - now + t, bearing, np.zeros(len(bearing)), distance)
+        return RangeScan(stamp - now + t, bearing, (0.0,) * len(bearing), distance)

@@ -7,12 +7,9 @@ import os
 import re
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
-import numpy as np
-
-from agents.arrays import Array
 from agents.clock import uptime
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4.odometry import Odometer
@@ -22,6 +19,8 @@ REPORTED_S: Final = (0.004, 0.045)  # a report of way that covers less or more i
 GAP_S: Final = 0.3  # [s] commands further apart were parted by a gap of the link
 FIRST_ANSWER_S: Final = 3.0  # [s] for the first answer: a late one spends the only client of a server of 2023
 PLACED_S: Final = 1.0  # [s] between two positions that are given to a server which does not tell its own
+
+Ranges = tuple[Sequence[float], Sequence[float]]  # bearings [rad], distances from the robot's centre [m]
 
 
 class UnknownAnswer(OSError):
@@ -91,7 +90,7 @@ class Driver(Protocol):
         """Request odometry and update `odometer`; the answer shows that the last command was read."""
         ...
 
-    def ranges(self) -> tuple[Array, Array]:
+    def ranges(self) -> Ranges:
         """Bearings [rad] and distances from the robot's centre [m]."""
         ...
 
@@ -134,7 +133,7 @@ class Park:
         else:
             self._add_last(reports[-1], odometer, before, asked)
 
-    def ranges(self) -> tuple[Array, Array]:
+    def ranges(self) -> Ranges:
         self._send(b"get_data")
         try:
             answer = self._receive("get_data")
@@ -144,7 +143,7 @@ class Park:
         sound = protocol.numbers(answer.decode("ascii", "replace").strip("\0\r\n "))
         if len(sound) != len(protocol.SOUND_BEARING):
             raise UnknownAnswer(f"answers get_data with {_shown(answer)}; leave ranges out of its device table")
-        return protocol.SOUND_BEARING, protocol.sound_distance(np.array(sound))
+        return protocol.SOUND_BEARING, [protocol.sound_distance(each) for each in sound]
 
     def battery(self) -> float:
         return math.nan
@@ -212,7 +211,7 @@ class GoalPark(Park):
         super().__init__(wire, chosen, server)
         self._theta = 0.0  # [rad] heading by the server's count
         self._placed = -math.inf  # [s] when the server was told its position
-        self._way = np.zeros(2)  # [m] since then, in its frame
+        self._way = 0.0, 0.0  # [m] since then, in its frame
         self._about = 0.0  # [rad/s] of a turn toward a goal behind
         self._goal = (0.0, 0.0)  # [m] the last one, of a server that counts poses
         self._ahead = 0.0  # [m] to the farthest goal since the last count, behind which it has not driven
@@ -242,8 +241,8 @@ class GoalPark(Park):
             now = uptime()
             if not (v or turn) or now - self._placed > PLACED_S:
                 self._send(b"i 0.0 0.0")
-                self._way, self._placed = np.zeros(2), now
-            here = self._way.tolist()
+                self._way, self._placed = (0.0, 0.0), now
+            here = self._way
             goal, stay = (
                 (here[0] + x, here[1] + y)
                 for x, y in (
@@ -257,7 +256,8 @@ class GoalPark(Park):
         if not self.server.posed:
             way = self._add_turn(report, odometer, sent)
             self._theta = report[1]
-            self._way = self._way + way * np.array([math.cos(self._theta), math.sin(self._theta)])
+            x, y = self._way
+            self._way = x + way * math.cos(self._theta), y + way * math.sin(self._theta)
             return
         # the pose counts from the p before the last `i`, since a turn of the loop ends behind each command
         _, way, theta = report
@@ -334,13 +334,11 @@ class KTeam:
         left, right = self._request("R", 2)[:2]
         odometer.wheels(left, right, uptime())
 
-    def ranges(self) -> tuple[Array, Array]:
+    def ranges(self) -> Ranges:
         sound, light = len(protocol.SOUND_BEARING), len(protocol.LIGHT_BEARING)
-        distances = (
-            protocol.sound_distance(np.array(self._request("G", sound)[:sound])),
-            protocol.light_distance(np.array(self._request("N", light)[:light])),
-        )
-        return np.concatenate([protocol.SOUND_BEARING, protocol.LIGHT_BEARING]), np.concatenate(distances)
+        distances = [protocol.sound_distance(each) for each in self._request("G", sound)[:sound]]
+        distances += [protocol.light_distance(each) for each in self._request("N", light)[:light]]
+        return protocol.SOUND_BEARING + protocol.LIGHT_BEARING, distances
 
     def battery(self) -> float:
         return 0.01 * self._request("V,5", 1)[0]

@@ -10,11 +10,11 @@ import sys
 import termios
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
-from agents.arrays import Array
 from agents.body.device_locks import numeric
 from agents.body.interface import FRESH_S, BodyError
 from agents.clock import uptime
@@ -134,7 +134,9 @@ class Khepera4Link:
         self, name: str, address: Address, chosen: protocol.Khepera4Settings, start: tuple[float, float, float]
     ) -> None:
         self.odometry = Odometry()
-        self.scan: tuple[float, Array, Array] | None = None  # time [s, `uptime`], bearings [rad], distances [m]
+        self.scan: tuple[float, Sequence[float], Sequence[float]] | None = (
+            None  # time [s, `uptime`], bearings [rad], distances [m]
+        )
         self.battery = math.nan  # charge, 0 to 1
         self.setpoint = (0.0, 0.0, -math.inf)  # v [m/s], ω [rad/s], time [s, `uptime`] of what it was decided on
         self.halted_since = math.inf  # [s, `uptime`]; infinity while the robot may move

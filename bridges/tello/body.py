@@ -9,17 +9,16 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
 from agents.body.interface import FRESH_S, BodyError, BodyRequest, BodyState, call_all, settings
 from agents.clock import uptime
 from agents.protocols import tello as protocol
+from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
 from bridges.tello.library import TelloLibrary
 from bridges.tello.pilot import Duty, TelloPilot
 
@@ -41,10 +40,8 @@ class TelloBody:
             if self._endpoints[row][0] in [host for host, _ in self._endpoints[:row]]:
                 raise BodyError(f"{name}: another Tello of this process has the address {self._endpoints[row][0]}")
         self._claims = Claims(self._names, [f"tello://{host}" for host, _ in self._endpoints])
-        rows = len(self._names)
         self._start_yaw = request.yaw
-        self._external = External(rows)
-        self._rows = np.arange(rows)
+        self._external = [External() for _ in self._names]
         self._library: TelloLibrary | None = None
         self._pilots: list[TelloPilot] = []
         self._lock = threading.Lock()
@@ -80,59 +77,54 @@ class TelloBody:
             remedy = f"switch it on, join its Wi-Fi, let UDP {protocol.STATE_PORT} through the firewall"
             raise BodyError(f"{'; '.join(reasons)} ({remedy})")
 
-    def read(self, t: float) -> BodyState:
-        rows = len(self._names)
-        nowhere = np.full((rows, 3), np.nan)
+    def read(self, t: float) -> Sequence[BodyState]:
         with self._lock:
             now = self._last_read = uptime()
-            yaw = self._start_yaw + [pilot.turned for pilot in self._pilots]
-            received = np.array([pilot.state_received for pilot in self._pilots]) - now + t
-            silent = np.array([pilot.silent(now) for pilot in self._pilots])
-            state = BodyState(
-                np.full(rows, t),
-                nowhere,
-                np.zeros((rows, 3)),
-                yaw,
-                nowhere.copy(),
-                np.full(rows, np.nan),
-                np.array([pilot.battery for pilot in self._pilots]),
-                np.array([pilot.flying for pilot in self._pilots]),
-                tuple(pilot.note(now) for pilot in self._pilots),
-                heard=received,
-            )
-            self._external.fill(state, self._rows)
-            fresh = t - state.time <= FRESH_S
-            for row, pilot in enumerate(self._pilots):
-                x, y, z = state.position[row].tolist() if fresh[row] else (math.nan,) * 3
-                pilot.position, pilot.yaw = (x, y, z), float(state.yaw[row])
-            # a drone without telemetry cannot be flown, even if its external position is fresh
-            state.time[silent] = np.minimum(state.time, received)[silent]
+            return [self._state(row, pilot, t, now) for row, pilot in enumerate(self._pilots)]
+
+    def _state(self, row: int, pilot: TelloPilot, t: float, now: float) -> BodyState:
+        """State of a drone, whose pilot gets its external pose."""
+        heard = pilot.state_received - now + t
+        state = BodyState(
+            t,
+            velocity=ZERO,
+            yaw=self._start_yaw[row] + pilot.turned,
+            battery=pilot.battery,
+            flying=pilot.flying,
+            heard=heard,
+            note=pilot.note(now),
+        )
+        self._external[row].fill(state)
+        pilot.position = state.position if t - state.time <= FRESH_S else UNKNOWN
+        pilot.yaw = state.yaw
+        if pilot.silent(now):  # a drone without telemetry cannot be flown, even if its external position is fresh
+            state.time = min(state.time, heard)
         return state
 
-    def command(self, setpoint: Array) -> None:
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
         with self._lock:
             now = uptime()
-            for pilot, (x, y, z, turn) in zip(self._pilots, setpoint.tolist(), strict=True):
-                if math.isfinite(x + y + z + turn) and pilot.duty in (Duty.HOLD, Duty.FLY):
-                    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, (x, y, z, turn), now
+            for pilot, setpoint in zip(self._pilots, setpoints, strict=True):
+                if math.isfinite(sum(setpoint)) and pilot.duty in (Duty.HOLD, Duty.FLY):
+                    pilot.duty, pilot.setpoint, pilot.setpoint_time = Duty.FLY, setpoint, now
 
-    def takeoff(self, rows: Index, height: Array) -> None:
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         with self._lock:
-            for row, to in zip(rows.tolist(), height.tolist(), strict=True):
-                self._pilots[row].take_off(to, uptime())
+            for row, height in zip(rows, heights, strict=True):
+                self._pilots[row].take_off(height, uptime())
 
-    def land(self, rows: Index) -> None:
-        with self._lock:
-            now = uptime()
-            call_all(partial(self._pilots[row].land, now) for row in rows.tolist() if self._pilots)
-
-    def stop(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         with self._lock:
             now = uptime()
-            call_all(partial(self._pilots[row].cut, now) for row in rows.tolist() if self._pilots)
+            call_all(partial(self._pilots[row].land, now) for row in rows if self._pilots)
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        self._external.update(row, t, position, yaw)
+    def stop(self, rows: Sequence[int]) -> None:
+        with self._lock:
+            now = uptime()
+            call_all(partial(self._pilots[row].cut, now) for row in rows if self._pilots)
+
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
+        self._external[row].update(t, position, yaw)
 
     def close(self) -> None:
         self._ending.set()

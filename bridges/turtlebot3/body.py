@@ -7,18 +7,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from math import nan
+from math import cos, inf, isfinite, sin
 from typing import Final
 
-import numpy as np
 import zenoh
 
-from agents.arrays import Array, Index
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import BodyError, BodyRequest, BodyState, Rays, call_all
+from agents.body.interface import BodyError, BodyRequest, BodyState, call_all
 from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import session as network
@@ -26,6 +24,7 @@ from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
+from agents.vectors import Setpoint, Vector
 from bridges.turtlebot3.robot import REPEAT_S, SILENCE_S, Robot
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
@@ -51,9 +50,9 @@ class TurtleBot3:
         self._robots = [Robot(request, row) for row in range(len(request.names))]
         self._claims = Claims([robot.name for robot in self._robots], [robot.device for robot in self._robots])
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
-        self._external_rows = np.flatnonzero(request.external)
-        self._external = External(len(self._robots))
-        self._read_at = -np.inf  # [s] the state on which the next command is decided
+        self._outside = request.external
+        self._external = [External() for _ in self._robots]
+        self._read_at = -inf  # [s] the state on which the next command is decided
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -72,12 +71,12 @@ class TurtleBot3:
                         session, ros2.types(where.distro), style=where.style, domain=where.domain
                     )
                 robot.join(participants[which])
-            while missing := [robot for robot in self._robots if robot.odometry_received == -np.inf]:
+            while missing := [robot for robot in self._robots if robot.odometry_received == -inf]:
                 if self._clock() > deadline:
                     raise BodyError("; ".join(self._missing_odometry(robot) for robot in missing))
                 time.sleep(POLL_S)
                 for robot in self._robots:
-                    robot.receive_messages(-np.inf, self._clock())
+                    robot.receive_messages(-inf, self._clock())
         except BaseException:
             self._close()
             raise
@@ -124,63 +123,58 @@ class TurtleBot3:
             hint += f" Namespaces with odometry there: {', '.join(sorted(others))}"
         return f"{robot.name}: no odometry on '{robot.odometry_key}': {hint}"
 
-    def read(self, t: float) -> BodyState:
+    def read(self, t: float) -> Sequence[BodyState]:
         now = self._read_at = self._clock()
-        robots = self._robots
-        for robot in robots:
+        for robot in self._robots:
             robot.receive_messages(t, now)
-            if robot.time == -np.inf and robot.odometry_received > -np.inf:
+            if robot.time == -inf and robot.odometry_received > -inf:
                 robot.time = t - (now - robot.odometry_received)  # received during `open`
             robot.send_command(self._clock())
-        rows = len(robots)
-        pose = np.array([robot.pose for robot in robots])
-        speed = np.array([robot.speed[0] for robot in robots])
-        position = np.zeros((rows, 3))
-        position[:, :2] = pose[:, :2]
-        position[np.isnan(pose[:, 0])] = nan
         linked = {endpoints: network.connected(session) for endpoints, session in self._sessions.items()}
+        return [
+            self._state(row, robot, t, now, linked=linked[robot.endpoints]) for row, robot in enumerate(self._robots)
+        ]
+
+    def _state(self, row: int, robot: Robot, t: float, now: float, *, linked: bool) -> BodyState:
+        (x, y, yaw), odometry = robot.pose, robot.time
         state = BodyState(
-            time=np.array([robot.time for robot in robots]),
-            position=position,
-            velocity=np.zeros((rows, 3)),
-            yaw=pose[:, 2].copy(),
-            true_position=np.full((rows, 3), nan),
-            true_yaw=np.full(rows, nan),
-            battery=np.array([robot.battery for robot in robots]),
-            flying=np.zeros(rows, dtype=bool),
-            notes=tuple(robot.note(now, linked[robot.endpoints]) for robot in robots),
-            rays=Rays.gather([robot.scan for robot in robots]),
-            heard=t - now + np.array([robot.odometry_received for robot in robots]),
+            odometry,
+            (x, y, 0.0 * x),
+            yaw=yaw,
+            battery=robot.battery,
+            heard=t - now + robot.odometry_received,
+            note=robot.note(now, linked),
+            scan=robot.scan,
         )
-        if len(self._external_rows):
-            odometry = state.time.copy()
-            self._external.fill(state, self._external_rows)
+        if self._outside[row]:
+            self._external[row].fill(state)
             # a robot with external positions but without odometry is still out of reach
-            state.time = np.where(t - odometry > SILENCE_S, np.minimum(state.time, odometry), state.time)
-        state.velocity[:, 0], state.velocity[:, 1] = speed * np.cos(state.yaw), speed * np.sin(state.yaw)
-        state.velocity[:, 2] = 0.0
+            if t - odometry > SILENCE_S:
+                state.time = min(state.time, odometry)
+        speed = robot.speed[0]
+        state.velocity = speed * cos(state.yaw), speed * sin(state.yaw), 0.0
         return state
 
-    def command(self, setpoint: Array) -> None:
+    def command(self, setpoints: Sequence[Setpoint]) -> None:
         """See `Body.command`: v [m/s] and ω [rad/s]."""
-        for robot, (v, w, _, _) in zip(self._robots, setpoint.tolist(), strict=True):
-            if np.isfinite(v) and np.isfinite(w):
+        for robot, (v, w, _, _) in zip(self._robots, setpoints, strict=True):
+            if isfinite(v) and isfinite(w):
                 robot.drive(v, w, self._read_at)
             robot.send_command(self._clock())
 
-    def takeoff(self, rows: Index, height: Array) -> None:
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """See `Body.takeoff`: no effect on a ground robot."""
 
-    def land(self, rows: Index) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         now = self._clock()
         if self._sessions:
-            call_all(partial(self._robots[row].halt, now) for row in rows.tolist())
+            call_all(partial(self._robots[row].halt, now) for row in rows)
 
-    def stop(self, rows: Index) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         self.land(rows)
 
-    def locate(self, row: int, t: float, position: Array, yaw: float) -> None:
-        self._external.update(row, t, position, yaw)
+    def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
+        self._external[row].update(t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
         return Inspection(volts=number(self._robots[row].volts))
@@ -191,7 +185,7 @@ class TurtleBot3:
             return
         until = self._clock() + STANDSTILL_S
         try:
-            self.stop(np.arange(len(self._robots)))
+            self.stop(range(len(self._robots)))
             while (now := self._clock()) < until:
                 for robot in self._robots:
                     robot.receive_messages(robot.time, now)

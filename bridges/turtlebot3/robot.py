@@ -10,7 +10,6 @@ from collections import deque
 from math import cos, hypot, inf, isfinite, nan, pi, sin
 from typing import Final
 
-import numpy as np
 import zenoh
 
 from agents.body.interface import FRESH_S, UNANSWERED, BodyError, BodyRequest, RangeScan, settings
@@ -73,11 +72,11 @@ class Robot:
         self.volts = nan  # of the battery [V]
         self.battery = nan  # charge, 0 to 1
         self.scan: RangeScan | None = None  # the newest
-        self.odometry_received = -np.inf  # time of the last odometry, monotonic [s]
-        self.time = -np.inf  # time of measurement of the pose, on the clock of `Body.read` [s]
+        self.odometry_received = -inf  # time of the last odometry, monotonic [s]
+        self.time = -inf  # time of measurement of the pose, on the clock of `Body.read` [s]
         self.age = 0.0  # of the last odometry when it arrived, by its stamp [s]
-        x, y, _ = request.start[row].tolist()
-        self._start = (x, y, float(request.yaw[row]))
+        x, y, _ = request.start[row]
+        self._start = (x, y, request.yaw[row])
         self._top = (kind.speed, kind.turn_rate)
         self._raw_pose: Planar = (nan, nan, nan)  # in odometry's own frame
         self._frame: Planar | None = None  # origin of odometry in the arena
@@ -85,8 +84,8 @@ class Robot:
         self._resets: deque[float] = deque(maxlen=RESETS[0])  # times of the last, monotonic [s]
         self._odometry_age, self._scan_age = StampAge(), StampAge()
         self._twist = self._sent_twist = (0.0, 0.0)
-        self._commanded = self._sent_at = self._still_since = -np.inf
-        self._halted_since = np.inf  # monotonic [s]; infinity while the robot may move
+        self._commanded = self._sent_at = self._still_since = -inf
+        self._halted_since = inf  # monotonic [s]; infinity while the robot may move
         self._zeros = ZEROS  # nothing to repeat: nothing is sent before the first command
         self._command_receivers: dict[str, tuple[str, str]] = {}
 
@@ -147,13 +146,13 @@ class Robot:
         twist = message.twist.twist
         x, y, v, w = place.x, place.y, twist.linear.x, twist.angular.z
         yaw = ros2.yaw_of(q)
-        if not np.isfinite((x, y, yaw, v, w)).all():
+        if not all(map(isfinite, (x, y, yaw, v, w))):
             return False
         if self._frame is None:
             boot = self.settings.origin == "boot"
             self._frame = self._start if boot else _frame(self._start, (x, y, yaw))
         pose = _to_arena(self._frame, (x, y, yaw))
-        if self.odometry_received > -np.inf and self._odometry_reset((x, y, yaw), pose, now):
+        if self.odometry_received > -inf and self._odometry_reset((x, y, yaw), pose, now):
             # odometry counts from zero again: assume that the robot stands at its last known pose
             self._frame, self._restarted = _frame(self.pose, (x, y, yaw)), True
             self._resets.append(now)
@@ -189,7 +188,7 @@ class Robot:
         """Drive at v [m/s], ω [rad/s] until the next command, for `FRESH_S` at most."""
         self._commanded = now
         if v or w:
-            self._halted_since = np.inf
+            self._halted_since = inf
         self._set_twist((turtlebot3.whole(v, self._top[0]), turtlebot3.whole(w, self._top[1])), now)
 
     def stale(self, now: float) -> bool:
@@ -200,7 +199,7 @@ class Robot:
         """Stop the robot: send zeros at once and repeat them."""
         self._halted_since = min(self._halted_since, now)
         self._zeros = 0
-        self._sent_at = -np.inf
+        self._sent_at = -inf
         self._set_twist((0.0, 0.0), now)
         self.send_command(now)
 
@@ -218,7 +217,7 @@ class Robot:
             self._set_twist((0.0, 0.0), now)
         twist = self._twist
         moving = twist != (0.0, 0.0)
-        if not moving and self._zeros >= ZEROS and (self._sent_at == -np.inf or self.standing):
+        if not moving and self._zeros >= ZEROS and (self._sent_at == -inf or self.standing):
             return
         if now - self._sent_at < (BETWEEN_S if twist != self._sent_twist else REPEAT_S):
             return
@@ -241,7 +240,7 @@ class Robot:
         if now - self.odometry_received > SILENCE_S:
             return (
                 f"odometry silent for {now - self.odometry_received:.0f} s"
-                if self.odometry_received > -np.inf
+                if self.odometry_received > -inf
                 else "no odometry"
             )
         if self._unsteady(now):
@@ -292,13 +291,10 @@ def _frame(arena: Planar, pose: Planar) -> Planar:
 
 def ranges(scan: Message, t: float) -> RangeScan:
     """A LaserScan taken at `t` [s]; rays without a hit inside the sensor's range, or without a bearing, are NaN."""
-    distance = scan.ranges.astype(float)
-    bearing = scan.angle_min + scan.angle_increment * np.arange(len(distance))
-    valid = (distance >= scan.range_min) & (distance <= scan.range_max) & (distance > 0.0)
-    valid &= np.isfinite(distance) & np.isfinite(bearing)
-    return RangeScan(
-        t,
-        np.nan_to_num(bearing, nan=0.0, posinf=0.0, neginf=0.0),
-        np.zeros(len(distance)),
-        np.where(valid, distance, nan),
-    )
+    bearings, distances = [], []
+    for number, distance in enumerate(scan.ranges.tolist()):
+        bearing = scan.angle_min + scan.angle_increment * number
+        valid = scan.range_min <= distance <= scan.range_max and 0.0 < distance < inf and isfinite(bearing)
+        bearings.append(bearing if isfinite(bearing) else 0.0)
+        distances.append(distance if valid else nan)
+    return RangeScan(t, bearings, (0.0,) * len(distances), distances)

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Final
 
 import msgspec
-import numpy as np
 import zenoh
 from msgspec import Meta
 
@@ -42,7 +41,7 @@ SKEW: Final = 1e-3  # tolerance of a rotation's orthonormality
 
 def heading(rotation: Sequence[float]) -> float:
     """Yaw [rad] of a rotation matrix (9,), row by row; NaN for an invalid one, such as zeros."""
-    a, b, c, d, e, f, g, h, i = rotation  # plain numbers: numpy takes ten times as long for three rows
+    a, b, c, d, e, f, g, h, i = rotation
     worst = max(
         abs(a * a + b * b + c * c - 1.0),
         abs(d * d + e * e + f * f - 1.0),
@@ -61,18 +60,19 @@ class PoseFilter:
         """`subjects`: subject name by robot; `print_line` prints a line for users."""
         self._subjects = dict(subjects)
         self._print_line = print_line
-        self._last = External(len(self._subjects))
-        self._seen_at = np.full(len(self._subjects), -np.inf)  # time of each robot's last pose [s]
-        self._pose: list[Segment | None] = [None] * len(self._subjects)  # last pose of each robot,
-        self._new_at = np.full(len(self._subjects), -np.inf)  # since when it is the same [s]
-        self._reported: list[str | None] = [None] * len(self._subjects)
+        count = len(self._subjects)
+        self._last = [External() for _ in self._subjects]
+        self._seen_at = [-math.inf] * count  # time of each robot's last pose [s]
+        self._pose: list[Segment | None] = [None] * count  # last pose of each robot,
+        self._new_at = [-math.inf] * count  # since when it is the same [s]
+        self._reported: list[str | None] = [None] * count
         self._not_z_up = False
         self._invalid = 0
 
     @property
     def refused(self) -> int:
         """Number of poses refused: no rotation, not finite, or a jump faster than any robot."""
-        return self._invalid + self._last.refused
+        return self._invalid + sum(last.refused for last in self._last)
 
     def filter_poses(self, frame: Frame, arrived: float) -> list[tuple[str, float, Segment, float]]:
         """Name, time of measurement [s], segment and yaw [rad] of each robot with a plausible pose.
@@ -92,10 +92,9 @@ class PoseFilter:
             frozen = segment is not None and arrived - self._new_at[row] >= REPEATED_S
             if segment is not None and frame.z_up and not frozen:
                 yaw = heading(segment.rotation)
-                position = np.array(segment.position)
                 if math.isnan(yaw) or not all(map(math.isfinite, segment.position)):
                     self._invalid += 1
-                elif self._last.update(row, measured, position, yaw):
+                elif self._last[row].update(measured, segment.position, yaw):
                     self._seen_at[row] = arrived
                     poses.append((robot, measured, segment, yaw))
             self._report(row, robot, subject, frame, arrived, frozen=frozen)

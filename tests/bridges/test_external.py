@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
+from math import isnan, nan
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED, BodyError, BodyRequest, Disturbance
@@ -19,6 +20,7 @@ from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.safety.detection import SLOWEST
+from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
 from bridges import external, measured_flight
 from bridges.external import ExternalBody
 from tests.conftest import RouterProcess
@@ -42,8 +44,8 @@ def request(endpoint: str, rows: dict[str, str] = ROWS, **device: object) -> Bod
         names=tuple(rows),
         kinds=tuple(KINDS[kind] for kind in rows.values()),
         addresses=("external",) * count,
-        start=np.zeros((count, 3)),
-        yaw=np.full(count, 0.25),
+        start=(ZERO,) * count,
+        yaw=(0.25,) * count,
         rate_hz=100.0,
         seeds=(1,) * count,
         disturbance=(Disturbance(),) * count,
@@ -122,22 +124,36 @@ class Drive:
     def __init__(self, body: ExternalBody) -> None:
         self.body = body
         self.zero = time.monotonic()
-        self.silent = np.full((len(ROWS), 4), np.nan)
 
-    def until(self, true: Callable[[], object], what: str, setpoint: np.ndarray | None = None) -> None:
+    def until(
+        self, true: Callable[[], object], what: str, setpoints: Sequence[Setpoint] = (NO_SETPOINT,) * len(ROWS)
+    ) -> None:
         def tick() -> object:
-            self.state = self.body.read(time.monotonic() - self.zero)
-            self.body.command(self.silent if setpoint is None else setpoint)
+            self.states = self.body.read(time.monotonic() - self.zero)
+            self.body.command(setpoints)
             return true()
 
         until(tick, what)
+
+    @property
+    def flying(self) -> list[bool]:
+        return [state.flying for state in self.states]
+
+    @property
+    def notes(self) -> list[str]:
+        return [state.note for state in self.states]
+
+    @property
+    def lowest(self) -> float:
+        """Height of the lower of both drones [m]."""
+        return min(state.position[2] for state in self.states[:2])
 
 
 # ---------------------------------------------------------------------- opening
 
 
 @pytest.mark.system
-def test_it_says_whose_position_is_missing_and_why(
+def test_missing_positions_are_named_with_reasons(
     router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(external, "OPEN_S", 0.5)
@@ -176,7 +192,7 @@ def test_it_says_whose_position_is_missing_and_why(
 
 
 @pytest.mark.system
-def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
+def test_bad_positions_settings_and_routers_are_named(
     router: RouterProcess, far: FarEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(external, "OPEN_S", 0.5)
@@ -205,41 +221,41 @@ def test_what_is_no_position_is_said_and_so_are_settings_and_routers(
 
 
 @pytest.mark.system
-def test_poses_are_as_they_were_said_and_grow_old(body: ExternalBody, far: FarEnd) -> None:
+def test_poses_are_as_published_and_grow_old(body: ExternalBody, far: FarEnd) -> None:
     drive = Drive(body)
     far.hush()
-    drive.until(lambda: drive.state.notes and drive.state.notes[0], "what was said before is old")
+    drive.until(lambda: drive.notes[0], "what was said before is old")
     utc, clock = time.time(), time.monotonic() - drive.zero
     for step in range(30):  # half a metre a second along x, with one frame that is elsewhere
         jump = 3.0 if step == 20 else 0.0
         far.say("CF01", [0.005 * step + jump, 0.0, 0.0], stamp=utc - 0.29 + 0.01 * step, yaw=None)
-    drive.until(lambda: drive.state.position[0, 0] >= 0.14, "the last of them is heard")
-    state = drive.state
-    assert state.position[0] == pytest.approx([0.145, 0.0, 0.0], abs=1e-12)
-    assert state.velocity[0] == pytest.approx([0.5, 0.0, 0.0], abs=0.05)
-    assert state.yaw == pytest.approx([0.5, 0.5, 0.5])
-    assert state.time[0] == pytest.approx(clock, abs=0.01)
-    assert np.isnan(state.true_position).all()
-    assert np.isnan(state.battery).all()
-    assert not state.flying.any()
-    old = state.time.copy()
-    drive.until(lambda: all("no position for" in note for note in drive.state.notes or ("",)), "they grow old")
-    np.testing.assert_allclose(drive.state.time, old, atol=0.02)
+    drive.until(lambda: drive.states[0].position[0] >= 0.14, "the last of them is heard")
+    state = drive.states[0]
+    assert state.position == pytest.approx((0.145, 0.0, 0.0), abs=1e-12)
+    assert state.velocity == pytest.approx((0.5, 0.0, 0.0), abs=0.05)
+    assert state.time == pytest.approx(clock, abs=0.01)
+    for state in drive.states:
+        assert state.yaw == pytest.approx(0.5)
+        assert all(map(isnan, (*state.true_position, state.battery)))
+        assert not state.flying
+    old = [state.time for state in drive.states]
+    drive.until(lambda: all("no position for" in note for note in drive.notes), "they grow old")
+    assert [state.time for state in drive.states] == pytest.approx(old, abs=0.02)
     far.session.put(KEYS.position("CF01"), b"\xff\x00", encoding="application/json")
     far.say("CF01", [float("nan"), 0.0, 0.0])
     far.say("CF01", [0.0, 0.0, 0.0], stamp=time.time() + 3600.0)
     far.session.put(KEYS.position("CF01"), b'{"robot":"KH01","stamp":1.0,"position":[0,0,0]}', encoding=messages.JSON)
-    drive.until(lambda: "4 positions refused" in drive.state.notes[0], "nonsense is counted")
-    assert drive.state.position[0] == pytest.approx([0.145, 0.0, 0.0], abs=1e-12)
+    drive.until(lambda: "4 positions refused" in drive.notes[0], "nonsense is counted")
+    assert drive.states[0].position == pytest.approx((0.145, 0.0, 0.0), abs=1e-12)
     far.talk(*ROWS)
-    drive.until(lambda: drive.state.position[0, 0] == 0.0 and "no position" not in drive.state.notes[0], "it is back")
+    drive.until(lambda: drive.states[0].position[0] == 0.0 and "no position" not in drive.notes[0], "it is back")
 
 
 @pytest.mark.system
 def test_what_robots_see_comes_from_the_far_end(body: ExternalBody, far: FarEnd) -> None:
     drive = Drive(body)
     drive.until(lambda: True, "a first look")
-    assert drive.state.rays is None
+    assert all(state.scan is None for state in drive.states)
 
     def say(name: str, *distance: float | None, robot: str | None = None) -> None:
         angles = [0.1 * k for k in range(len(distance))]
@@ -248,48 +264,48 @@ def test_what_robots_see_comes_from_the_far_end(body: ExternalBody, far: FarEnd)
 
     say("KH01", 0.25, None, 1.5)
     say("CF01", 2.0)
-    drive.until(lambda: drive.state.rays is not None and len(drive.state.rays.row) == 4, "they are heard")
-    rays = drive.state.rays
-    assert rays is not None
-    assert rays.row.tolist() == [0, 2, 2, 2]
-    np.testing.assert_array_equal(rays.distance, [2.0, 0.25, np.nan, 1.5])
-    assert rays.bearing.tolist() == pytest.approx([0.0, 0.0, 0.1, 0.2])
-    assert rays.time == pytest.approx(time.monotonic() - drive.zero, abs=0.5)
+    drive.until(lambda: drive.states[0].scan is not None and drive.states[2].scan is not None, "they are heard")
+    first, second, third = (state.scan for state in drive.states)
+    assert first is not None
+    assert second is None
+    assert third is not None
+    assert first.distance == (2.0,)
+    assert third.distance == (0.25, pytest.approx(nan, nan_ok=True), 1.5)
+    assert third.bearing == pytest.approx((0.0, 0.1, 0.2))
+    assert third.time == pytest.approx(time.monotonic() - drive.zero, abs=0.5)
     say("KH01", 0.1, robot="TE01")
-    drive.until(lambda: any("1 sweeps refused" in note for note in drive.state.notes), "nonsense is counted")
-    drive.until(lambda: drive.state.rays is None, "what is old is forgotten")
+    drive.until(lambda: any("1 sweeps refused" in note for note in drive.notes), "nonsense is counted")
+    drive.until(lambda: all(state.scan is None for state in drive.states), "what is old is forgotten")
 
 
 # ---------------------------------------------------------------------- what it says
 
 
 @pytest.mark.system
-def test_a_far_end_that_begins_anew_is_told_what_was_under_way(body: ExternalBody, far: FarEnd) -> None:
+def test_restarted_simulator_hears_orders_under_way(body: ExternalBody, far: FarEnd) -> None:
     """The twin service was killed while one robot climbed and the other landed; its successor knows of neither."""
     drive = Drive(body)
     drive.until(lambda: True, "a first look")
-    everyone = np.array([0, 1])
-    body.takeoff(everyone, np.array([0.6, 0.8]))
+    body.takeoff([0, 1], [0.6, 0.8])
     far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.3]
-    drive.until(lambda: drive.state.position[:2, 2].min() > 0.2, "they are up")
-    body.land(np.array([1]))
+    drive.until(lambda: drive.lowest > 0.2, "they are up")
+    body.land([1])
     drive.until(lambda: far.actions("TE01", "land"), "one lands")
     climb, landing = far.actions("CF01", "takeoff")[-1].seq, far.actions("TE01", "land")[-1].seq
     far.hush()
-    drive.until(lambda: any("no position" in note for note in drive.state.notes), "silence is noticed")
-    assert drive.state.flying.tolist() == [True, True, False]
+    drive.until(lambda: any("no position" in note for note in drive.notes), "silence is noticed")
+    assert drive.flying == [True, True, False]
     assert far.actions("TE01", "drive") == []
     told = len(far.actions("CF01", "takeoff"))
     far.talk(*ROWS)
     drive.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "it is told again to climb")
     assert {command.seq for command in far.actions("CF01", "takeoff")} == {climb}
     assert {command.seq for command in far.actions("TE01", "land")} == {landing}
-    setpoint = np.full((3, 4), np.nan)
-    setpoint[0] = [0.0, 0.0, 0.6, 0.0]
-    drive.until(lambda: far.actions("CF01", "drive"), "it is steered", setpoint)
+    setpoints = [(0.0, 0.0, 0.6, 0.0), NO_SETPOINT, NO_SETPOINT]
+    drive.until(lambda: far.actions("CF01", "drive"), "it is steered", setpoints)
     told = len(far.actions("CF01", "takeoff"))
     driven = len(far.actions("CF01", "drive"))
-    drive.until(lambda: len(far.actions("CF01", "drive")) > driven + 40, "it is steered on", setpoint)
+    drive.until(lambda: len(far.actions("CF01", "drive")) > driven + 40, "it is steered on", setpoints)
     assert len(far.actions("CF01", "takeoff")) <= told + 1, "what is steered need not climb"
 
 
@@ -312,8 +328,8 @@ def test_numbers_after_standstill_exceed_those_of_successor(monkeypatch: pytest.
     def process() -> ExternalBody:
         made = ExternalBody(request("tcp/127.0.0.1:1", {"CF01": "crazyflie"}))
         monkeypatch.setattr(made, "_read_positions", lambda: None)
-        positions = SimpleNamespace(ahead=np.zeros(1), malformed=[0])
-        ranges = SimpleNamespace(read=lambda *_: None, malformed=0)
+        positions = SimpleNamespace(ahead=[0.0], malformed=[0])
+        ranges = SimpleNamespace(replace_scans=lambda *_: None, malformed=0)
         monkeypatch.setattr(made, "_positions", positions, raising=False)
         monkeypatch.setattr(made, "_ranges", ranges, raising=False)
         return made
@@ -324,27 +340,27 @@ def test_numbers_after_standstill_exceed_those_of_successor(monkeypatch: pytest.
         for _ in range(100):
             now[0] += 0.01
             of.read(now[0] - 1000.0)
-            of.command(np.zeros((1, 4)))
+            of.command([(0.0, 0.0, 0.0, 0.0)])
         return seen
 
     first = process()
     before = numbers(first)
-    assert np.diff(before).tolist() == [1] * 99
+    assert [later - sooner for sooner, later in pairwise(before)] == [1] * 99
     now[0] += 30.0  # it stands still; another process takes the name, and ends
     between = numbers(process())
     assert numbers(first)[0] > between[-1] > before[-1]
 
 
 @pytest.mark.system
-def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: ExternalBody, far: FarEnd) -> None:
-    sent = np.arange(40.0).reshape(10, 1, 4) + 100.0 * np.arange(3).reshape(3, 1)
-    sent[:, 1] = np.nan
-    for setpoint in sent:
-        body.command(setpoint)
+def test_setpoints_are_sent_once_nan_never(body: ExternalBody, far: FarEnd) -> None:
+    for step in range(10):
+        x = 4.0 * step
+        body.command([(x, x + 1.0, x + 2.0, x + 3.0), NO_SETPOINT, (x + 200.0, 0.0, 0.0, 0.0)])
     until(lambda: len(far.look()) >= 20, "they arrive")
-    for row, name in ((0, "CF01"), (2, "KH01")):
+    for name, first in (("CF01", 0.0), ("KH01", 200.0)):
         drives = far.actions(name, "drive")
-        assert [command.setpoint for command in drives] == [tuple(values) for values in sent[:, row].tolist()]
+        given = [command.setpoint for command in drives if command.setpoint is not None]
+        assert [setpoint[0] for setpoint in given] == [first + 4.0 * step for step in range(10)]
         assert [command.seq - drives[0].seq for command in drives] == list(range(10))
         assert drives[0].seq > 1e3 * (time.time() - 60.0)  # and grow from one process to the next
         assert all(abs(command.stamp - time.time()) < 5.0 for command in drives)
@@ -353,20 +369,20 @@ def test_every_setpoint_is_said_once_and_rows_of_nan_are_left_alone(body: Extern
 
 @pytest.mark.mechanism("external body: orders are repeated")
 @pytest.mark.system
-def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody, far: FarEnd) -> None:
+def test_orders_are_repeated_until_obeyed(body: ExternalBody, far: FarEnd) -> None:
     drive = Drive(body)
     drive.until(lambda: True, "a first look")
-    rows = np.arange(3)
-    body.takeoff(rows, np.array([0.6, 0.8, 0.0]))
+    rows = range(3)
+    body.takeoff(rows, [0.6, 0.8, 0.0])
     drive.until(lambda: len(far.actions("CF01", "takeoff")) >= 3, "takeoff is repeated")
-    assert drive.state.flying.tolist() == [True, True, False]
+    assert drive.flying == [True, True, False]
     first = far.actions("CF01", "takeoff")[0].seq
     assert {(c.seq, c.height) for c in far.actions("CF01", "takeoff")} == {(first, 0.6)}
     assert {c.height for c in far.actions("TE01", "takeoff")} == {0.8}
     assert far.actions("KH01", "takeoff") == []
     far.place["CF01"] = [0.0, 0.0, 0.3]
     far.place["TE01"] = [0.0, 0.0, 0.3]
-    drive.until(lambda: drive.state.position[:2, 2].min() > 0.2, "they are up")
+    drive.until(lambda: drive.lowest > 0.2, "they are up")
     told = len(far.actions("CF01", "takeoff"))
     drive.until(lambda: len(far.actions("CF01", "takeoff")) >= told + 5, "another may answer half-way up")
     silent = len(far.actions("CF01", "takeoff"))
@@ -376,23 +392,23 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
     drive.until(lambda: len(far.actions("CF01", "land")) >= 3, "land is repeated")
     assert len(far.actions("CF01", "takeoff")) - silent <= 1
     assert len(far.actions("TE01", "takeoff")) - again <= 1
-    assert drive.state.flying.tolist() == [True, True, False]
+    assert drive.flying == [True, True, False]
     assert {c.seq for c in far.actions("CF01", "land")} == {first + 1}
     assert len(far.actions("KH01", "land")) >= 1
     far.place["CF01"] = [0.0, 0.0, 0.01]
-    drive.until(lambda: not drive.state.flying[0], "one is down")
-    assert drive.state.flying.tolist() == [False, True, False]
+    drive.until(lambda: not drive.flying[0], "one is down")
+    assert drive.flying == [False, True, False]
 
-    body.stop(np.array([1, 2]))
-    body.land(np.array([1, 2]))  # a stop is the last word
-    moving = np.ones((3, 4))
+    body.stop([1, 2])
+    body.land([1, 2])  # a stop is the last word
+    moving = [(1.0, 1.0, 1.0, 1.0)] * 3
     drive.until(lambda: len(far.actions("TE01", "stop")) >= 5, "stop is repeated", moving)
-    assert drive.state.flying.tolist() == [False, True, False]  # it is seen where it was
-    drive.until(lambda: UNANSWERED in drive.state.notes[1] if drive.state.notes else False, "it is said", moving)
-    assert UNANSWERED not in drive.state.notes[2]  # it stands
+    assert drive.flying == [False, True, False]  # it is seen where it was
+    drive.until(lambda: UNANSWERED in drive.notes[1], "it is said", moving)
+    assert UNANSWERED not in drive.notes[2]  # it stands
     far.place["TE01"] = [0.0, 0.0, 0.0]
-    drive.until(lambda: not drive.state.flying.any(), "it has come down", moving)
-    assert not any(drive.state.notes)
+    drive.until(lambda: not any(drive.flying), "it has come down", moving)
+    assert not any(drive.notes)
     assert {c.seq for c in far.actions("TE01", "stop")} == {first + 2}
     assert len(far.actions("KH01", "stop")) >= 5
     assert far.actions("TE01", "drive") == far.actions("KH01", "drive") == []  # a stop is the last word
@@ -400,24 +416,22 @@ def test_orders_are_repeated_until_they_are_seen_to_be_obeyed(body: ExternalBody
 
 
 @pytest.mark.system
-def test_a_robot_that_lands_unseen_is_taken_for_down_in_the_end(
-    body: ExternalBody, far: FarEnd, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unseen_landing_ends_at_last(body: ExternalBody, far: FarEnd, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measured_flight, "LANDING_S", 1.0)
     drive = Drive(body)
     far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.0]
     drive.until(lambda: True, "a first look")
-    body.takeoff(np.array([0, 1]), np.array([0.6, 0.6]))
+    body.takeoff([0, 1], [0.6, 0.6])
     far.place["CF01"] = far.place["TE01"] = [0.0, 0.0, 0.5]
-    drive.until(lambda: drive.state.position[:2, 2].min() > 0.4, "they are up")
+    drive.until(lambda: drive.lowest > 0.4, "they are up")
     far.hush()
     far.talk("TE01")
-    body.land(np.array([0, 1]))
+    body.land([0, 1])
     told = time.monotonic()
-    drive.until(lambda: not drive.state.flying[0], "nobody has seen it for long")
+    drive.until(lambda: not drive.flying[0], "nobody has seen it for long")
     assert time.monotonic() - told > 0.5 / SLOWEST, "from 0.5 m it may take so long"
-    assert drive.state.flying[1]  # this one is seen, and does not come down
-    assert drive.state.notes[0].startswith("no position for")
+    assert drive.flying[1]  # this one is seen, and does not come down
+    assert drive.notes[0].startswith("no position for")
 
 
 @pytest.mark.mechanism("external body: router loss")
@@ -426,38 +440,38 @@ def test_it_outlives_its_router(body: ExternalBody, far: FarEnd, router: RouterP
     drive = Drive(body)
     drive.until(lambda: True, "a first look")
     router.kill()
-    drive.until(lambda: drive.state.notes and drive.state.notes[0], "silence is noticed", np.ones((3, 4)))
+    drive.until(lambda: drive.notes[0], "silence is noticed", [(1.0, 1.0, 1.0, 1.0)] * 3)
     before = len(far.look())
     router.start()
-    drive.until(lambda: not any(drive.state.notes), "it is back", np.ones((3, 4)))
-    drive.until(lambda: len(far.look()) > before, "it is heard again", np.ones((3, 4)))
+    drive.until(lambda: not any(drive.notes), "it is back", [(1.0, 1.0, 1.0, 1.0)] * 3)
+    drive.until(lambda: len(far.look()) > before, "it is heard again", [(1.0, 1.0, 1.0, 1.0)] * 3)
 
 
 def test_no_take_off_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     body, said = ExternalBody(request("tcp/127.0.0.1:1")), list[str]()
     monkeypatch.setattr(body, "_put", lambda _, command: said.append(command.action))
-    body.stop(np.array([0]))
-    body.takeoff(np.array([0]), np.array([1.0]))
-    body.land(np.array([0]))
-    body.command(np.full((3, 4), np.nan))
+    body.stop([0])
+    body.takeoff([0], [1.0])
+    body.land([0])
+    body.command([NO_SETPOINT] * 3)
     assert said == ["stop", "stop"]
 
 
 def test_pose_of_wheels_is_as_old_as_its_yaw(monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot that steers by a yaw that is not told any more has no position; one in the air does."""
-    body, samples, now = ExternalBody(request("tcp/127.0.0.1:1")), list[tuple[int, float, np.ndarray, float]](), [0.0]
+    body, samples, now = ExternalBody(request("tcp/127.0.0.1:1")), list[tuple[int, float, Vector, float]](), [0.0]
     body._positions = SimpleNamespace(  # type: ignore[assignment]
-        receive=lambda *_: samples, ahead=None, malformed=[0] * 3, trouble=[""] * 3
+        receive=lambda *_: samples, ahead=[nan] * 3, malformed=[0] * 3, trouble=[""] * 3
     )
-    body._ranges = SimpleNamespace(read=lambda *_: None, malformed=0)  # type: ignore[assignment]
+    body._ranges = SimpleNamespace(replace_scans=lambda *_: None, malformed=0)  # type: ignore[assignment]
     monkeypatch.setattr(body, "_now", lambda: now[0])
     for k in range(300):
         now[0] = 0.01 * k
-        yaw = 2.0 if k <= 100 else np.nan
-        samples[:] = [(row, now[0], np.zeros(3), yaw) for row in range(3)]
-        state = body.read(now[0])
+        yaw = 2.0 if k <= 100 else nan
+        samples[:] = [(row, now[0], ZERO, yaw) for row in range(3)]
+        states = body.read(now[0])
         if k == 140:
-            assert state.time[2] == pytest.approx(1.4)
-    assert state.yaw == pytest.approx(np.full(3, 2.0))
-    assert state.time == pytest.approx([2.99, 2.99, 1.0])
-    assert state.notes == ("", "", "no yaw for 2 s")
+            assert states[2].time == pytest.approx(1.4)
+    assert [state.yaw for state in states] == [2.0] * 3
+    assert [state.time for state in states] == pytest.approx([2.99, 2.99, 1.0])
+    assert [state.note for state in states] == ["", "", "no yaw for 2 s"]

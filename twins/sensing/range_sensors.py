@@ -56,7 +56,7 @@ SENSORS: Final[dict[str, Sensor]] = {
     # Khepera IV; the maker gives no accuracy, and rates depend on the program on the robot: 10 Hz, sigmas, heights
     # (lower than a landed Crazyflie is high) and dropouts are choices
     "infrared": Sensor(
-        bearing=LIGHT_BEARING,
+        bearing=np.array(LIGHT_BEARING),
         elevation=np.zeros(len(LIGHT_BEARING)),
         mount=RIM,
         height=0.025,
@@ -65,7 +65,7 @@ SENSORS: Final[dict[str, Sensor]] = {
         sigma=0.005,
     ),
     "ultrasonic": Sensor(
-        bearing=SOUND_BEARING,
+        bearing=np.array(SOUND_BEARING),
         elevation=np.zeros(len(SOUND_BEARING)),
         mount=RIM,
         height=0.025,
