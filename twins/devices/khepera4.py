@@ -14,14 +14,14 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Array
-from agents.body.interface import BodyError, settings
+from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Latency
-from twins.models.noise import Noise
+from twins.models.noise import refill
 
 GARBAGE: Final = (3.0, -2.0)  # [m] goal of servers whose goal was never set; theirs is what the memory holds
 RECEIVE_S: Final = 0.05  # [s] after which the fork's loop turns without a command,
@@ -30,11 +30,15 @@ MAIN_S: Final = 0.02  # [s] that of 2025-05, whether or not there are commands
 
 
 class _Robot:
-    """The robot below its server: wheels, encoders and battery."""
+    """A robot below its server: wheels, encoders and battery."""
 
-    def __init__(self, faults: Faults) -> None:
+    def __init__(self, body: BodyRequest, row: int, faults: Faults) -> None:
+        self._dt, self._faults = 1.0 / body.rate_hz, faults
+        self.model = Differential(body.kinds[row], body.start[row], body.yaw[row])
+        disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
+        self._latency, self._drift = Latency(disturbance, self._dt), Drift(disturbance, name, seed)
         self.charge = faults.battery
-        self.pulses = np.zeros(2)  # of the left and the right encoder, since power-on
+        self.pulses = (0.0, 0.0)  # of the left and the right encoder, since power-on
         self.speed = (0.0, 0.0)  # units
         self.twist = (0.0, 0.0)  # commanded v [m/s], ω [rad/s]
         self.sounding = 31  # mask of the ultrasonic sensors
@@ -48,11 +52,30 @@ class _Robot:
         """Stop both wheels."""
         self.twist = (0.0, 0.0)
 
-    def add_motion(self, ahead: float, turn: float, dt: float) -> None:
+    def move(self) -> None:
+        """One step."""
+        self.charge = max(0.0, self.charge - self._faults.drain * self._dt / KHEPERA4.endurance_s)
+        if self.charge <= 0.0:
+            self.halt()
+        model, drift = self.model, self._drift
+        (x, y, _), yaw = model.position, model.yaw
+        model.command(self._latency.delay((*self.twist, 0.0, 0.0)))
+        model.move(self._dt)
+        x, y, turn = model.position[0] - x, model.position[1] - y, model.yaw - yaw
+        if drift.present:  # of the encoders: wheels that slip
+            error_x, error_y = drift.x, drift.y
+            drift.advance(x, y)
+            refill(drift.noise)
+            x, y = x + drift.x - error_x, y + drift.y - error_y
+        middle = yaw + 0.5 * turn
+        self._add_motion(math.cos(middle) * x + math.sin(middle) * y, turn)
+
+    def _add_motion(self, ahead: float, turn: float) -> None:
         """Add one step of the wheels: way along the nose [m] and turn [rad]."""
         half = 0.5 * protocol.BASE * turn
-        self.pulses += np.array([ahead - half, ahead + half]) / protocol.PULSE
-        self.speed = (ahead - half) / dt / protocol.UNIT, (ahead + half) / dt / protocol.UNIT
+        left, right = ahead - half, ahead + half
+        self.pulses = self.pulses[0] + left / protocol.PULSE, self.pulses[1] + right / protocol.PULSE
+        self.speed = left / self._dt / protocol.UNIT, right / self._dt / protocol.UNIT
 
 
 class ParkProgram:
@@ -63,7 +86,7 @@ class ParkProgram:
 
     def __init__(self, robot: _Robot, name: str) -> None:
         self.robot, self.name, self.kind = robot, name, protocol.PARK[name]
-        self._last = robot.pulses.copy()
+        self._last = robot.pulses
         self._place = [0.0, 0.0]  # [m]
         self._theta = self._way = self._sum = 0.0  # [rad]; [m] in the last turn; sum of the bearing errors [rad]
         self._goal, self._active = GARBAGE, False
@@ -73,7 +96,7 @@ class ParkProgram:
         """A client was accepted."""
         if self.name == "fork":
             self._active = False
-        self._last = self.robot.pulses.copy()
+        self._last = self.robot.pulses
 
     def end_session(self) -> None:
         """The client has gone."""
@@ -138,8 +161,8 @@ class ParkProgram:
 
     def _encoders(self) -> tuple[float, float]:
         """Way [m] and turn [rad] since the encoders were read last; whole pulses."""
-        left, right = np.trunc(self.robot.pulses - self._last)
-        self._last = self.robot.pulses.copy()
+        left, right = (math.trunc(now - last) for now, last in zip(self.robot.pulses, self._last, strict=True))
+        self._last = self.robot.pulses
         return 0.5 * protocol.PULSE * (left + right), protocol.PULSE * (right - left) / self.kind.base
 
     def _turn(self) -> None:
@@ -210,7 +233,7 @@ def answer_kteam(robot: _Robot, line: str) -> str:
     elif letter == "U" and len(values) == 1:
         robot.sounding = values[0]
     elif letter == "I":
-        robot.pulses[:] = 0.0
+        robot.pulses = (0.0, 0.0)
     elif letter == "V" and values and values[0] in measured:
         return f"v,{round(measured[values[0]])}"
     elif letter in answers:
@@ -300,16 +323,14 @@ class KheperaDevice:
         chosen = [settings(protocol.Khepera4Settings, *row) for row in zip(body.names, body.device, strict=True)]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
-        self._model = Differential(body.kinds, body.start, body.yaw, self._dt)
-        self._latency = Latency(body.disturbance, self._dt)
-        self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
         self._servers: list[_Server] = []
         addresses = []
         try:
-            for name, address, choice in zip(body.names, body.addresses, chosen, strict=True):
-                listener = _listen(name, address)
+            for row, choice in enumerate(chosen):
+                listener = _listen(body.names[row], body.addresses[row])
                 server = choice.server or protocol.NEWEST
-                self._servers.append(_Server(_Robot(request.faults), server, request.faults, listener))
+                robot = _Robot(body, row, request.faults)
+                self._servers.append(_Server(robot, server, request.faults, listener))
                 host, port = listener.getsockname()
                 addresses.append(f"{'kteam' if server == 'kteam' else 'khepera4'}://{host}:{port}")
         except BodyError:
@@ -327,8 +348,8 @@ class KheperaDevice:
 
     def advance(self, t: float) -> None:
         for now in instants(self._t, t, self._dt):
-            self._step()
             for server in self._servers:
+                server.robot.move()
                 server.advance(now)
         self._t = t
         for server in self._servers:
@@ -336,7 +357,8 @@ class KheperaDevice:
                 server.flush()
 
     def truth(self) -> tuple[Array, Array]:
-        return self._model.position.copy(), self._model.yaw.copy()
+        models = [server.robot.model for server in self._servers]
+        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     def close(self) -> None:
         for server in self._servers:
@@ -345,30 +367,6 @@ class KheperaDevice:
 
     def _silent(self, server: _Server, t: float) -> bool:
         return self._faults.silent(t) or server.robot.charge <= 0.0
-
-    def _step(self) -> None:
-        wanted = np.zeros((len(self._servers), 4))
-        for row, server in enumerate(self._servers):
-            robot = server.robot
-            robot.charge = max(0.0, robot.charge - self._faults.drain * self._dt / KHEPERA4.endurance_s)
-            if robot.charge <= 0.0:
-                robot.halt()
-            wanted[row, :2] = robot.twist
-        if self._latency.present:
-            wanted = self._latency.delay(wanted)
-        place, yaw = self._model.position.copy(), self._model.yaw.copy()
-        self._model.command(wanted[:, :2])
-        self._model.advance()
-        moved, turn = (self._model.position - place)[:, :2], self._model.yaw - yaw
-        middle = yaw + 0.5 * turn
-        ahead = np.cos(middle) * moved[:, 0] + np.sin(middle) * moved[:, 1]
-        if self._drift.present:  # of the encoders: wheels that slip
-            error = self._drift.error.copy()
-            self._drift.advance(moved)
-            slip = self._drift.error - error
-            ahead = ahead + np.cos(middle) * slip[:, 0] + np.sin(middle) * slip[:, 1]
-        for row, server in enumerate(self._servers):
-            server.robot.add_motion(float(ahead[row]), float(turn[row]), self._dt)
 
 
 def _listen(name: str, address: str) -> socket.socket:

@@ -14,13 +14,14 @@ from typing import Final
 import numpy as np
 
 from agents.arrays import Array
-from agents.body.interface import BodyError, settings
+from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
+from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, difference, norm
 from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.disturbance import HoverJitter, Latency
-from twins.models.noise import Noise
+from twins.models.noise import refill
 from twins.models.quadrotor import Quadrotor
 
 PORT: Final = 18889  # not the drone's own 8889: djitellopy binds that on every address of this host
@@ -67,13 +68,18 @@ class Mode(Enum):
 
 
 class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
-    """Socket, client and commands of one drone."""
+    """Socket, client, commands and motion of one drone."""
 
     def __init__(
-        self, wire: socket.socket, faults: Faults, chance: np.random.Generator, chosen: protocol.TelloSettings
+        self, wire: socket.socket, faults: Faults, body: BodyRequest, row: int, chosen: protocol.TelloSettings
     ) -> None:
-        super().__init__(faults, chance)
-        self.wire = wire
+        name, seed, disturbance = body.names[row], body.seeds[row], body.disturbance[row]
+        super().__init__(faults, np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"loss")]))
+        self.wire, self._dt = wire, 1.0 / body.rate_hz
+        self.model = Quadrotor(body.kinds[row], body.start[row], body.yaw[row])
+        self._jitter = HoverJitter(disturbance, name, seed, self._dt)
+        self._latency = Latency(disturbance, self._dt)
+        self.start_yaw = body.yaw[row]
         self.stick_speed = chosen.twin_stick_speed  # [m/s] at full deflection
         self.seeks_pads = False  # mission pads are switched on
         self.mode = Mode.GROUND
@@ -82,8 +88,8 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         self.answer_to: tuple[str, int] | None = None  # receiver of the answer at the end of the manoeuvre
         self.last_command = 0.0
         self.sticks = (0, 0, 0, 0)
-        self.goal = np.zeros(3)
-        self.further: list[Array] = []  # points after the goal
+        self.goal = ZERO
+        self.further: list[Vector] = []  # points after the goal
         self.heading = 0.0
         self.pace = protocol.STICK_SPEED  # [m/s] of moves
         self.motors_s = 0.0
@@ -95,6 +101,15 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
     def aloft(self) -> bool:
         """Whether the drone accepts motion commands."""
         return self.mode in (Mode.STICKS, Mode.MOVE, Mode.TURN)
+
+    def fly(self, setpoint: Setpoint) -> None:
+        """One step; the setpoint takes effect after the latency."""
+        model = self.model
+        model.command(self._latency.delay(setpoint))
+        if self._jitter.present:
+            model.wobble = self._jitter.advance(model.held[2])
+            refill(self._jitter.noise)
+        model.move(self._dt)
 
     def hover(self) -> None:
         """Hover at the current place, if the drone is in controlled flight."""
@@ -127,23 +142,16 @@ class TelloDevice:
 
     def __init__(self, request: DeviceRequest) -> None:
         body = request.body
-        count = len(body.names)
         chosen = [
             settings(protocol.TelloSettings, name, table) for name, table in zip(body.names, body.device, strict=True)
         ]
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
-        self._model = Quadrotor(body.kinds, body.start, body.yaw, self._dt)
-        self._jitter = HoverJitter(body.disturbance, Noise(body.names, body.seeds, "hover jitter", 2), self._dt)
-        self._latency = Latency(body.disturbance, self._dt)
-        self._start_yaw = body.yaw.copy()
-        self._truth = np.array(body.start, dtype=float)
-        self._setpoint = np.full((count, 4), np.nan)
         self._drones: list[_Drone] = []
         try:
             for row, name in enumerate(body.names):
-                chance = np.random.default_rng([body.seeds[row], zlib.crc32(name.encode()), zlib.crc32(b"loss")])
-                self._drones.append(_Drone(_listen(name, body.addresses[row]), request.faults, chance, chosen[row]))
+                wire = _listen(name, body.addresses[row])
+                self._drones.append(_Drone(wire, request.faults, body, row, chosen[row]))
         except BodyError:
             self.close()
             raise
@@ -183,7 +191,8 @@ class TelloDevice:
             drone.flush()
 
     def truth(self) -> tuple[Array, Array]:
-        return self._truth.copy(), self._model.yaw.copy()
+        models = [drone.model for drone in self._drones]
+        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
 
     def close(self) -> None:
         for drone in self._drones:
@@ -207,7 +216,7 @@ class TelloDevice:
 
     def _answer(self, row: int, question: str) -> str:
         drone = self._drones[row]
-        height = float(self._truth[row, 2])
+        height = drone.model.position[2]
         answers = {
             "battery?": f"{round(100.0 * drone.charge)}\r\n",
             "speed?": f"{100.0 * drone.pace:.1f}\r\n",
@@ -254,28 +263,28 @@ class TelloDevice:
 
     def _start_automatic(self, row: int, word: str, sender: tuple[str, int]) -> str:
         """Start an automatic manoeuvre: take-off, landing or emergency stop; returns an immediate answer, or empty."""
-        drone, rows = self._drones[row], np.array([row])
+        drone = self._drones[row]
         if word == "emergency":
-            self._model.stop(rows)
+            drone.model.stop()
             drone.mode, drone.answer_to, drone.sticks = Mode.FALL, None, (0, 0, 0, 0)
             return "ok"
         if word == "takeoff":
             if drone.mode is not Mode.GROUND or drone.charge < LOWEST_TAKEOFF_CHARGE:
                 return "error"
-            self._model.takeoff(rows, np.array([protocol.TAKEOFF_HEIGHT]))
+            drone.model.takeoff(protocol.TAKEOFF_HEIGHT)
             drone.mode, drone.answer_to, drone.sticks = Mode.CLIMB, sender, (0, 0, 0, 0)
             return ""
         drone.landing_due = min(drone.landing_due, drone.t + drone.faults.refuse_landing_s)
         if drone.mode in (Mode.GROUND, Mode.CLIMB, Mode.FALL) or drone.t < drone.landing_due:
             return "error"  # busy with its take-off it obeys `emergency` only
         if drone.mode is not Mode.LAND:  # a repeated command changes nothing
-            self._model.land(rows)
+            drone.model.land()
         drone.mode, drone.answer_to = Mode.LAND, sender
         return ""
 
     def _manoeuvre(self, row: int, word: str, arguments: list[str], sender: tuple[str, int]) -> str:
         """Begin a move or turn; returns the answer of a refusal, else nothing yet."""
-        drone, yaw = self._drones[row], float(self._model.yaw[row])
+        drone, yaw = self._drones[row], self._drones[row].model.yaw
         try:
             if word in ("cw", "ccw"):
                 (angle,) = _integers(arguments, 1)
@@ -285,8 +294,9 @@ class TelloDevice:
             else:
                 ways, drone.pace = self._path_of_move(drone, word, arguments)
                 cos, sin = math.cos(yaw), math.sin(yaw)
-                turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-                drone.goal, *drone.further = [self._model.position[row] + turn @ way for way in ways]
+                x, y, z = drone.model.held
+                points = [(x + cos * a - sin * b, y + sin * a + cos * b, z + c) for a, b, c in np.array(ways).tolist()]
+                drone.goal, *drone.further = points
                 drone.mode = Mode.MOVE
         except _Refusal as refusal:
             return str(refusal)
@@ -317,12 +327,14 @@ class TelloDevice:
 
     def _yaw(self, row: int) -> int:
         """Yaw as reported: degrees clockwise from the yaw at power-on, -180 to 179."""
-        return (round(-math.degrees(float(self._model.yaw[row] - self._start_yaw[row]))) + 180) % 360 - 180
+        drone = self._drones[row]
+        return (round(-math.degrees(drone.model.yaw - drone.start_yaw)) + 180) % 360 - 180
 
     def _state(self, row: int) -> str:
-        drone, yaw, height = self._drones[row], float(self._model.yaw[row]), float(self._truth[row, 2])
+        drone = self._drones[row]
+        height = drone.model.position[2]
         pad, at = (-1, -100) if drone.seeks_pads else (-2, -200)  # none seen; not searched for
-        right, forward, up, _ = protocol.sticks(tuple(self._model.velocity[row].tolist()), 0.0, yaw)
+        right, forward, up, _ = protocol.sticks(drone.model.velocity, 0.0, drone.model.yaw)
         return (
             f"mid:{pad};x:{at};y:{at};z:{at};mpry:0,0,0;pitch:0;roll:0;yaw:{self._yaw(row)};"
             f"vgx:{int(forward / 10)};vgy:{int(right / 10)};vgz:{int(-up / 10)};templ:63;temph:66;"
@@ -334,37 +346,27 @@ class TelloDevice:
     # ------------------------------------------------------------------ the model
 
     def _step(self) -> None:
-        self._setpoint[:] = np.nan
-        for row, drone in enumerate(self._drones):
-            self._setpoint[row] = self._model_setpoint(row, drone)
-        setpoint = self._latency.delay(self._setpoint) if self._latency.present else self._setpoint
-        self._model.command(setpoint)
-        self._model.advance()
-        self._truth[:] = self._model.position
-        if self._jitter.present:
-            self._truth[:, :2] += self._jitter.advance(self._model.position[:, 2])
-        for row, drone in enumerate(self._drones):
-            self._update(row, drone)
+        for drone in self._drones:
+            drone.fly(self._model_setpoint(drone))
+            self._update(drone)
 
-    def _model_setpoint(self, row: int, drone: _Drone) -> tuple[float, float, float, float]:
-        yaw = float(self._model.yaw[row])
+    @staticmethod
+    def _model_setpoint(drone: _Drone) -> Setpoint:
+        yaw = drone.model.yaw
         if drone.mode is Mode.STICKS:
             return protocol.motion(drone.sticks, yaw, drone.stick_speed)
         if drone.mode is Mode.TURN:
             rate = max(-protocol.STICK_TURN, min(protocol.STICK_TURN, 4.0 * (drone.heading - yaw)))
             return 0.0, 0.0, 0.0, rate
         if drone.mode is Mode.MOVE:
-            way = drone.goal - self._model.position[row]
-            far = float(np.sqrt(way @ way))
-            x, y, z = (way * min(drone.pace / max(far, 1e-9), 1.5)).tolist()
-            return x, y, z, 0.0
-        return math.nan, math.nan, math.nan, math.nan
+            way = difference(drone.goal, drone.model.held)
+            pace = min(drone.pace / max(norm(way), 1e-9), 1.5)
+            return way[0] * pace, way[1] * pace, way[2] * pace, 0.0
+        return NO_SETPOINT
 
-    def _update(self, row: int, drone: _Drone) -> None:
+    def _update(self, drone: _Drone) -> None:
         """Update a drone after a step: end of manoeuvres, battery, automatic landing."""
-        model = self._model
-        z = float(model.position[row, 2])
-        flying = bool(model.flying[row])
+        z, flying = drone.model.held[2], drone.model.flying
         if drone.mode is Mode.CLIMB and abs(z - protocol.TAKEOFF_HEIGHT) < NEAR:
             drone.mode = Mode.STICKS
             drone.finish("ok")
@@ -373,7 +375,7 @@ class TelloDevice:
             drone.finish("ok")
         elif drone.mode is Mode.FALL and z <= 0.0:
             drone.mode = Mode.GROUND
-        elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(row, drone):
+        elif drone.mode in (Mode.MOVE, Mode.TURN) and self._arrived(drone):
             if drone.mode is Mode.MOVE and drone.further:
                 drone.goal = drone.further.pop(0)
             else:
@@ -385,15 +387,16 @@ class TelloDevice:
         drone.charge = max(0.0, drone.charge - drone.faults.drain * self._dt / TELLO.endurance_s)
         alone = drone.t - drone.last_command > protocol.AUTO_LAND_S
         if drone.mode is not Mode.LAND and (alone or drone.charge <= LANDING_CHARGE):
-            model.land(np.array([row]))
+            drone.model.land()
             drone.finish("error Auto land")
             drone.mode = Mode.LAND
 
-    def _arrived(self, row: int, drone: _Drone) -> bool:
+    @staticmethod
+    def _arrived(drone: _Drone) -> bool:
         if drone.mode is Mode.TURN:
-            return abs(drone.heading - float(self._model.yaw[row])) < NEAR_YAW
+            return abs(drone.heading - drone.model.yaw) < NEAR_YAW
         near = PASSED if drone.further else NEAR
-        return float(np.abs(drone.goal - self._model.position[row]).max()) < near
+        return max(map(abs, difference(drone.goal, drone.model.held))) < near
 
 
 class _Refusal(Exception):

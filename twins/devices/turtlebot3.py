@@ -10,32 +10,33 @@ from __future__ import annotations
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, inf, nan, pi, sin
+from math import cos, inf, isfinite, nan, pi, sin
 from typing import Final
 
 import numpy as np
 import zenoh
 
-from agents.arrays import Array, clamp
-from agents.body.interface import BodyError, settings
+from agents.arrays import Array
+from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import TURTLEBOT3
 from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
+from agents.vectors import clamp
 from twins.body import instants
 from twins.devices.device import DeviceRequest, FaultyLink
 from twins.models.differential import Differential
 from twins.models.disturbance import Drift, Measurement
-from twins.models.noise import Noise
+from twins.models.noise import refill
 
 JOIN_S: Final = 5.0  # deadline of the router's answer
 
 
 @dataclass
-class _Row:
-    """The ROS side of one robot."""
+class _Node:
+    """The ROS side of a robot."""
 
     types: ros2.Types
     command: Subscriber
@@ -43,9 +44,48 @@ class _Row:
     odometry: Publisher
     scan: Publisher
     battery: Publisher
-    start: tuple[float, float, float]
     watchdog: float
-    commanded: float = -inf
+
+
+class _Robot:
+    """Wheels, odometry and node of one robot."""
+
+    def __init__(self, node: _Node, body: BodyRequest, row: int) -> None:
+        self.node, self._dt = node, 1.0 / body.rate_hz
+        self.model = Differential(body.kinds[row], body.start[row], body.yaw[row])
+        self.start = (*body.start[row][:2], body.yaw[row])
+        disturbance, name, seed = body.disturbance[row], body.names[row], body.seeds[row]
+        self._measurement = Measurement(disturbance, name, seed, spatial=False)
+        self._drift = Drift(disturbance, name, seed)
+        self.twist = (0.0, 0.0)  # v [m/s], ω [rad/s]
+        self.commanded = -inf  # time of the last command [s]
+        self.executed = 0  # commands
+        self._last_yaw = self.model.yaw
+
+    def move(self) -> None:
+        """One step."""
+        x, y, _ = self.model.position
+        self.model.command((*self.twist, 0.0, 0.0))
+        self.model.move(self._dt)
+        if self._drift.present:
+            self._drift.advance(self.model.position[0] - x, self.model.position[1] - y)
+            refill(self._drift.noise)
+
+    def odometry(self) -> tuple[float, float, float, float, float]:
+        """Measured x, y [m] and yaw [rad] from the start; speed [m/s] and mean yaw rate since the last call [rad/s]."""
+        model = self.model
+        (x, y, _), yaw = model.position, model.yaw
+        if self._measurement.present:
+            dx, dy, _, turn = self._measurement.draw()
+            refill(self._measurement.noise)
+            x, y, yaw = x + dx, y + dy, yaw + turn
+        x0, y0, yaw0 = self.start
+        x, y = x + self._drift.x - x0, y + self._drift.y - y0
+        # as in the robot's node: speeds are averages since the last odometry
+        turned, self._last_yaw = model.yaw - self._last_yaw, model.yaw
+        speed = model.velocity[0] * cos(model.yaw) + model.velocity[1] * sin(model.yaw)
+        ahead, left = cos(yaw0) * x + sin(yaw0) * y, cos(yaw0) * y - sin(yaw0) * x
+        return ahead, left, yaw - yaw0, speed, turned * turtlebot3.ODOMETRY_HZ
 
 
 class TurtleBot3Twin:
@@ -56,21 +96,11 @@ class TurtleBot3Twin:
         self._dt = 1.0 / body.rate_hz
         self._t = 0.0
         self._ticks = 0
-        self._model = Differential(body.kinds, body.start, body.yaw, self._dt)
-        rows = len(body.names)
-        self._twist = np.zeros((rows, 2))
-        self._top: Array = np.array([TURTLEBOT3.speed, TURTLEBOT3.turn_rate])  # the maker's limits
-        self._last_yaw = self._model.yaw.copy()
         self._used = 0.0
-        self._measurement = Measurement(
-            body.disturbance, np.tile([1.0, 1.0, 0.0], (rows, 1)), Noise(body.names, body.seeds, "measurement", 4)
-        )
-        self._drift = Drift(body.disturbance, Noise(body.names, body.seeds, "odometry", 2))
         random = np.random.default_rng([body.seeds[0], 0x7B3])
         self._link = FaultyLink[tuple[Publisher, bytes]](request.faults, random)
-        self.commands_received = [0] * rows  # executed commands
         self._sessions: dict[tuple[str, ...], zenoh.Session] = {}
-        self._rows: list[_Row] = []
+        self._robots: list[_Robot] = []
         addresses = []
         self._clock = body.clock
         participants: dict[tuple[object, ...], Participant] = {}
@@ -84,8 +114,7 @@ class TurtleBot3Twin:
                 which = (endpoints, where.style, where.distro, where.domain)
                 if which not in participants:
                     participants[which] = self._participant(endpoints, where)
-                x, y = body.start[row, :2].tolist()
-                self._rows.append(_row(participants[which], where, chosen, (x, y, float(body.yaw[row]))))
+                self._robots.append(_Robot(_node(participants[which], where, chosen), body, row))
                 addresses.append(str(where))
         except BaseException:
             self.close()
@@ -117,11 +146,8 @@ class TurtleBot3Twin:
         silent = self._link.faults.silent(t)
         self._receive_commands(t)
         for _ in steps:
-            self._model.command(self._twist)  # repeated: this robot has no timeout, unlike the model
-            before = self._model.position[:, :2].copy()
-            self._model.advance()
-            if self._drift.present:
-                self._drift.advance(self._model.position[:, :2] - before)
+            for robot in self._robots:
+                robot.move()
             self._used += self._dt
             self._ticks += 1
             for rate, publish in (
@@ -136,7 +162,13 @@ class TurtleBot3Twin:
                 publisher.send(payload)
 
     def truth(self) -> tuple[Array, Array]:
-        return self._model.position.copy(), self._model.yaw.copy()
+        models = [robot.model for robot in self._robots]
+        return np.array([model.position for model in models]), np.array([model.yaw for model in models])
+
+    @property
+    def commands_received(self) -> list[int]:
+        """Executed commands of each robot."""
+        return [robot.executed for robot in self._robots]
 
     def close(self) -> None:
         """Leaves the network."""
@@ -147,20 +179,21 @@ class TurtleBot3Twin:
     # ------------------------------------------------------------------ commands
 
     def _receive_commands(self, t: float) -> None:
-        for index, row in enumerate(self._rows):
-            for message in row.command.received():
+        for robot in self._robots:
+            node = robot.node
+            for message in node.command.received():
                 if self._link.lost():
                     continue
-                said = message.twist if row.stamped else message
+                said = message.twist if node.stamped else message
                 v, w = said.linear.x, said.angular.z
-                if not (np.isfinite(v) and np.isfinite(w) and max(abs(v), abs(w)) < 1e6):
+                if not (isfinite(v) and isfinite(w) and max(abs(v), abs(w)) < 1e6):
                     continue
-                twist: Array = np.array([turtlebot3.cut(v), turtlebot3.cut(w)])
-                self._twist[index] = clamp(twist, -self._top, self._top)
-                row.commanded = t
-                self.commands_received[index] += 1
-            if t - row.commanded > row.watchdog:
-                self._twist[index] = 0.0
+                speed, rate = TURTLEBOT3.speed, TURTLEBOT3.turn_rate  # the maker's limits
+                robot.twist = clamp(turtlebot3.cut(v), -speed, speed), clamp(turtlebot3.cut(w), -rate, rate)
+                robot.commanded = t
+                robot.executed += 1
+            if t - robot.commanded > node.watchdog:
+                robot.twist = (0.0, 0.0)
 
     # ------------------------------------------------------------------ published topics
 
@@ -169,41 +202,28 @@ class TurtleBot3Twin:
             self._link.put((publisher, types.encode(message, publisher.kind)))
 
     def _odometry(self) -> None:
-        position, yaw = self._model.position[:, :2].copy(), self._model.yaw.copy()
-        if self._measurement.present:
-            noise = self._measurement.draw()
-            position, yaw = position + noise[:, :2], yaw + noise[:, 3]
-        if self._drift.present:
-            position = position + self._drift.error
-        # as in the robot's node: speeds are averages since the last odometry
-        turn = (self._model.yaw - self._last_yaw) * turtlebot3.ODOMETRY_HZ
-        self._last_yaw = self._model.yaw.copy()
-        velocity = self._model.velocity
-        speed = velocity[:, 0] * np.cos(self._model.yaw) + velocity[:, 1] * np.sin(self._model.yaw)
         now = self._clock.utc()
-        for index, row in enumerate(self._rows):
-            make = row.types.make
-            x0, y0, yaw0 = row.start
-            x, y = position[index, 0] - x0, position[index, 1] - y0
-            turned = float(yaw[index]) - yaw0
-            ahead, left = cos(yaw0) * x + sin(yaw0) * y, cos(yaw0) * y - sin(yaw0) * x
-            pose = row.types.pose(float(ahead), float(left), 0.0, turned)
-            twist = row.types.twist((float(speed[index]), 0.0, 0.0), (0.0, 0.0, float(turn[index])))
+        for robot in self._robots:
+            node = robot.node
+            make = node.types.make
+            ahead, left, turned, speed, rate = robot.odometry()
+            pose = node.types.pose(ahead, left, 0.0, turned)
+            twist = node.types.twist((speed, 0.0, 0.0), (0.0, 0.0, rate))
             message = make(
                 ros2.ODOMETRY,
-                header=row.types.header(now, "odom"),
+                header=node.types.header(now, "odom"),
                 child_frame_id="base_footprint",
                 pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
                 twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
             )
-            self._publish(row.odometry, row.types, message)
+            self._publish(node.odometry, node.types, message)
 
     def _scan(self) -> None:
         now, step = self._clock.utc(), 2.0 * pi / turtlebot3.RAYS
-        for row in self._rows:
-            message = row.types.make(
+        for node in (robot.node for robot in self._robots):
+            message = node.types.make(
                 ros2.LASER_SCAN,
-                header=row.types.header(now, "base_scan"),
+                header=node.types.header(now, "base_scan"),
                 angle_min=0.0,
                 angle_max=step * (turtlebot3.RAYS - 1),
                 angle_increment=step,
@@ -214,17 +234,17 @@ class TurtleBot3Twin:
                 ranges=np.full(turtlebot3.RAYS, inf, np.float32),  # nothing is in reach
                 intensities=np.zeros(turtlebot3.RAYS, np.float32),
             )
-            self._publish(row.scan, row.types, message)
+            self._publish(node.scan, node.types, message)
 
     def _battery(self) -> None:
         spent = self._used * self._link.faults.drain / TURTLEBOT3.endurance_s
         charge = max(0.0, self._link.faults.battery - spent)
         voltage = turtlebot3.EMPTY_V + charge * (turtlebot3.FULL_V - turtlebot3.EMPTY_V)
         now = self._clock.utc()
-        for row in self._rows:
-            message = row.types.make(
+        for node in (robot.node for robot in self._robots):
+            message = node.types.make(
                 ros2.BATTERY_STATE,
-                header=row.types.header(now, ""),
+                header=node.types.header(now, ""),
                 voltage=voltage,
                 temperature=nan,
                 current=nan,
@@ -241,22 +261,19 @@ class TurtleBot3Twin:
                 location="",
                 serial_number="",
             )
-            self._publish(row.battery, row.types, message)
+            self._publish(node.battery, node.types, message)
 
 
-def _row(
-    participant: Participant, where: Address, chosen: TurtleBot3Settings, start: tuple[float, float, float]
-) -> _Row:
+def _node(participant: Participant, where: Address, chosen: TurtleBot3Settings) -> _Node:
     """The node of one robot."""
     kind = turtlebot3.command_type(where.distro, chosen.stamped)
     node = participant.node("turtlebot3_node", where.namespace)
-    return _Row(
+    return _Node(
         types=participant.types,
         command=node.subscriber(chosen.command_topic, kind, depth=10),
         stamped=kind == ros2.TWIST_STAMPED,
         odometry=node.publisher(turtlebot3.ODOMETRY, ros2.ODOMETRY),
         scan=node.publisher(turtlebot3.SCAN, ros2.LASER_SCAN, ros2.SENSOR_DATA),
         battery=node.publisher(turtlebot3.BATTERY, ros2.BATTERY_STATE),
-        start=start,
         watchdog=chosen.watchdog_s or inf,
     )
