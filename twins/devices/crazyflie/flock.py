@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, some
+from agents.arrays import Array, Index, Mask, some
 from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
 from agents.body.kinds import CRAZYFLIE
@@ -20,7 +20,7 @@ from twins.devices.crazyflie.supervisor import Supervisor
 from twins.devices.crazyflie.vertical import VerticalLoops
 from twins.devices.device import Faults
 from twins.models.disturbance import HoverJitter, Latency, Measurement
-from twins.models.noise import Noise
+from twins.models.noise import refill
 from twins.models.quadrotor import GRAVITY, RESPONSES, Quadrotor
 
 SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
@@ -95,6 +95,70 @@ LEANING_S: Final = 0.05  # time constant of the attitude
 ENOUGH_ANCHORS: Final = 4  # for three dimensions and a common clock
 
 
+class Quadrotors:
+    """Motion models of N rows; their state is that of these arrays, which others may change between two steps."""
+
+    def __init__(self, request: BodyRequest, dt: float) -> None:
+        robots = zip(request.kinds, request.start, request.yaw, strict=True)
+        self._models, self._dt = [Quadrotor(*robot) for robot in robots], dt
+        self.position, self.velocity = np.array(request.start, dtype=float), np.zeros((len(self._models), 3))
+        self.yaw, self.flying = np.array(request.yaw, dtype=float), np.zeros(len(self._models), dtype=bool)
+
+    def command(self, setpoint: Array) -> None:
+        """Set positions and yaws (N, 4); no effect on rows of NaN, and on the ground."""
+        for model, flying, row in zip(self._models, self.flying.tolist(), setpoint.tolist(), strict=True):
+            model.flying = flying
+            model.command(tuple(row))
+
+    def stop(self, rows: Index) -> None:
+        """Switch motors off."""
+        self.flying[rows] = False
+
+    def advance(self) -> None:
+        """Advance one step."""
+        columns = (self.position.tolist(), self.velocity.tolist(), self.yaw.tolist(), self.flying.tolist())
+        for model, position, velocity, yaw, flying in zip(self._models, *columns, strict=True):
+            (x, y, z), (v_x, v_y, v_z) = position, velocity
+            model.held, model.velocity, model.yaw, model.flying = (x, y, z), (v_x, v_y, v_z), yaw, flying
+            model.move(self._dt)
+        self.position = np.array([model.position for model in self._models])
+        self.velocity = np.array([model.velocity for model in self._models])
+        self.yaw = np.array([model.yaw for model in self._models])
+
+
+class Disturbances:
+    """Disturbances of N rows."""
+
+    def __init__(self, request: BodyRequest, dt: float) -> None:
+        robots = list(zip(request.disturbance, request.names, request.seeds, strict=True))
+        self._jitters = [HoverJitter(*robot, dt) for robot in robots]
+        self._measurements = [Measurement(*robot, spatial=True) for robot in robots]
+        self._latencies = [Latency(disturbance, dt) for disturbance in request.disturbance]
+
+    def delay(self, setpoint: Array) -> Array:
+        """Setpoints (N, 4) that take effect now, when these were given."""
+        commands = zip(self._latencies, setpoint.tolist(), strict=True)
+        return np.array([latency.delay(tuple(command)) for latency, command in commands])
+
+    def jitter(self, height: Array) -> Array:
+        """Hover jitter (N, 2) of rows at heights (N,) [m]."""
+        moved = np.zeros((len(height), 2))
+        for row, jitter in enumerate(self._jitters):
+            if jitter.present:
+                moved[row] = jitter.advance(float(height[row]))
+                refill(jitter.noise)
+        return moved
+
+    def noise(self) -> Array:
+        """Noise (N, 3) of a measured position [m]."""
+        drawn = np.zeros((len(self._measurements), 3))
+        for row, measurement in enumerate(self._measurements):
+            if measurement.present:
+                drawn[row] = measurement.draw()[:3]
+                refill(measurement.noise)
+        return drawn
+
+
 class Flock:
     """N Crazyflies; the protocol of each is a `twins.devices.crazyflie.drone.Drone`."""
 
@@ -121,7 +185,7 @@ class Flock:
         self.commander = Commander(rows)
         self.supervisor = Supervisor(~np.array(by_hand))
         self.estimator = Estimator(rows)
-        self.quadrotor = Quadrotor(request.kinds, request.start, request.yaw, self.dt)
+        self.quadrotor = Quadrotors(request, self.dt)
         decks = zip(self.lighthouse, self.loco, self.multiranger, self.flow, strict=True)
         boards = "bcLighthouse4", "bcDWM1000", "bcMultiranger", "bcFlow2"
         self.memories = [
@@ -130,12 +194,7 @@ class Flock:
         self.charge = np.full(rows, faults.battery)  # 0 to 1
         self._low_since = np.full(rows, np.inf)  # [s]
         self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s
-        spatial = np.ones((rows, 3))
-        noise = Noise(request.names, request.seeds, "measurement", 4)
-        self._measurement = Measurement(request.disturbance, spatial, noise)
-        wobble = Noise(request.names, request.seeds, "hover jitter", 2)
-        self._jitter = HoverJitter(request.disturbance, wobble, self.dt)
-        self._latency = Latency(request.disturbance, self.dt)
+        self._disturbances = Disturbances(request, self.dt)
         response, kind = RESPONSES["crazyflie"], request.kinds[0]
         self._gain, self._turn_gain = np.array(response.position), kind.turn_response
         self._speed_gain = np.array(response.velocity)
@@ -245,7 +304,7 @@ class Flock:
             turn_gain=self._turn_gain,
         )
         setpoint = self._true_setpoint(setpoint)
-        delayed = self._latency.delay(setpoint) if self._latency.present else setpoint
+        delayed = self._disturbances.delay(setpoint)
         quadrotor.command(delayed)
         before, place = quadrotor.velocity, quadrotor.position.copy()
         quadrotor.advance()
@@ -258,14 +317,14 @@ class Flock:
         self._touch_floor(before, place, setpoint)
         self._update_attitude(before)
         self.place = quadrotor.position.copy()
-        if self._jitter.present:
-            self.place[:, :2] += self._jitter.advance(quadrotor.position[:, 2])
+        self.place[:, :2] += self._disturbances.jitter(quadrotor.position[:, 2])
         np.maximum(self.charge - self._drain * quadrotor.flying, 0.0, out=self.charge)
         self._low_since = np.where(self.volts < LOW_V, np.minimum(self._low_since, t), np.inf)
         self.estimator.advance(t, self.dt, self.ready(), self._flow, flying=quadrotor.flying)
-        measured = self.place + self._measurement.draw()[:, :3] if self._measurement.present else self.place
+        measured = self.place + self._disturbances.noise()
         self.estimate = measured + self.estimator.error
-        self.velocity = velocity_after(self.velocity, measured - self._last_measured, self.dt)
+        moved = zip(self.velocity.tolist(), (measured - self._last_measured).tolist(), strict=True)
+        self.velocity = np.array([velocity_after((u, v, w), (x, y, z), self.dt) for (u, v, w), (x, y, z) in moved])
         self._last_measured = measured
         return locked
 
