@@ -21,6 +21,7 @@ from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, L
 from agents.decision.neighbours import Neighbours
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
+from agents.decision.rehearsal import rehearse
 from agents.decision.transmission import Transmitter
 from agents.plugins.planners import Pose
 from agents.plugins.predictors import HOLD
@@ -331,8 +332,13 @@ class Robot:
         return setpoint
 
     def _ready(self) -> bool:
-        """Whether nothing is missing for a take-off; asked before it alone."""
+        """Whether nothing is missing for a take-off; asked before it alone. Raises PluginError as `rehearse`."""
         t, life, assignment = self.now.t, self.lifecycle, self.assignment
+        if life.phase == IDLE and not self.now.invalid:
+            rehearse(
+                self.goals, self.transmitter, assignment.update, self._perception, assignment.legs,
+                self.now.position, t,
+            )  # fmt: skip
         lacks = False
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks = self.neighbours.unreceived() or (self.guidance is not None and self.guidance.missing)

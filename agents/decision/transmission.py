@@ -17,15 +17,16 @@ STILL: Final[Vector] = ZERO
 class Transmitter:
     """Transmissions of one robot."""
 
-    __slots__ = ("_predictor", "_smooths", "asking", "position", "smoothed", "velocity")
+    __slots__ = ("_smooths", "asking", "position", "predictor", "smoothed", "velocity")
 
     asking: TriggerState
+    predictor: Predictor  # of the receivers
     position: Vector  # of the last question: what would be transmitted [m],
     velocity: Vector  # and its velocity [m/s], NaN where unknown
     smoothed: LowPass
 
     def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind) -> None:
-        self.asking, self._predictor, self.smoothed = TriggerState(trigger), predictor, LowPass(kind)
+        self.asking, self.predictor, self.smoothed = TriggerState(trigger), predictor, LowPass(kind)
         self._smooths = trigger.smoothing_s > 0.0
         self.position = self.velocity = UNKNOWN
         self.asking.view.reach_s = predictor.reach()
@@ -62,9 +63,9 @@ class Transmitter:
         view.t, view.position, view.velocity, view.error, view.energy = t, position, velocity, error, energy
         view.since_start, view.offset, view.since_event = since_start, offset, t - last.time
         if last.time > -inf:
-            believed = self._predictor.position(last, view.since_event)
+            believed = self.predictor.position(last, view.since_event)
             view.deviation = distance(position, believed)
-            view.drift = distance(last.velocity, self._predictor.velocity(last, 0.0))
+            view.drift = distance(last.velocity, self.predictor.velocity(last, 0.0))
         due = asking.due() and is_finite(position)
         if due:
             asking.record()

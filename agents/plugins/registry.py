@@ -99,7 +99,7 @@ def struct(group: str, name: str) -> type[msgspec.Struct]:
     if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
             f"{_origin(entry)} can be changed, and would mix what it keeps of different robots and runs; declare it "
-            "with frozen=True and keep nothing in it (triggers: memory(rows))"
+            "with frozen=True and keep nothing in it (triggers: MEMORY)"
         )
     return plugin
 

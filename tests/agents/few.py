@@ -15,7 +15,7 @@ NOISY = {
 
 
 def pair(**parts):
-    """Two ground robots that listen to each other, and want to be 0.5 m apart; `parts` changes that."""
+    """Two ground robots that receive each other, and want to be 0.5 m apart; `parts` changes that."""
     given = {
         "title": "A pair",
         "duration_s": 60.0,
@@ -28,7 +28,7 @@ def pair(**parts):
 
 
 def triangle(**parts):
-    """Three ground robots; C listens to nobody and stands."""
+    """Three ground robots; C receives nobody and stands."""
     robots = {
         name: Robot(kind="khepera4", start=start)
         for name, start in {"A": [-0.4, 0.0], "B": [0.4, 0.1], "C": [0.0, -0.5]}.items()

@@ -1,78 +1,84 @@
-"""Random signals for triggers, and a loop that asks them."""
+"""Random signals for a trigger, and a loop that asks it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import dist, inf, nan
 
 import numpy as np
 
-from agents.arrays import norm
+from agents.body.kinds import KHEPERA4
 from agents.decision.transmission import Transmitter
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
+from agents.vectors import NO_SETPOINT, Vector
 
 DT = 0.02
 
 
-@dataclass
-class Signal:
-    """Over K ticks: position, velocity and offset (K, N, 3), error and energy (K, N)."""
+@dataclass(frozen=True)
+class Moment:
+    """Quantities of a robot at one question."""
 
-    position: np.ndarray
-    velocity: np.ndarray
-    offset: np.ndarray
-    error: np.ndarray
-    energy: np.ndarray
-
-    def of(self, row: int) -> Signal:
-        """One row alone."""
-        return Signal(*(getattr(self, field.name)[:, row : row + 1] for field in fields(self)))
-
-    def every(self, ticks: int) -> Signal:
-        """Fewer moments."""
-        return Signal(*(getattr(self, field.name)[::ticks] for field in fields(self)))
+    position: Vector
+    velocity: Vector
+    offset: Vector
+    error: float
+    energy: float
 
 
-def wander(seed: int, rows: int, ticks: int) -> Signal:
-    """Random walks with rests."""
+def wander(seed: int, ticks: int) -> list[Moment]:
+    """Random walk with rests."""
     rng = np.random.default_rng(seed)
-    speed = rng.choice([0.0, 0.05, 0.5], (ticks, rows, 1)) * rng.normal(size=(ticks, rows, 3))
-    return Signal(
-        np.cumsum(speed * DT, axis=0) + rng.normal(size=(rows, 3)),
-        speed,
-        np.cumsum(0.005 * rng.normal(size=(ticks, rows, 3)), axis=0),
-        rng.uniform(0, 0.3, (ticks, rows)),
-        np.exp(rng.uniform(-9, -2, (ticks, rows))),
-    )
+    speed = rng.choice([0.0, 0.05, 0.5], (ticks, 1)) * rng.normal(size=(ticks, 3))
+    place = np.cumsum(speed * DT, axis=0) + rng.normal(size=3)
+    offset = np.cumsum(0.005 * rng.normal(size=(ticks, 3)), axis=0)
+    error, energy = rng.uniform(0, 0.3, ticks), np.exp(rng.uniform(-9, -2, ticks))
+    columns = (place, speed, offset, error, energy)
+    vectors = [[tuple(row) if isinstance(row, list) else row for row in column.tolist()] for column in columns]
+    return [Moment(*values) for values in zip(*vectors, strict=True)]
+
+
+def standing(ticks: int, position: Vector = (0.0, 0.0, 0.0)) -> list[Moment]:
+    """A robot that stays, without errors."""
+    return [Moment(position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)] * ticks
 
 
 class Play:
-    """Asks a trigger on every tick, as an agent does from the start of its experiment on.
+    """Asks a trigger on every tick, as a robot does from the start of its experiment on.
 
     Attributes:
-        fired: (K, N) who had an event when.
-        gap_before: (K, N) ‖ε‖ when it was asked [m], and `gap_after` what was left then.
-        told: At the end.
-        state: At the end.
+        fired: Whether there was an event, at each question.
+        gap_before: ‖ε‖ when it was asked [m], infinite at first; `gap_after`: what was left then.
     """
 
-    def __init__(self, trigger: Trigger, signal: Signal, *, predictor: Predictor = HOLD, dt: float = DT) -> None:
-        rows = signal.position.shape[1]
-        voice = Transmitter(trigger, rows, predictor)
-        fired, before, after = [], [], []
-        for k in range(len(signal.position)):
+    def __init__(self, trigger: Trigger, signal: list[Moment], *, predictor: Predictor = HOLD, dt: float = DT) -> None:
+        self.transmitter = Transmitter(trigger, predictor, KHEPERA4)
+        self.fired: list[bool] = []
+        self.gap_before: list[float] = []
+        self.gap_after: list[float] = []
+        last = self.transmitter.asking.last
+        for k, moment in enumerate(signal):
             t = k * dt
-            told = voice.last_event
-            known = np.isfinite(told.time)
-            age = np.where(known, t - told.time, 0.0)
-            held = predictor.position(told.position, told.velocity, age)
-            said = voice.transmit(
-                t, signal.position[k], signal.velocity[k], error=signal.error[k], energy=signal.energy[k],
-                start=np.zeros(rows), offset=signal.offset[k],
+            held = predictor.position(last, t - last.time) if last.time > -inf else (nan, nan, nan)
+            fired = self.transmitter.transmits(
+                t, moment.position, moment.velocity, error=moment.error, energy=moment.energy, since_start=t,
+                offset=moment.offset, setpoint=NO_SETPOINT,
             )  # fmt: skip
-            before.append(norm(said.position - held))
-            now = np.isin(np.arange(rows), said.rows)
-            fired.append(now)
-            after.append(np.where(now, 0.0, before[-1]))
-        self.fired, self.gap_before, self.gap_after = np.array(fired), np.array(before), np.array(after)
-        self.last_event, self.state = voice.last_event, voice._state
+            gap = dist(self.transmitter.position, held) if k else inf
+            self.fired.append(fired)
+            self.gap_before.append(gap)
+            self.gap_after.append(0.0 if fired else gap)
+
+    @property
+    def events(self) -> Iterator[int]:
+        """Numbers of the questions that had an event."""
+        return (k for k, fired in enumerate(self.fired) if fired)
+
+    @property
+    def intervals(self) -> list[int]:
+        """Questions from each event to the next."""
+        events = list(self.events)
+        return [later - earlier for earlier, later in itertools.pairwise(events)]

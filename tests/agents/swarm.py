@@ -1,84 +1,83 @@
-"""Robots of an experiment in any number of groups, each with its own decision and its own twins, that only exchange
-what their triggers send: every group is what a process would be.
-"""
+"""Robots of an experiment on one clock, each with its own decision; they only exchange what their triggers send."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from math import inf, isfinite
+from typing import Any
 
 import msgspec
-import numpy as np
 
-from agents.agent import Actions, Agent
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
+from agents.robot import Robot
+from agents.safety.situation import ProcessHealth
+from agents.vectors import ZERO, Vector
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
-from tests.agents.things import poses
 from twins.body import TwinBody
 
 LEAD_S = 0.5
+LOGGED = ("phase", "goal", "error", "setpoint", "position", "truth")
 
 
 class Group:
-    """The robots of one process."""
+    """Robots of one process: their decisions, and the body that they share."""
 
-    def __init__(self, experiment: Experiment, names: Sequence[str]) -> None:
+    def __init__(self, plan: Plan, names: Sequence[str]) -> None:
         self.names = tuple(names)
-        self.assignment = Plan(experiment).assignment(self.names)
-        self.agent = Agent(self.assignment)
-        self.body = TwinBody(bodies.body_request(experiment, self.names, [experiment.seed]))
-        self.agent.neighbours.mark_alive(np.arange(len(self.assignment.links)))
-        self.by_speaker = self.assignment.links.by_sender(self.assignment.robots)
-        self.state: BodyState
-        self.actions: Actions
+        health = ProcessHealth()
+        self.robots = [Robot(plan.assignment(name), health) for name in names]
+        self.body = TwinBody(bodies.body_request(plan.experiment, self.names, plan.experiment.seed))
+        self.states: list[BodyState] = []
+        self.sending: list[int] = []
+        self.spoil: dict[str, Callable[[BodyState], None]] = {}  # changes of measurements, by name
+        for robot in self.robots:
+            for link in range(len(robot.neighbours.all)):
+                robot.neighbours.mark_alive(link)
 
-    def hear(self, speaker: str, position, velocity, stamp: float, arrived: float) -> None:
-        """As a process does it: one sample on all links of its speaker."""
-        links = self.by_speaker.get(speaker)
-        if links is not None:
-            many = (len(links), 1)
-            stamps, arrivals = np.full(len(links), stamp), np.full(len(links), arrived)
-            self.agent.neighbours.receive(
-                poses(links, np.tile(position, many), np.tile(velocity, many), stamps, arrivals)
-            )
+    def receive(self, sender: str, position: Vector, velocity: Vector, stamp: float, arrival: float) -> None:
+        known = velocity if isfinite(velocity[0]) else ZERO  # as the inbox of a process does
+        for robot in self.robots:
+            for link, neighbour in enumerate(robot.neighbours.all):
+                if neighbour.name == sender:
+                    robot.neighbours.receive(link, position, known, stamp, arrival)
 
     def step(self, t: float) -> None:
         """One tick of the process."""
-        agent, body = self.agent, self.body
-        state = body.read(t)
-        # copies: without noise the measured position is the true one, in the same array
-        self.state = self.spoil(t, replace(state, time=state.time.copy(), position=state.position.copy()))
-        self.actions = agent.step(t, self.state)
-        duties = self.actions.commands
-        if duties is not None:
-            body.stop(duties.stop)
-            body.land(duties.land)
-            body.takeoff(duties.takeoff, self.assignment.hover[duties.takeoff])
-        body.command(self.actions.setpoint)
-
-    def spoil(self, t: float, state: BodyState) -> BodyState:
-        """What a test makes of the measurement."""
-        return state
+        self.states = [copy(state) for state in self.body.read(t)]
+        self.sending = []
+        for row, robot in enumerate(self.robots):
+            if self.names[row] in self.spoil:
+                self.spoil[self.names[row]](self.states[row])
+            if robot.transmit(t, self.states[row]):
+                self.sending.append(row)
+        for row, robot in enumerate(self.robots):
+            robot.act(t)
+            if robot.stops:
+                self.body.stop([row])
+            if robot.lands:
+                self.body.land([row])
+            if robot.takes_off:
+                self.body.takeoff([row], [robot.assignment.hover])
+        self.body.command([robot.setpoint for robot in self.robots])
 
 
 class Swarm:
-    """All groups on one clock; `order` gives every robot by name, whichever group it is in."""
+    """All robots of an experiment, in any number of processes."""
 
     def __init__(self, experiment: Experiment, groups: Iterable[Sequence[str]] | None = None) -> None:
-        self.experiment = experiment
-        names = tuple(experiment.robots)
-        self.groups = [Group(experiment, group) for group in (groups if groups is not None else [names])]
+        self.experiment, plan = experiment, Plan(experiment)
+        self.groups = [Group(plan, group) for group in (groups or [[name] for name in experiment.robots])]
         self.where = {name: (group, row) for group in self.groups for row, name in enumerate(group.names)}
-        self.names = tuple(name for name in names if name in self.where)
-        self.dt = 1.0 / experiment.rates.body_hz
-        self.tick = 0
-        self.start_at = np.inf
+        self.names = tuple(name for name in experiment.robots if name in self.where)
+        self.dt, self.tick, self.start_at = 1.0 / experiment.rates.body_hz, 0, inf
         self.sent: list[tuple[int, str]] = []
-        self.log: list[dict[str, np.ndarray]] = []
-        self._flying: list[tuple[str, np.ndarray, np.ndarray, float]] = []
+        self.log: list[dict[str, dict[str, Any]]] = []  # of each tick, by name
+        self.under_way: list[tuple[str, Vector, Vector, float]] = []
+        self.muted: set[tuple[str, str]] = set()  # senders and receivers that no pose passes between
 
     @property
     def t(self) -> float:
@@ -89,63 +88,82 @@ class Swarm:
         """Time of the experiment [s]."""
         return self.t - self.start_at
 
-    def agent(self, name: str) -> Agent:
-        return self.where[name][0].agent
+    def robot(self, name: str) -> Robot:
+        group, row = self.where[name]
+        return group.robots[row]
 
     def phase(self, name: str) -> int:
-        group, row = self.where[name]
-        return int(group.agent.lifecycle.phase[row])
+        return self.robot(name).lifecycle.phase
 
-    def row(self, name: str, what: str) -> np.ndarray:
-        """What the last tick says of one robot."""
-        return self.log[-1][what][self.names.index(name)]
+    def spoil(self, name: str, change: Callable[[BodyState], None] | None) -> None:
+        """Change each measurement of a robot from now on; None: no longer."""
+        spoilers = self.where[name][0].spoil
+        spoilers.pop(name, None)
+        if change is not None:
+            spoilers[name] = change
 
-    def speaker_links(self, speaker: str) -> list[tuple[Agent, np.ndarray]]:
-        """Every decision that listens to a robot, and on which of its links."""
-        return [(g.agent, g.by_speaker[speaker]) for g in self.groups if speaker in g.by_speaker]
+    def link(self, receiver: str, sender: str) -> int:
+        return [each.name for each in self.robot(receiver).neighbours.all].index(sender)
+
+    def lose(self, sender: str, *receivers: str, since: float = 0.0) -> None:
+        """Receivers lose the token of a sender, `since` [s] ago, and receive it no more."""
+        for receiver in receivers or self.receivers(sender):
+            self.robot(receiver).neighbours.mark_lost(self.link(receiver, sender), self.t - since)
+            self.muted.add((sender, receiver))
+
+    def find(self, sender: str, *receivers: str) -> None:
+        """Receivers see the token of a sender again, and receive it."""
+        for receiver in receivers or self.receivers(sender):
+            self.robot(receiver).neighbours.mark_alive(self.link(receiver, sender))
+            self.muted.discard((sender, receiver))
+
+    def receivers(self, sender: str) -> list[str]:
+        return [name for name in self.names if sender in (each.name for each in self.robot(name).neighbours.all)]
+
+    def last(self, name: str, what: str) -> Any:
+        """A value of one robot on the last tick."""
+        return self.log[-1][name][what]
+
+    def column(self, name: str, what: str, since: int = 0) -> list[Any]:
+        """Values of one robot from a tick on."""
+        return [moment[name][what] for moment in self.log[since:]]
 
     def conduct(self) -> None:
-        """Gives the orders that a conductor gives."""
+        """Give the orders that a conductor gives."""
         phases = [self.phase(name) for name in self.names]
         if min(phases) == READY:
-            for group, row in self.where.values():
-                assert group.agent.lifecycle.takeoff(row) == ""
-        elif min(phases) == AIRBORNE and self.start_at == np.inf:
+            for name in self.names:
+                assert self.robot(name).lifecycle.takeoff() == ""
+        elif min(phases) == AIRBORNE and self.start_at == inf:
             self.start_at = self.t + LEAD_S
-            for group, row in self.where.values():
-                assert group.agent.start(row, self.start_at) == ""
+            for name in self.names:
+                assert self.robot(name).start(self.start_at) == ""
 
     def step(self) -> None:
-        """One tick of everybody; what is said now is heard on the next one."""
-        arriving, self._flying = self._flying, []
-        for speaker, position, velocity, stamp in arriving:
+        """One tick of all; what is sent on it is received on the next one."""
+        arriving, self.under_way = self.under_way, []
+        for sender, *pose in arriving:
             for group in self.groups:
-                group.hear(speaker, position, velocity, stamp, self.t)
+                if not any((sender, name) in self.muted for name in group.names):
+                    group.receive(sender, *pose, self.t)
         for group in self.groups:
             group.step(self.t)
         for name in self.names:  # in one order, however they are grouped
             group, row = self.where[name]
-            if row in group.actions.transmit:
+            if row in group.sending:
+                robot = group.robots[row]
                 self.sent.append((self.tick, name))
-                said = group.actions
-                self._flying.append((name, said.position[row].copy(), said.velocity[row].copy(), self.t))
-        self.log.append({what: self._all(what) for what in ("phase", "goal", "error", "setpoint", "position", "truth")})
+                self.under_way.append((name, robot.sent_position, robot.sent_velocity, self.t))
+        self.log.append({name: self._values(name) for name in self.names})
         self.tick += 1
 
-    def _all(self, what: str) -> np.ndarray:
-        def of(group: Group) -> np.ndarray:
-            match what:
-                case "phase":
-                    return group.agent.lifecycle.phase
-                case "setpoint":
-                    return group.actions.setpoint
-                case "position":
-                    return group.state.position
-                case "truth":
-                    return group.state.true_position
-            return getattr(group.agent, what)
-
-        return np.array([of(group)[row] for group, row in (self.where[name] for name in self.names)])
+    def _values(self, name: str) -> dict[str, Any]:
+        (group, row), robot = self.where[name], self.robot(name)
+        state = group.states[row]
+        values = (
+            robot.lifecycle.phase, robot.goal, robot.error, robot.setpoint, state.position, state.true_position,
+        )  # fmt: skip
+        return dict(zip(LOGGED, values, strict=True))
 
     def until(self, phase: int, most_s: float = 60.0) -> Swarm:
         """Until all are there."""
@@ -164,10 +182,6 @@ class Swarm:
     def running(self) -> Swarm:
         """Until the experiment begins."""
         return self.until(RUNNING)
-
-    def column(self, what: str) -> np.ndarray:
-        """Over time."""
-        return np.array([moment[what] for moment in self.log])
 
 
 def changed(experiment: Experiment, **parts: object) -> Experiment:

@@ -1,54 +1,29 @@
-"""What rows know of themselves and of what is near, put together by hand."""
+"""A robot and what is near it, put together by hand."""
 
-import numpy as np
-
-from agents.arrays import PoseTable
 from agents.body.kinds import KHEPERA4
 from agents.plugins.avoidance import Nearby, OwnState
 
 
-def own(kinds, position, *, yaw=0.0, velocity=0.0):
-    """Rows of these kinds, at (N, 2) or (N, 3) [m]."""
-    given = np.array(position, dtype=float).reshape(len(kinds), -1)
-    place = np.zeros((len(kinds), 3))
-    place[:, : given.shape[1]] = given
-    takes = np.array([kind.takes for kind in kinds])
-    column = {
-        name: np.array([float(getattr(kind, name)) for kind in kinds])
-        for name in ("radius", "height", "speed", "turn_rate", "response", "lag")
-    }
-    return OwnState(
-        position=place,
-        velocity=np.broadcast_to(np.asarray(velocity, dtype=float), place.shape).copy(),
-        yaw=np.broadcast_to(np.asarray(yaw, dtype=float), len(kinds)).copy(),
-        takes=tuple(takes.tolist()),
-        by_position=takes == "position",
-        by_twist=takes == "twist",
-        flies=np.array([kind.flies for kind in kinds]),
-        **column,
-    )
+def own(kind, position, *, yaw=0.0, velocity=(0.0, 0.0, 0.0)):
+    """State of a robot of a kind, at x, y (, z) [m]."""
+    made = OwnState()
+    made.position = (*position, 0.0)[:3] if len(position) < 3 else tuple(position)
+    made.velocity, made.yaw, made.flies = tuple(velocity), yaw, kind.flies
+    made.radius, made.height, made.speed, made.lag = kind.radius, kind.height, kind.speed, kind.lag
+    made.turn_rate, made.response = kind.turn_rate, kind.response
+    made.by_position, made.by_twist = kind.takes == "position", kind.takes == "twist"
+    return made
 
 
-def near(row, position, *, velocity=0.0, radius=0.0, heard=False, lag=0.0):
-    """Things (K) that rows know, beside them all."""
-    row = np.array(row, dtype=np.intp)
-    many = len(row)
-    place = np.array(position, dtype=float).reshape(many, 2)
-    return Nearby(
-        row=row,
-        position=place,
-        velocity=np.broadcast_to(np.asarray(velocity, dtype=float), place.shape).copy(),
-        radius=np.broadcast_to(np.asarray(radius, dtype=float), many).copy(),
-        low=np.zeros(many),
-        high=np.full(many, KHEPERA4.height),
-        is_robot=np.broadcast_to(np.asarray(heard), many).copy(),
-        lag=np.broadcast_to(np.asarray(lag, dtype=float), many).copy(),
-    )
+def near(*places, velocity=(0.0, 0.0), radius=0.0, is_robot=False, lag=0.0):
+    """Things at x, y [m] that are alike otherwise."""
+    made = Nearby()
+    for x, y in places:
+        thing = made.add()
+        thing.x, thing.y, thing.radius, thing.lag, thing.is_robot = x, y, radius, lag, is_robot
+        thing.velocity_x, thing.velocity_y = velocity
+        thing.low, thing.high = 0.0, KHEPERA4.height
+    return made
 
 
-NOTHING = near([], np.zeros((0, 2)))
-
-
-def poses(link, position, velocity, stamp, arrival, *, yaw=None):
-    """Poses received on links (H,)."""
-    return PoseTable(link, np.zeros(len(link), dtype=np.intp), stamp, arrival, position, velocity, yaw)
+NOTHING = near()

@@ -1,9 +1,9 @@
 """Every registered planner: it starts where the robot is, never jumps, never asks for more than its speed."""
 
 import math
+from math import atan2, cos, dist, hypot, inf, isnan, pi, sin, sqrt
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,152 +23,113 @@ PLANS = [
     {"kind": "circle", "radius": -0.4, "period_s": 9.0, "turns": 1.25},
     {"kind": "lemniscate", "size": 0.5, "period_s": 15.0},
 ]
-FEW = settings(max_examples=15)
-SEEDS = st.integers(0, 2**32 - 1)
+FEW = settings(max_examples=25)
+NUMBER = st.floats(-1, 1)
+ANCHOR, HEADING = st.tuples(NUMBER, NUMBER, NUMBER), st.floats(-pi, pi)
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 def built(plan):
     return registry.build(registry.PLANNERS, plan)
 
 
-def anchors(seed, rows=3):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1, 1, (rows, 3)), rng.uniform(-math.pi, math.pi, rows)
+def places(planner, times, anchor=ORIGIN, heading=0.0):
+    return [planner.target(t, anchor, heading)[:3] for t in times]
 
 
-def path(planner, times, anchor, heading):
-    """(T, R, 3) and (T, R)."""
-    found = [planner.target(np.full(len(anchor), t), anchor, heading) for t in times]
-    return np.array([position for position, _ in found]), np.array([yaw for _, yaw in found])
-
-
-def test_every_registered_planner_is_tried_here():
+def test_every_registered_planner_is_tried():
     assert {plan["kind"] for plan in PLANS} == set(registry.names(registry.PLANNERS))
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 @FEW
-@given(seed=SEEDS)
-def test_it_starts_where_the_robot_is(plan, seed):
-    anchor, heading = anchors(seed)
-    kept = anchor.copy(), heading.copy()
-    position, _ = built(plan).target(np.zeros(3), anchor, heading)
-    np.testing.assert_allclose(position, anchor, atol=1e-12)
-    np.testing.assert_array_equal(anchor, kept[0])
-    np.testing.assert_array_equal(heading, kept[1])
+@given(anchor=ANCHOR, heading=HEADING)
+def test_starts_where_the_robot_is(plan, anchor, heading):
+    assert built(plan).target(0.0, anchor, heading)[:3] == pytest.approx(anchor, abs=1e-12)
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)
 @FEW
-@given(seed=SEEDS, begin=st.floats(0, 60))
-def test_it_never_asks_for_more_than_its_speed(plan, seed, begin):
+@given(anchor=ANCHOR, heading=HEADING, begin=st.floats(0, 60))
+def test_never_exceeds_its_speed(plan, anchor, heading, begin):
     planner, dt = built(plan), 0.01
-    position, _ = path(planner, begin + dt * np.arange(60), *anchors(seed))
-    step = np.linalg.norm(np.diff(position, axis=0), axis=2)
-    assert (step <= planner.speed() * dt + 1e-9).all()
+    path = places(planner, [begin + dt * k for k in range(60)], anchor, heading)
+    assert max(map(dist, path, path[1:])) <= planner.speed() * dt + 1e-9
 
 
 @pytest.mark.parametrize("plan", [plan for plan in PLANS if plan["kind"] in ("line", "circle", "lemniscate")], ids=str)
-def test_its_speed_is_no_larger_than_it_must_be(plan):
+def test_speed_is_no_larger_than_needed(plan):
     planner, dt = built(plan), 1e-4
-    position, _ = path(planner, dt * np.arange(3), *anchors(1))
-    speed = np.linalg.norm(np.diff(position, axis=0), axis=2) / dt
-    np.testing.assert_allclose(speed, planner.speed(), rtol=1e-6)
+    first, second = places(planner, (0.0, dt), (0.3, -0.2, 0.1), 0.7)
+    assert dist(first, second) / dt == pytest.approx(planner.speed(), rel=1e-6)
 
 
-@pytest.mark.parametrize("plan", PLANS, ids=str)
-@FEW
-@given(seed=SEEDS)
-def test_rows_are_led_as_if_each_were_alone(plan, seed):
-    planner, (anchor, heading) = built(plan), anchors(seed)
-    elapsed = np.random.default_rng(seed).uniform(0, 40, 3)
-    position, yaw = planner.target(elapsed, anchor, heading)
-    for row in range(3):
-        one = slice(row, row + 1)
-        mine, toward = planner.target(elapsed[one], anchor[one], heading[one])
-        np.testing.assert_array_equal(mine[0], position[row])
-        np.testing.assert_array_equal(toward[0], yaw[row])
+def test_line_ends_exactly_and_stays():
+    line, length = Line(move_by=[0.3, -0.4, 0.1], speed_=0.1, yaw=0.5), sqrt(0.26)
+    for elapsed, share in ((0.0, 0.0), (0.5 * length / 0.1, 0.5), (length / 0.1, 1.0), (1e6, 1.0)):
+        *place, yaw = line.target(elapsed, (1.0, 2.0, 3.0), 0.0)
+        assert place == pytest.approx([1.0 + 0.3 * share, 2.0 - 0.4 * share, 3.0 + 0.1 * share], abs=1e-12)
+        assert yaw == 0.5 if share == 1.0 else isnan(yaw)
 
 
-def test_a_line_ends_exactly_and_stays():
-    line = Line(move_by=[0.3, -0.4, 0.1], speed_=0.1, yaw=0.5)
-    length = math.sqrt(0.26)
-    anchor = np.array([[1.0, 2.0, 3.0]] * 4)
-    times = np.array([0.0, 0.5 * length / 0.1, length / 0.1, 1e6])
-    position, yaw = line.target(times, anchor, np.zeros(4))
-    np.testing.assert_allclose(position - anchor, np.outer([0, 0.5, 1, 1], [0.3, -0.4, 0.1]), atol=1e-12)
-    np.testing.assert_array_equal(yaw, [np.nan, np.nan, 0.5, 0.5])
-
-
-def test_a_line_of_no_length_stays():
-    position, yaw = Line(move_by=[0.0, 0.0], speed_=1.0, yaw=2.0).target(np.zeros(1), np.ones((1, 3)), np.zeros(1))
-    np.testing.assert_array_equal(position, np.ones((1, 3)))
-    np.testing.assert_array_equal(yaw, [2.0])
+def test_line_of_no_length_stays():
+    assert Line(move_by=[0.0, 0.0], speed_=1.0, yaw=2.0).target(0.0, (1.0, 1.0, 1.0), 0.0) == (1.0, 1.0, 1.0, 2.0)
 
 
 def test_hold_stands_where_it_is_told():
-    anchor = np.array([[1.0, 2.0, 0.7]])
-    position, yaw = Hold(at=[0.0, 0.5], yaw=0.3).target(np.zeros(1), anchor, np.zeros(1))
-    np.testing.assert_array_equal(position, [[0.0, 0.5, 0.7]])
-    np.testing.assert_array_equal(yaw, [0.3])
+    assert Hold(at=[0.0, 0.5], yaw=0.3).target(0.0, (1.0, 2.0, 0.7), 0.0) == (0.0, 0.5, 0.7, 0.3)
     assert Hold(at=[0.0, 0.5]).speed() == 0.0
 
 
-def test_waypoints_pass_through_their_points_at_constant_speed():
+def test_waypoints_pass_at_constant_speed():
     plan = Waypoints(points=[[1.0, 0.0], [1.0, 2.0], [0.0, 2.0, 1.0]], speed_=0.5)
-    anchor = np.array([[0.0, 0.0, 0.0]])
-    times = np.array([2.0, 6.0, 6.0 + math.sqrt(2) / 0.5, 99.0])
-    position, _ = path(plan, times, anchor, np.zeros(1))
-    np.testing.assert_allclose(position[:, 0], [[1, 0, 0], [1, 2, 0], [0, 2, 1], [0, 2, 1]], atol=1e-12)
+    found = places(plan, (2.0, 6.0, 6.0 + sqrt(2) / 0.5, 99.0))
+    wanted = [(1, 0, 0), (1, 2, 0), (0, 2, 1), (0, 2, 1)]
+    assert all(place == pytest.approx(there, abs=1e-12) for place, there in zip(found, wanted, strict=True))
 
 
-def test_waypoints_loop_without_the_way_to_the_first():
+def test_waypoints_loop_without_the_approach():
     plan = Waypoints(points=[[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]], speed_=0.5, loop=True)
-    anchor = np.array([[2.0, 0.0, 0.3]])
-    position, _ = path(plan, 2.0 + 8.0 * np.arange(4), anchor, np.zeros(1))  # one lap is 4 m: eight seconds
-    np.testing.assert_allclose(position, np.tile([1.0, 0.0, 0.3], (4, 1, 1)), atol=1e-12)
-    before, after = path(plan, np.array([9.99, 10.01]), anchor, np.zeros(1))[0]
-    np.testing.assert_allclose(before[0], [0.995, 0.0, 0.3], atol=1e-12)
-    np.testing.assert_allclose(after[0], [1.0, 0.005, 0.3], atol=1e-12)
+    anchor = (2.0, 0.0, 0.3)
+    for place in places(plan, (2.0, 10.0, 18.0, 26.0), anchor):  # one lap is 4 m: eight seconds
+        assert place == pytest.approx((1.0, 0.0, 0.3), abs=1e-12)
+    before, after = places(plan, (9.99, 10.01), anchor)
+    assert before == pytest.approx((0.995, 0.0, 0.3), abs=1e-12)
+    assert after == pytest.approx((1.0, 0.005, 0.3), abs=1e-12)
 
 
 @pytest.mark.parametrize(("radius", "side"), [(0.6, 1.0), (-0.4, -1.0)])
-def test_a_circle_has_its_radius_and_leaves_along_the_heading(radius, side):
-    plan = Circle(radius=radius, period_s=10.0)
-    anchor, heading = anchors(5)
-    position, _ = path(plan, np.linspace(0, 10, 41), anchor, heading)
-    centre = anchor[:, :2] + radius * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-    np.testing.assert_allclose(np.linalg.norm(position[..., :2] - centre, axis=2), abs(radius), atol=1e-12)
-    np.testing.assert_allclose(position[-1], anchor, atol=1e-12)
-    np.testing.assert_allclose(position[..., 2], np.tile(anchor[:, 2], (41, 1)))
-    first = position[1, :, :2] - anchor[:, :2]
-    ahead = first[:, 0] * np.cos(heading) + first[:, 1] * np.sin(heading)
-    left = first[:, 1] * np.cos(heading) - first[:, 0] * np.sin(heading)
-    assert (ahead > 0).all()
-    assert (np.sign(left) == side).all()
+def test_circle_leaves_along_the_heading(radius, side):
+    plan, anchor, heading = Circle(radius=radius, period_s=10.0), (0.3, -0.2, 0.5), 0.7
+    path = places(plan, [0.25 * k for k in range(41)], anchor, heading)
+    centre = anchor[0] - radius * sin(heading), anchor[1] + radius * cos(heading)
+    for place in path:
+        assert dist(place[:2], centre) == pytest.approx(abs(radius), abs=1e-12)
+        assert place[2] == anchor[2]
+    assert path[-1] == pytest.approx(anchor, abs=1e-12)
+    x, y = path[1][0] - anchor[0], path[1][1] - anchor[1]
+    assert x * cos(heading) + y * sin(heading) > 0.0
+    assert (y * cos(heading) - x * sin(heading)) * side > 0.0
 
 
-def test_a_circle_ends_after_its_turns():
-    plan = Circle(radius=0.5, period_s=4.0, turns=0.5)
-    position, _ = path(plan, np.array([2.0, 50.0]), np.zeros((1, 3)), np.zeros(1))
-    np.testing.assert_allclose(position[:, 0], [[0.0, 1.0, 0.0]] * 2, atol=1e-12)
+def test_circle_ends_after_its_turns():
+    for place in places(Circle(radius=0.5, period_s=4.0, turns=0.5), (2.0, 50.0)):
+        assert place == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
 
 
 @pytest.mark.parametrize("radius", [0.0, math.nan, math.inf])
-def test_a_circle_needs_a_radius(radius):
+def test_circle_needs_a_radius(radius):
     with pytest.raises(ValueError, match="`radius` must be a number other than 0"):
         Circle(radius=radius, period_s=1.0)
 
 
-def test_a_lemniscate_crosses_its_centre_twice_and_is_as_long_as_asked():
-    plan = Lemniscate(size=0.5, period_s=8.0)
-    anchor, heading = np.array([[0.2, 0.1, 0.8]]), np.array([0.7])
-    position, _ = path(plan, np.array([0.0, 4.0, 8.0]), anchor, heading)
-    np.testing.assert_allclose(position, np.tile(anchor, (3, 1, 1)), atol=1e-12)
-    dense, _ = path(plan, np.linspace(0, 8, 801), anchor, heading)
-    assert np.linalg.norm(dense - anchor, axis=2).max() == pytest.approx(0.5, abs=1e-9)
-    first = dense[1, 0] - anchor[0]
-    assert math.atan2(first[1], first[0]) == pytest.approx(0.7, abs=1e-2)
+def test_lemniscate_crosses_its_centre_twice():
+    plan, anchor = Lemniscate(size=0.5, period_s=8.0), (0.2, 0.1, 0.8)
+    for place in places(plan, (0.0, 4.0, 8.0), anchor, 0.7):
+        assert place == pytest.approx(anchor, abs=1e-12)
+    dense = places(plan, [0.01 * k for k in range(801)], anchor, 0.7)
+    assert max(dist(place, anchor) for place in dense) == pytest.approx(0.5, abs=1e-9)
+    assert atan2(dense[1][1] - anchor[1], dense[1][0] - anchor[0]) == pytest.approx(0.7, abs=1e-2)
 
 
 @pytest.mark.parametrize("plan", [{"kind": "line", "move_by": [1.0], "speed": 1.0}, {"kind": "circle", "radius": 1.0}])
@@ -180,52 +141,42 @@ def test_parameters_are_checked(plan):
 # ---------------------------------------------------------------- itineraries
 
 
-def journey(itinerary, times, position, yaw):
-    found = [itinerary.target(np.full(len(position), t), position, yaw) for t in times]
-    return np.array([place for place, _ in found]), np.array([toward for _, toward in found])
-
-
 @FEW
-@given(st.lists(st.sampled_from(range(len(PLANS))), min_size=1, max_size=4), SEEDS)
-def test_legs_follow_one_another_without_a_jump(chosen, seed):
+@given(st.lists(st.sampled_from(range(len(PLANS))), min_size=1, max_size=4), ANCHOR, HEADING)
+def test_legs_follow_without_a_jump(chosen, start, yaw):
     legs = [Leg(1.0 + 2.3 * k, built(PLANS[plan])) for k, plan in enumerate(chosen)]
-    start, yaw = anchors(seed, 2)
-    itinerary = Itinerary(np.arange(2), legs, holds_before=True)
-    times = np.arange(0.0, 13.0, 0.02)
+    itinerary, times = Itinerary(legs, holds_before=True), [0.02 * k for k in range(650)]
     fastest = max(leg.planner.speed() for leg in legs)
-    place, _ = journey(itinerary, times, start, yaw)
-    np.testing.assert_allclose(place[0], start)
-    assert np.linalg.norm(np.diff(place, axis=0), axis=2).max() <= fastest * 0.02 + 1e-9
-    late, _ = journey(Itinerary(np.arange(2), legs, holds_before=True), times[-1:], start, yaw)
-    np.testing.assert_allclose(late[0], place[-1], atol=1e-12)  # who joins late does not begin from the beginning
+    path = [itinerary.target(t, start, yaw)[:3] for t in times]
+    assert path[0] == start
+    assert max(map(dist, path, path[1:])) <= fastest * 0.02 + 1e-9
+    late = Itinerary(legs, holds_before=True).target(times[-1], start, yaw)  # does not begin from the beginning
+    assert late[:3] == pytest.approx(path[-1], abs=1e-12)
 
 
-def test_before_the_first_leg_rows_hold_or_have_no_target():
-    start, yaw = np.array([[0.1, 0.2, 0.3]]), np.array([0.4])
-    legs = [Leg(5.0, Line(move_by=[1.0, 0.0], speed_=0.5))]
-    holds, _ = journey(Itinerary(np.arange(1), legs, holds_before=True), [0.0, 4.9, 6.0], start, yaw)
-    np.testing.assert_allclose(holds[:, 0], [start[0], start[0], start[0] + [0.5, 0, 0]])
-    free, _ = journey(Itinerary(np.arange(1), legs, holds_before=False), [0.0, 4.9], start, yaw)
-    assert np.isnan(free).all()
-    waiting, _ = journey(Itinerary(np.arange(1), legs, holds_before=True), [-np.inf], start, yaw)
-    assert np.isnan(waiting).all()
+def test_before_its_first_leg_a_robot_holds():
+    start, legs = (0.1, 0.2, 0.3), [Leg(5.0, Line(move_by=[1.0, 0.0], speed_=0.5))]
+    holds = Itinerary(legs, holds_before=True)
+    found = [holds.target(t, start, 0.4)[:3] for t in (-inf, 0.0, 4.9, 6.0)]
+    assert isnan(found[0][0])
+    assert found[1:] == [start, start, (0.6, 0.2, 0.3)]
+    free = Itinerary(legs, holds_before=False)
+    assert all(isnan(each) for t in (0.0, 4.9) for each in free.target(t, start, 0.4))
 
 
-def test_a_leg_begins_where_the_one_before_ends_whatever_the_robot_did():
+def test_leg_begins_where_the_last_one_ends():
     legs = [Leg(0.0, Line(move_by=[1.0, 0.0], speed_=0.5, yaw=1.5)), Leg(4.0, Circle(radius=0.5, period_s=4.0))]
-    itinerary = Itinerary(np.arange(1), legs, holds_before=True)
-    first, yaw = itinerary.target(np.array([0.0]), np.zeros((1, 3)), np.zeros(1))
-    np.testing.assert_array_equal(first, np.zeros((1, 3)))
-    lost = np.array([[9.0, 9.0, 9.0]])
-    assert itinerary.target(np.array([3.0]), lost, np.ones(1))[1] == [1.5]
-    place, yaw = itinerary.target(np.array([6.0]), lost, np.array([0.2]))
+    itinerary, lost = Itinerary(legs, holds_before=True), (9.0, 9.0, 9.0)
+    assert itinerary.target(0.0, ORIGIN, 0.0)[:3] == ORIGIN
+    assert itinerary.target(3.0, lost, 1.0)[3] == 1.5
+    *place, yaw = itinerary.target(6.0, lost, 0.2)
     # half a turn to the left of the heading that the line asked for, from its end
-    np.testing.assert_allclose(place[0], [1.0 - 1.0 * math.sin(1.5), math.cos(1.5), 0.0], atol=1e-12)
-    assert np.isnan(yaw).all()
+    assert place == pytest.approx([1.0 - 1.0 * sin(1.5), cos(1.5), 0.0], abs=1e-12)
+    assert isnan(yaw)
+    assert itinerary.origin == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_rows_may_be_at_different_times():
-    legs = [Leg(1.0, Line(move_by=[1.0, 0.0], speed_=1.0)), Leg(3.0, Line(move_by=[0.0, 1.0], speed_=1.0))]
-    itinerary = Itinerary(np.arange(3), legs, holds_before=True)
-    place, _ = itinerary.target(np.array([0.5, 1.5, 3.5]), np.zeros((3, 3)), np.zeros(3))
-    np.testing.assert_allclose(place, [[0, 0, 0], [0.5, 0, 0], [1.0, 0.5, 0.0]])
+def test_plan_waits_for_a_known_place():
+    itinerary = Itinerary([Leg(1.0, Line(move_by=[1.0, 0.0], speed_=1.0))], holds_before=True)
+    assert isnan(itinerary.target(0.5, (math.nan, 0.0, 0.0), 0.0)[0])
+    assert hypot(*itinerary.target(1.5, ORIGIN, 0.0)[:2]) == 0.5

@@ -6,9 +6,10 @@ import msgspec
 import pytest
 
 from agents.plugins import registry
-from agents.plugins.registry import BODIES, LAWS, PLANNERS, TRIGGERS
+from agents.plugins.registry import AVOIDANCES, BODIES, LAWS, PLANNERS, PREDICTORS, TRIGGERS
 
-REGISTERED = [(group, name) for group in (BODIES, TRIGGERS, LAWS, PLANNERS) for name in registry.names(group)]
+GROUPS = (BODIES, TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES)
+REGISTERED = [(group, name) for group in GROUPS for name in registry.names(group)]
 STRUCTS = [(group, name) for group, name in REGISTERED if group != BODIES]
 
 
@@ -53,19 +54,19 @@ def test_everything_registered_loads(group, name):
 
 
 @pytest.mark.parametrize(("group", "name"), STRUCTS)
-def test_every_trigger_law_and_planner_is_a_frozen_strict_struct(group, name):
+def test_every_plug_in_is_a_frozen_strict_struct(group, name):
     config = registry.struct(group, name).__struct_config__
     assert config.frozen
     assert config.forbid_unknown_fields
 
 
 @pytest.mark.parametrize(("group", "name"), STRUCTS)
-def test_an_unknown_parameter_is_refused_by_every_plugin(group, name):
+def test_every_plug_in_refuses_unknown_parameters(group, name):
     with pytest.raises(msgspec.ValidationError, match="nonsense"):
         registry.build(group, {"kind": name, "nonsense": 1})
 
 
-def test_names_are_sorted_and_the_basic_ones_are_there():
+def test_names_are_sorted():
     assert registry.names(TRIGGERS) == sorted(registry.names(TRIGGERS))
     assert {"periodic", "send-on-delta"} <= set(registry.names(TRIGGERS))
     assert {"hold", "line", "waypoints", "circle", "lemniscate"} <= set(registry.names(PLANNERS))
@@ -77,13 +78,13 @@ def test_build_by_name_and_by_table():
     assert registry.build(TRIGGERS, {"kind": "send-on-delta", "threshold": 0.25}).threshold == 0.25
 
 
-def test_build_leaves_the_table_as_it_was():
+def test_build_leaves_its_table_alone():
     choice = {"kind": "periodic", "period_s": 0.5}
     registry.build(TRIGGERS, choice)
     assert choice == {"kind": "periodic", "period_s": 0.5}
 
 
-def test_a_bad_parameter_keeps_its_path(foreign):
+def test_bad_parameter_keeps_its_path(foreign):
     with pytest.raises(msgspec.ValidationError, match=r"Expected `float`, got `str` - at `\$\.width`"):
         registry.build(foreign, {"kind": "pulse", "width": "wide"})
     with pytest.raises(msgspec.ValidationError, match="missing required field `width`"):
@@ -93,12 +94,12 @@ def test_a_bad_parameter_keeps_its_path(foreign):
 
 
 @pytest.mark.parametrize(("choice", "message"), [({}, "required field `kind`"), ({"kind": 3}, r"at `\$\.kind`")])
-def test_a_table_must_say_its_kind(choice, message):
+def test_table_needs_a_kind(choice, message):
     with pytest.raises(msgspec.ValidationError, match=message):
         registry.build(TRIGGERS, choice)
 
 
-def test_an_unknown_name_is_answered_with_the_nearest():
+def test_unknown_name_gets_the_nearest():
     with pytest.raises(registry.UnknownPlugin, match=r"no 'periodc' among the triggers; did you mean 'periodic'?"):
         registry.load(TRIGGERS, "periodc")
     with pytest.raises(registry.UnknownPlugin, match=r"known: .*periodic.*send-on-delta"):
@@ -107,14 +108,14 @@ def test_an_unknown_name_is_answered_with_the_nearest():
         registry.load("zenpark.nothing", "xyzzy")
 
 
-def test_a_plugin_that_fails_to_import_says_whose_it_is_and_why(foreign):
+def test_failing_import_names_owner_and_reason(foreign):
     with pytest.raises(registry.PluginError, match=r"'gone' .*unnamed distribution.*No module named 'no_such_module"):
         registry.load(foreign, "gone")
     with pytest.raises(registry.PluginError, match=r"AttributeError: .*Puls"):
         registry.load(foreign, "misnamed")
 
 
-def test_a_plugin_of_the_wrong_sort_is_refused(foreign):
+def test_plug_in_must_be_a_struct(foreign):
     with pytest.raises(registry.PluginError, match=r"no msgspec.Struct"):
         registry.build(foreign, "function")
 
@@ -139,18 +140,18 @@ def test_did_you_mean(word, known, answer):
     assert registry.did_you_mean(word, known) == answer
 
 
-def test_two_of_one_name_are_refused_not_chosen_from(foreign):
+def test_ambiguous_name_is_refused(foreign):
     with pytest.raises(registry.PluginError, match=r"'twice' .* is ambiguous: .*one:A.* and .*two:B.*another name"):
         registry.load(foreign, "twice")
     assert registry.struct(foreign, "pulse") is Pulse, "found by two paths, it is one"
 
 
-def test_a_plugin_that_can_be_changed_is_refused(foreign):
+def test_changeable_plug_in_is_refused(foreign):
     with pytest.raises(registry.PluginError, match=r"Keeper.* can be changed.* frozen=True"):
         registry.build(foreign, "keeper")
 
 
-def test_plugins_that_cannot_be_used_are_named_with_reason_and_remedy(foreign, monkeypatch):
+def test_unusable_plug_ins_are_named_with_remedy(foreign, monkeypatch):
     monkeypatch.setattr(registry, "STRUCTS", (foreign,))
     lines = registry.unusable(registry.struct)
     assert [line.partition(" (")[0] for line in lines] == [
@@ -168,7 +169,7 @@ def failing():
     raise LookupError("of the plug-in")
 
 
-def test_an_error_in_a_plugin_of_another_distribution_has_its_line(monkeypatch):
+def test_foreign_culprit_is_named_with_its_line(monkeypatch):
     entry = SimpleNamespace(module=__name__, dist=Named("theirs"))
     monkeypatch.setattr(registry, "_installed", lambda: SimpleNamespace(select=lambda group: [entry]))
     with pytest.raises(LookupError) as caught:
@@ -180,6 +181,6 @@ def test_an_error_in_a_plugin_of_another_distribution_has_its_line(monkeypatch):
     assert registry.culprit(caught.value) is None
 
 
-def test_a_struct_without_faults_reads_no_metadata(monkeypatch):
+def test_sound_struct_reads_no_metadata(monkeypatch):
     monkeypatch.setattr(registry, "_name", lambda _: pytest.fail("the metadata of a distribution were read"))
     assert registry.struct(registry.TRIGGERS, "periodic").__name__ == "Periodic"
