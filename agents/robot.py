@@ -335,10 +335,7 @@ class Robot:
         """Whether nothing is missing for a take-off; asked before it alone. Raises PluginError as `rehearse`."""
         t, life, assignment = self.now.t, self.lifecycle, self.assignment
         if life.phase == IDLE and not self.now.invalid:
-            rehearse(
-                self.goals, self.transmitter, assignment.update, self._perception, assignment.legs,
-                self.now.position, t,
-            )  # fmt: skip
+            rehearse(assignment, self.goals, self.transmitter, self._perception, position=self.now.position, t=t)
         lacks = False
         if assignment.patience_s is None or t <= assignment.patience_s:
             lacks = self.neighbours.unreceived() or (self.guidance is not None and self.guidance.missing)

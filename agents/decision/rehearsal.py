@@ -7,11 +7,11 @@ from copy import deepcopy
 from numbers import Real
 from typing import Final
 
+from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer
 from agents.decision.perception import Perception
 from agents.decision.transmission import Transmitter
 from agents.plugins.calls import wrong
-from agents.plugins.planners import Leg
 from agents.plugins.triggers import LastEvent, Trigger, View
 from agents.vectors import NO_SETPOINT, ZERO, Vector
 
@@ -19,8 +19,8 @@ NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}
 
 
 def rehearse(
-    goals: GoalComputer, transmitter: Transmitter, update: Trigger | None, perception: Perception | None,
-    legs: Iterable[Leg], position: Vector, t: float,
+    assignment: Assignment, goals: GoalComputer, transmitter: Transmitter, perception: Perception | None,
+    *, position: Vector, t: float,
 ) -> None:  # fmt: skip
     """Call each plug-in of a robot at `position` [m]; raises PluginError where a result is not what it must be."""
     predictor, law, sent = transmitter.predictor, goals.law, LastEvent()
@@ -32,11 +32,11 @@ def rehearse(
             apart = sender.apart(position, predictor, t)
             _expect("law", law, "pull", law.pull(apart, sender.link), 3)
             _expect("law", law, "error", law.error(apart, sender.link), 1)
-    trigger = transmitter.asking.trigger
+    trigger, update = transmitter.asking.trigger, assignment.update
     _expect_bool(trigger, trigger.fires(deepcopy(transmitter.asking.view)))
     if update is not None:
         _expect_bool(update, update.fires(View(update.MEMORY)))
-    for leg in legs:
+    for leg in assignment.legs:
         _expect("planner", leg.planner, "target", leg.planner.target(0.0, position, 0.0), 4)
     if perception is not None:
         avoidance, own, near = perception.avoidance, perception.own, perception.near

@@ -64,9 +64,8 @@ class Play:
             t = k * dt
             held = predictor.position(last, t - last.time) if last.time > -inf else (nan, nan, nan)
             fired = self.transmitter.transmits(
-                t, moment.position, moment.velocity, error=moment.error, energy=moment.energy, since_start=t,
-                offset=moment.offset, setpoint=NO_SETPOINT,
-            )  # fmt: skip
+                t, moment.position, moment.velocity, moment.error, moment.energy, t, moment.offset, NO_SETPOINT
+            )
             gap = dist(self.transmitter.position, held) if k else inf
             self.fired.append(fired)
             self.gap_before.append(gap)

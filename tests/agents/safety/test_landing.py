@@ -39,7 +39,8 @@ class Lander:
 
     def decide(self, t, lag):
         """Ask where to land, and move on."""
-        self.now.take(t, BodyState(t - lag, self.position, self.velocity, 0.0, flying=self.kind.flies and self.lands))
+        self.now.state = BodyState(t - lag, self.position, self.velocity, 0.0, flying=self.kind.flies and self.lands)
+        self.now.begin(t)
         self.filter.judge(self.now)
         landing = self.landing
         if self.ordered or landing.aside:

@@ -49,7 +49,8 @@ class Standing:
     def check(self, missing=(), **values):
         """First reason why it must not take off."""
         stands = {"time": self.t, "position": (*START, 0.0), "velocity": (0.0, 0.0, 0.0), "yaw": 0.0}
-        self.now.take(self.t, BodyState(**{**stands, **self.values, **values}))
+        self.now.state = BodyState(**{**stands, **self.values, **values})
+        self.now.begin(self.t)
         self.filter.judge(self.now)
         return self.preflight.check(self.now, missing, self.neighbours, self.health)
 

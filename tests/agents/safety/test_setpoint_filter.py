@@ -35,7 +35,8 @@ class Swerve:
 def judged(kind, position, *, yaw=0.0, age=0.0, limits=LIMITS):
     """A filter, and a situation that it judged."""
     made, now = SetpointFilter(kind, limits), Situation()
-    now.take(0.0, BodyState(-age, position, (0.0, 0.0, 0.0), yaw))
+    now.state = BodyState(-age, position, (0.0, 0.0, 0.0), yaw)
+    now.begin(0.0)
     made.judge(now)
     return made, now
 

@@ -50,7 +50,8 @@ class Watched:
             self.neighbours.update_active(self.t)
             given = {"time": self.t, "heard": self.t, **self.values}
             state = BodyState(position=self.position, velocity=self.velocity, yaw=self.yaw, **given)
-            self.now.take(self.t, state)
+            self.now.state = state
+            self.now.begin(self.t)
             self.causes = self.detector.causes(self.now, self.status, self.neighbours, self.health)
             if self.causes or self.hazards.under_way:
                 self.acts += self.hazards.update(
