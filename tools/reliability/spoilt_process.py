@@ -147,16 +147,15 @@ def _refuse_landings(folder: Path) -> None:
 
 
 def _stamp_stops(stamp: Switch) -> None:
-    from agents.arrays import Index  # not in every process
-    from twins.body import TwinBody
+    from twins.body import TwinBody  # not in every process
 
     cut = TwinBody.stop
 
-    def stop(body: TwinBody, rows: Index) -> None:
+    def stop(body: TwinBody, rows: Sequence[int]) -> None:
         cut(body, rows)
         stamp.write(stamp.read() or time.monotonic())
 
-    TwinBody.stop = stop  # type: ignore[method-assign, assignment]
+    TwinBody.stop = stop  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":

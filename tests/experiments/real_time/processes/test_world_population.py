@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from agents.vectors import NO_SETPOINT
 from experiments.definition.experiment import Arena, Experiment, Robot, World
 from experiments.real_time.processes.world_population import Population, Refused
 from twins.scene import Obstacle
@@ -42,41 +43,38 @@ def row(world: Population, name: str) -> int:
 
 
 def at(world: Population, name: str) -> list[float]:
-    return [round(value, 6) for value in world.state.true_position[row(world, name)].tolist()]
+    return [round(value, 6) for value in world.states[row(world, name)].true_position]
 
 
 def go(world: Population, ticks: int, **setpoints: tuple[float, float, float, float]) -> None:
     for _ in range(ticks):
-        given = np.full((len(world.names), 4), np.nan)
-        for name, setpoint in setpoints.items():
-            given[row(world, name)] = setpoint
-        world.body.command(given)
+        world.body.command([setpoints.get(name, NO_SETPOINT) for name in world.names])
         world.advance()
 
 
-def test_robots_of_a_world_are_carried_and_the_others_are_mirrors(world: Population) -> None:
+def test_world_carries_its_robots_and_mirrors_others(world: Population) -> None:
     assert world.names == ("KH01", "CF01", "TB01")
-    assert world.carried.tolist() == [True, True, False]
-    assert world.seen.tolist() == [True, True, False]
+    assert world.carried == (True, True, False)
+    assert world.seen == (True, True, False)
     assert at(world, "CF01") == [0.0, 1.0, 0.0]
-    assert np.isnan(world.state.true_position[2]).all(), "nobody has said where it is"
+    assert np.isnan(world.states[2].true_position).all(), "nobody has said where it is"
     go(world, 100, KH01=(0.2, 0.0, 0.0, 0.0))
     assert world.time == pytest.approx(1.0)
     assert at(world, "KH01")[0] == pytest.approx(0.19, abs=0.011)
 
 
-def test_who_asks_for_ranges_gets_sensors_without_being_carried() -> None:
+def test_mirrored_robot_may_ask_for_ranges() -> None:
     world = Population(
         experiment(
             TB01=Robot(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
             KH01=Robot(kind="khepera4", start=[0.0, 0.0]),
         )
     )
-    assert world.carried.tolist() == [False, False]
-    assert world.seen.tolist() == [True, False]
+    assert world.carried == (False, False)
+    assert world.seen == (True, False)
 
 
-def test_reset_puts_back_and_leaves_in_the_air_what_flies(world: Population) -> None:
+def test_reset_puts_back_and_leaves_in_the_air(world: Population) -> None:
     world.takeoff(row(world, "CF01"), 0.6)
     go(world, 250)
     go(world, 100, CF01=(0.4, 1.2, 0.6, 0.0), KH01=(0.2, 0.0, 0.0, 0.0))
@@ -86,8 +84,8 @@ def test_reset_puts_back_and_leaves_in_the_air_what_flies(world: Population) -> 
     assert at(world, "CF01")[0] > 0.3
     world.reset(None)
     assert at(world, "CF01") == [0.0, 1.0, pytest.approx(0.6, abs=0.01)]
-    assert world.state.true_yaw[1] == 0.5
-    assert world.body.engine.flying.tolist()[:2] == [False, True]
+    assert world.states[1].true_yaw == 0.5
+    assert [state.flying for state in world.states[:2]] == [False, True]
     go(world, 50)
     assert at(world, "CF01") == [0.0, 1.0, pytest.approx(0.6, abs=0.01)], "it holds there"
     with pytest.raises(Refused, match="TB01 is only mirrored here"):
@@ -100,7 +98,7 @@ def test_reset_puts_back_and_leaves_in_the_air_what_flies(world: Population) -> 
         world.reset("KH02")
 
 
-def test_reset_puts_back_what_was_pushed_and_lets_time_go_on() -> None:
+def test_reset_puts_back_pushed_obstacles() -> None:
     given = experiment(KH01=Robot(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
     arena = msgspec.structs.replace(given.arena, obstacles={"crate": msgspec.structs.replace(CRATE, mass=0.2)})
     world = Population(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk")))
@@ -124,7 +122,7 @@ def test_nothing_is_put_back_into_an_obstacle() -> None:
         world.reset("KH01")
 
 
-def test_what_moves_by_a_plan_begins_with_the_run_and_goes_on_after_a_reset() -> None:
+def test_planned_obstacles_move_from_the_start() -> None:
     belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
     given = experiment()
     arena = msgspec.structs.replace(given.arena, obstacles={"belt": belt})
@@ -157,7 +155,7 @@ def test_contacts_have_names() -> None:
     assert all(meeting.impulse > 0.0 and meeting.overlap < 1e-3 for meeting in found)
 
 
-def test_wheels_stop_without_commands_only_with_a_watchdog(world: Population) -> None:
+def test_wheels_stop_with_a_watchdog_alone(world: Population) -> None:
     flying = row(world, "CF01")
     assert world.hold_s[flying] == 0.5
     assert world.hold_s[row(world, "KH01")] == np.inf
