@@ -70,7 +70,7 @@ class WorldProcess:
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
         self.paused = False
-        names = zip(population.names, population.carried.tolist(), strict=True)
+        names = zip(population.names, population.carried, strict=True)
         self.carried = [name for name, here in names if here]
         self._farewell = Farewell(session, self._keys, self.carried, lost)
 

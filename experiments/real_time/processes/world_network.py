@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from typing import Final
 
-import numpy as np
+import msgspec
 import zenoh
 
-from agents.arrays import Array, some
-from agents.body.interface import RangeScan, Rays
+from agents.body.interface import BodyState
 from agents.clock import Clock
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -88,25 +88,19 @@ class Exchange:
         self._begun = inf
         self._ticks = 0
         names = self._names = population.names
-        rows = len(names)
-        self._quiet = np.full(rows, inf)  # begin of the silence of each row; infinity: it needs no command
-        # time and pose of the last state of each mirrored row
-        self._received_at = np.full(rows, -inf)
-        self._place, self._velocity, self._yaw = np.full((rows, 3), np.nan), np.zeros((rows, 3)), np.zeros(rows)
-        self._carried, self._mirrored = np.flatnonzero(population.carried), np.flatnonzero(~population.carried)
-        carried = self._carried.tolist()
+        self._quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
+        self._carried = carried = [row for row, here in enumerate(population.carried) if here]
         self._row = {keys.setpoint(names[row]): row for row in carried}
         measured = frozenset(Plan(experiment).externally_measured)
-        placed = [row for row in carried if names[row] not in measured]
-        self._placed = np.array(placed, dtype=np.intp)
 
-        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[str, zenoh.Publisher]:
-            return {names[row]: pubsub.publisher(session, key(names[row]), self._mime) for row in rows}
+        def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, zenoh.Publisher]:
+            return {row: pubsub.publisher(session, key(names[row]), self._mime) for row in rows}
 
-        self._positions = publishers(keys.position, placed)
+        self._positions = publishers(keys.position, (row for row in carried if names[row] not in measured))
         self._truths = publishers(keys.truth, carried)
-        self._ranges = publishers(keys.ranges, np.flatnonzero(population.seen).tolist())
-        self._mirrors = [(row, self._states_of(names[row])) for row in self._mirrored.tolist()]
+        self._ranges = publishers(keys.ranges, (row for row, seen in enumerate(population.seen) if seen))
+        mirrored = [row for row, here in enumerate(population.carried) if not here]
+        self._mirrors = [_Mirror(row, self._states_of(names[row])) for row in mirrored]
         self.restart()
 
     def begin(self, up: float) -> None:
@@ -115,21 +109,14 @@ class Exchange:
 
     def restart(self) -> None:
         """Follows a body that is made anew: it has no commands, and does not know the mirrored robots."""
-        rows = len(self._names)
-        self._held = np.zeros(rows, dtype=bool)
-        self._given = np.full((rows, 4), np.nan)  # setpoints since the last step
-        self._scanned = np.full(rows, -inf)
-        self._rays: Rays | None = None
-        if len(self._mirrored):
-            self._update_mirrors()
+        self._held = [False] * len(self._names)
+        self._given = [NO_SETPOINT] * len(self._names)  # setpoints since the last step
+        self._scanned = dict.fromkeys(self._ranges, -inf)  # time of the last published sweep [s]
+        self._update_mirrors()
 
     def restore_positions(self, there: Set[str]) -> list[str]:
         """Places simulated robots that are on the network at the poses of their states; returns their names."""
-        waiting = {
-            name: self._states_of(name)
-            for name in (self._names[row] for row in self._carried.tolist())
-            if name in there
-        }
+        waiting = {name: self._states_of(name) for name in (self._names[row] for row in self._carried) if name in there}
         found: list[str] = []
         deadline, pause = time.monotonic() + ANSWER_S, threading.Event()
         while waiting and time.monotonic() < deadline:
@@ -150,7 +137,7 @@ class Exchange:
 
     def mirrored(self) -> list[str]:
         """Names of the mirrored robots with a known pose."""
-        return [self._names[row] for row in self._mirrored.tolist() if np.isfinite(self._place[row, 0])]
+        return [self._names[mirror.row] for mirror in self._mirrors if isfinite(mirror.place[0])]
 
     # ------------------------------------------------------------------ receive
 
@@ -167,39 +154,40 @@ class Exchange:
             if command.seq > self._done.get(command.robot, 0):
                 self._done[command.robot] = command.seq
                 self._obey(row, command, t)
-        if len(self._mirrored):
-            self._update_poses(t)
+        self._update_poses(t)
         for status in self._statuses.read():
             self._update_start(status, t)
 
     def slept(self, seconds: float, t: float) -> None:
         """Forgives silence after the world stood still for so long, until `t`."""
         if seconds > HANG_S:
-            self._quiet = np.where(np.isfinite(self._quiet), np.maximum(self._quiet, t), self._quiet)
+            self._quiet = [max(since, t) for since in self._quiet]
 
     def apply_commands(self, t: float) -> None:
         """Applies the commands; robots without commands hold, drive on, or land after `LAND_S`."""
-        population = self._population
-        hold_s: float | Array = population.hold_s
-        if self._cut_off:  # without a router no command arrives: robots hold, but need not land
-            self._quiet = np.maximum(self._quiet, t - HOLD_S - 1e-3)
-            hold_s = HOLD_S
-        silent = t - self._quiet > hold_s
-        if some(silent):
-            holding = np.flatnonzero(silent & ~self._held)
-            if len(holding):
-                self._held[holding] = True
-                population.body.command(population.holding(holding))
-            tired = np.flatnonzero(silent & (t - self._quiet > LAND_S) & population.body.engine.flying)
-            if len(tired):
-                population.body.land(tired)
-                self._quiet[tired] = inf
-                for row in tired.tolist():
-                    self.publish_event("silent", self._names[row], f"lands: no command for {LAND_S:g} s")
-        given = np.isfinite(self._given[:, 0])
-        if some(given):
-            population.body.command(self._given)
-            self._given = np.full_like(self._given, np.nan)
+        population, body = self._population, self._population.body
+        holding, tired = set[int](), list[int]()
+        for row, motion in enumerate(body.engine.motions):
+            hold_s = population.hold_s[row]
+            if self._cut_off:  # without a router no command arrives: robots hold, but need not land
+                self._quiet[row] = max(self._quiet[row], t - HOLD_S - 1e-3)
+                hold_s = HOLD_S
+            silence = t - self._quiet[row]
+            if silence > hold_s and not self._held[row]:
+                self._held[row] = True
+                holding.add(row)
+            if silence > max(hold_s, LAND_S) and motion.flying:
+                self._quiet[row] = inf
+                tired.append(row)
+        if holding:
+            body.command(population.holding(holding))
+        if tired:
+            body.land(tired)
+            for row in tired:
+                self.publish_event("silent", self._names[row], f"lands: no command for {LAND_S:g} s")
+        if any(isfinite(setpoint[0]) for setpoint in self._given):
+            body.command(self._given)
+            self._given = [NO_SETPOINT] * len(self._names)
 
     def _obey(self, row: int, command: messages.Command, t: float) -> None:
         population, action = self._population, command.action
@@ -207,12 +195,12 @@ class Exchange:
             self._given[row] = command.setpoint
             self._quiet[row], self._held[row] = t, False
             return
-        self._given[row], self._held[row] = np.nan, False
+        self._given[row], self._held[row] = NO_SETPOINT, False
         if action == "takeoff" and command.height is not None:
             population.takeoff(row, command.height)
             self._quiet[row] = t + CLIMB_S
         else:
-            (population.body.land if action == "land" else population.body.stop)(np.array([row]))
+            (population.body.land if action == "land" else population.body.stop)([row])
             self._quiet[row] = inf
 
     def _note_owner(self, token: str) -> None:
@@ -248,22 +236,26 @@ class Exchange:
     def _update_poses(self, t: float) -> None:
         """Updates the poses of mirrored robots."""
         changed = False
-        for row, inbox in self._mirrors:
-            state = self._newest(inbox)
+        for mirror in self._mirrors:
+            state = self._newest(mirror.inbox)
             if state is not None and state.position is not None:
-                self._place[row], self._velocity[row] = state.position, state.velocity or messages.STILL
-                self._yaw[row] = state.yaw or 0.0
-                self._received_at[row] = t
+                mirror.place, mirror.velocity = state.position, state.velocity or messages.STILL
+                mirror.yaw, mirror.received_at = state.yaw or 0.0, t
                 changed = True
-            elif t - self._received_at[row] > GONE_S and np.isfinite(self._place[row, 0]):
-                self._place[row] = np.nan
+            elif t - mirror.received_at > GONE_S and isfinite(mirror.place[0]):
+                mirror.place = UNKNOWN
                 changed = True
         if changed:
             self._update_mirrors()
 
     def _update_mirrors(self) -> None:
-        rows = self._mirrored
-        self._population.body.mirror(rows, self._place[rows], self._yaw[rows], self._velocity[rows])
+        mirrors = self._mirrors
+        self._population.body.mirror(
+            [mirror.row for mirror in mirrors],
+            [mirror.place for mirror in mirrors],
+            [mirror.yaw for mirror in mirrors],
+            [mirror.velocity for mirror in mirrors],
+        )
 
     def _states_of(self, name: str) -> pubsub.Inbox[messages.State]:
         subscriber = pubsub.subscriber(self._session, self._keys.state(name), 4)
@@ -297,16 +289,17 @@ class Exchange:
 
     def publish(self, t: float) -> None:
         """Publishes positions, true poses, range readings and contacts."""
-        state, rows = self._population.state, self._carried
+        states, names, encoding = self._population.states, self._names, self._encoding
         stamp = round(self.utc + t, 6)
-        self._publish(self._positions, state.position[self._placed], state.yaw[self._placed], stamp)
+        for row, publisher in self._positions.items():
+            state = states[row]
+            _publish(publisher, messages.position(names[row], stamp, *_rounded(state.position, state.yaw)), encoding)
         if self._ticks % self._truth_every == 0:
-            self._publish(self._truths, state.true_position[rows], state.true_yaw[rows], stamp)
+            for row, publisher in self._truths.items():
+                truth = _rounded(states[row].true_position, states[row].true_yaw)
+                _publish(publisher, messages.position(names[row], stamp, *truth), encoding)
         self._ticks += 1
-        rays = state.rays
-        if rays is not None and rays is not self._rays:
-            self._rays = rays
-            self._sweep(rays, stamp)
+        self._publish_sweeps(states, stamp)
         for meeting in self._population.meetings():
             self.contacts += 1
             contact = messages.Contact(stamp, meeting.first, meeting.second, meeting.impulse, meeting.overlap)
@@ -327,23 +320,35 @@ class Exchange:
         self.trouble = reason
         self.publish_event("refused", source, reason)
 
-    def _publish(self, publishers: Mapping[str, zenoh.Publisher], position: Array, yaw: Array, stamp: float) -> None:
-        encoding = self._encoding
-        for (name, publisher), place, heading in zip(
-            publishers.items(), position.round(6).tolist(), yaw.round(6).tolist(), strict=True
-        ):
-            said = messages.encode(messages.position(name, stamp, place, heading), encoding)
-            publisher.put(said, source_info=pubsub.source_of(publisher))
+    def _publish_sweeps(self, states: Sequence[BodyState], stamp: float) -> None:
+        """Publishes new range readings."""
+        for row, publisher in self._ranges.items():
+            scan = states[row].scan
+            if scan is not None and scan.time > self._scanned[row]:
+                self._scanned[row] = scan.time
+                message = range_inbox.message(self._names[row], stamp, msgspec.structs.replace(scan, time=0.0))
+                publisher.put(messages.encode(message, self._encoding))
 
-    def _sweep(self, rays: Rays, stamp: float) -> None:
-        """Publishes the readings of rows that have new ones."""
-        begin = np.flatnonzero(np.diff(rays.row, prepend=-1))  # rays of one row follow one another
-        end = np.append(begin[1:], len(rays.row))
-        time = np.maximum.reduceat(rays.time, begin)
-        rows = rays.row[begin]
-        for k in np.flatnonzero(time > self._scanned[rows]).tolist():
-            row, part = int(rows[k]), slice(int(begin[k]), int(end[k]))
-            self._scanned[row] = time[k]
-            scan = RangeScan(0.0, rays.bearing[part], rays.elevation[part], rays.distance[part])
-            message = range_inbox.message(self._names[row], stamp, scan)
-            self._ranges[self._names[row]].put(messages.encode(message, self._encoding))
+
+class _Mirror:
+    """A robot that another process carries, as its states show it."""
+
+    __slots__ = ("inbox", "place", "received_at", "row", "velocity", "yaw")
+
+    place: Vector  # [m], NaN while it is absent
+    velocity: Vector  # [m/s]
+    yaw: float  # [rad]
+    received_at: float  # of the last state [s]
+
+    def __init__(self, row: int, inbox: pubsub.Inbox[messages.State]) -> None:
+        self.row, self.inbox = row, inbox
+        self.place, self.velocity, self.yaw, self.received_at = UNKNOWN, ZERO, 0.0, -inf
+
+
+def _rounded(position: Vector, yaw: float) -> tuple[Vector, float]:
+    """A pose in micrometres and microradians, still in metres and radians."""
+    return (round(position[0], 6), round(position[1], 6), round(position[2], 6)), round(yaw, 6)
+
+
+def _publish(publisher: zenoh.Publisher, message: messages.Position, encoding: messages.Encoding) -> None:
+    publisher.put(messages.encode(message, encoding), source_info=pubsub.source_of(publisher))
