@@ -10,14 +10,15 @@ import subprocess
 import sys
 import threading
 import tomllib
+from math import cos, hypot, sin
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.formation.graph import Links
+from agents.formation.link import Link
+from tests.agents.signals import Play, standing
 from tests.system import lab
 from tests.waiting import until
 
@@ -64,7 +65,7 @@ def zenpark(folder, *arguments):
     )  # fmt: skip
 
 
-def test_every_group_of_plugins_has_an_example():
+def test_every_group_has_an_example():
     assert {group for _, _, _, group in REGISTERED} | {"zenpark.triggers"} == {
         *("zenpark.triggers", "zenpark.predictors", "zenpark.laws", "zenpark.planners"),
         *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies"),
@@ -72,7 +73,7 @@ def test_every_group_of_plugins_has_an_example():
 
 
 @pytest.mark.slow
-def test_the_trigger_of_the_docs_runs_from_outside(installed):
+def test_trigger_of_the_docs_runs_from_outside(installed):
     assert len(source_of("SendEvery").splitlines()) <= 20
     listed = zenpark(installed, "list").stdout
     assert re.search(r"Triggers: .*\bsend-every\b", listed)
@@ -117,8 +118,8 @@ class Rover(threading.Thread):
             twist = json.loads(payload)
             self.twists.append((twist["v"], twist["w"]))
             self.pose[2] += 0.02 * twist["w"]
-            self.pose[0] += 0.02 * twist["v"] * np.cos(self.pose[2])
-            self.pose[1] += 0.02 * twist["v"] * np.sin(self.pose[2])
+            self.pose[0] += 0.02 * twist["v"] * cos(self.pose[2])
+            self.pose[1] += 0.02 * twist["v"] * sin(self.pose[2])
             self.socket.sendto(b"not a pose", sender)
             self.socket.sendto(json.dumps(dict(zip(("x", "y", "yaw"), self.pose, strict=True))).encode(), sender)
 
@@ -141,23 +142,23 @@ def rovers(*addresses):
     request = SimpleNamespace(
         names=tuple(f"R{k}" for k in range(count)),
         addresses=addresses,
-        start=np.zeros((count, 3)),
-        yaw=np.zeros(count),
+        start=((0.0, 0.0, 0.0),) * count,
+        yaw=(0.0,) * count,
     )
     return names["Rovers"](request)
 
 
-def test_the_body_of_the_docs_drives_a_robot_over_udp(rover):
+def test_body_of_the_docs_drives_over_udp(rover):
     body = rovers(rover.address)
     body.open()
     for _ in range(3):
-        body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
-    until(lambda: body.read(7.0).position[0, 0] > 0.0299)
-    state = body.read(7.0)
-    assert state.position[0] == pytest.approx([0.03, 0.0, 0.0])
-    assert state.time == pytest.approx([7.0])
-    body.stop(np.array([0]))
-    body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
+        body.command([(0.5, 0.0, 0.0, 0.0)])
+    until(lambda: body.read(7.0)[0].position[0] > 0.0299)
+    (state,) = body.read(7.0)
+    assert state.position == pytest.approx((0.03, 0.0, 0.0))
+    assert state.time == 7.0
+    body.stop([0])
+    body.command([(0.5, 0.0, 0.0, 0.0)])
     until(lambda: len(rover.twists) >= 5 and rover.twists[-2:] == [(0.0, 0.0)] * 2)
     body.close()
 
@@ -195,9 +196,7 @@ def four_rovers():
 
 
 @pytest.mark.system
-def test_a_robot_of_the_guide_that_dies_or_freezes_or_tells_nonsense_fails_the_run(
-    installed, four_rovers, tmp_path, monkeypatch
-):
+def test_broken_robots_of_the_guide_fail_the_run(installed, four_rovers, tmp_path, monkeypatch):
     monkeypatch.setitem(lab.ENVIRONMENT, "PYTHONPATH", os.pathsep.join([str(installed), str(ROOT)]))
     robots = "".join(
         f'[robots.{name}]\nkind = "khepera4"\nstart = {list(STARTS[name])}\n'
@@ -226,10 +225,10 @@ def test_a_robot_of_the_guide_that_dies_or_freezes_or_tells_nonsense_fails_the_r
     assert "over: " not in said
     (recording,) = (tmp_path / "run").glob("*.mcap")
     drove = [state.velocity for state in lab.typed(recording, "/RV04/state")]
-    assert max(np.hypot(*velocity[:2]) for velocity in drove if velocity) > 0.02  # the body measures none
+    assert max(hypot(*velocity[:2]) for velocity in drove if velocity) > 0.02  # the body measures none
 
 
-def test_the_body_of_the_docs_refuses_what_is_no_address_and_a_robot_that_is_not_there():
+def test_body_of_the_docs_refuses_wrong_addresses():
     with pytest.raises(BodyError, match="no address"):
         rovers("rover://nowhere")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
@@ -238,11 +237,32 @@ def test_the_body_of_the_docs_refuses_what_is_no_address_and_a_robot_that_is_not
             rovers("rover://{}:{}".format(*silent.getsockname())).open()
 
 
-def test_the_law_of_the_docs_pulls_to_the_distance_of_the_link():
+def test_law_of_the_docs_pulls_to_its_distance():
     names: dict[str, type] = {"__name__": "my_laws"}
     exec(source_of("Spring"), names)
-    law = names["Spring"](constant=0.3)
-    links = Links(np.array([0]), np.array([1]), np.array([0.5]), np.array([1.0]))
-    position, heard = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0]])
-    assert law.offset(position, heard, links) == pytest.approx(np.array([[-0.15, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-    assert law.error(position, heard, links) == pytest.approx([0.5])
+    law, link = names["Spring"](constant=0.3), Link(0.5)
+    assert law.pull((1.0, 0.0, 0.0), link) == pytest.approx((-0.15, 0.0, 0.0))
+    assert law.error((1.0, 0.0, 0.0), link) == pytest.approx(0.5)
+
+
+def made(name, **parameters):
+    """A plug-in of the guide."""
+    names: dict[str, type] = {"__name__": "guide"}
+    exec(source_of(name), names)
+    return names[name](**parameters)
+
+
+def test_fading_of_the_docs_spends_what_it_saved():
+    trigger = made("Fading", threshold=0.0, floor=0.01, saving=0.1)
+    saved = Play(trigger, standing(100) + standing(1, (0.015, 0.0, 0.0)))
+    assert not saved.fired[-1]
+    assert Play(trigger, standing(1) + standing(1, (0.015, 0.0, 0.0))).fired[-1]
+
+
+def test_predictor_and_planner_of_the_docs():
+    sent = SimpleNamespace(position=(1.0, 2.0, 0.0), velocity=(0.2, 0.0, 0.0))
+    assert made("Cautious", share=0.5).position(sent, 2.0) == pytest.approx((1.2, 2.0, 0.0))
+    assert made("Cautious").velocity(sent, 9.0) == pytest.approx((0.1, 0.0, 0.0))
+    shuttle = made("Shuttle", length=0.4, period_s=4.0)
+    assert shuttle.target(3.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
+    assert shuttle.target(5.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
