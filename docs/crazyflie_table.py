@@ -14,8 +14,9 @@ from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
 from twins.devices.crazyflie.flock import LOST, Estimator
 from twins.devices.crazyflie.planner import ORDER, Planner, evaluate, polynomial
-from twins.engines.mujoco_engine import Drones
-from twins.models.quadrotor import Quadrotor
+from twins.engines.engine import Engine, Stage
+from twins.engines.mujoco_engine import RigidBody
+from twins.engines.point_mass import PointMass
 from twins.scene import Scene
 
 DT = 0.01
@@ -87,8 +88,8 @@ def twin() -> Callable[[], float]:
     def advance() -> float:
         nonlocal tick
         tick += 1
-        estimator.add_external(0, DT * tick, (0.0, 0.0, 0.0))
-        estimator.advance(DT * tick, DT, np.zeros((1, 3)), no, no, flying=no)
+        estimator.add_external(0, DT * tick, (0.0, 0.0, 0.0), np.zeros(3))
+        estimator.advance(DT * tick, DT, no, no, flying=no)
         return float(estimator.variance[0])
 
     return advance
@@ -102,15 +103,16 @@ def settling(variance: Callable[[], float]) -> tuple[float, float]:
 
 def law_difference(setpoints: Array) -> tuple[float, float]:
     """Root mean square and largest distance [m] of the twin's law to the cascade on a rigid body; setpoints (T, 4)."""
-    one = ((CRAZYFLIE,), np.zeros((1, 3)), np.zeros(1), DT)
+    one = Stage((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
+    engines: tuple[Engine, ...] = PointMass().build(one), RigidBody().build(one)
     paths = []
-    for robot in (Quadrotor(*one), Drones(*one, scene=Scene.empty(), motor_lag=0.03)):
-        robot.place(np.array([0]), np.array([[0.0, 0.0, 1.0]]), np.zeros(1), np.array([True]))
+    for engine in engines:
+        engine.place([0], [(0.0, 0.0, 1.0)], [0.0], [True])
         path = []
-        for setpoint in setpoints:
-            robot.command(setpoint[None])
-            robot.advance()
-            path.append(robot.position[0].copy())
+        for x, y, z, yaw in setpoints.tolist():
+            engine.command([(x, y, z, yaw)])
+            engine.advance(0.0, [(0.0, 0.0)])
+            path.append(engine.motions[0].position)
         paths.append(np.array(path))
     far = np.linalg.norm(paths[0] - paths[1], axis=1)
     return float(np.sqrt((far**2).mean())), float(far.max())

@@ -11,24 +11,26 @@ from matplotlib.figure import Figure
 from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
 from experiments.report.style import CASES, STYLE
-from twins.engines.mujoco_engine import Drones
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.engines.engine import Engine, Stage
+from twins.engines.mujoco_engine import RigidBody
+from twins.engines.point_mass import PointMass
+from twins.models.quadrotor import RESPONSES
 from twins.scene import Scene
 
 DT, SECONDS, HEIGHT = 0.01, 4.0, 1.0
 STEPS = (("x", 0, 0.3), ("x", 0, 1.0), ("z", 2, 0.3), ("z", 2, 1.0), ("yaw", 3, 1.0))
 
 
-def flown(robot: Drones | Quadrotor, axis: int, step: float) -> Array:
+def flown(engine: Engine, axis: int, step: float) -> Array:
     """(T, 2) time [s] and what a step of one axis makes of it [m], [rad]."""
-    hold = np.array([0.0, 0.0, HEIGHT, 0.0])
-    robot.place(np.array([0]), hold[None, :3], hold[3:], np.array([True]))
-    setpoint, path = hold.copy(), [0.0]
-    setpoint[axis] += step
+    hold = [0.0, 0.0, HEIGHT, 0.0]
+    engine.place([0], [(0.0, 0.0, HEIGHT)], [0.0], [True])
+    x, y, z, yaw = (value + step * (number == axis) for number, value in enumerate(hold))
+    motion, path = engine.motions[0], [0.0]
     for _ in range(round(SECONDS / DT)):
-        robot.command(setpoint[None])
-        robot.advance()
-        path.append([*robot.position[0], robot.yaw[0]][axis] - hold[axis])
+        engine.command([(x, y, z, yaw)])
+        engine.advance(0.0, [(0.0, 0.0)])
+        path.append([*motion.position, motion.yaw][axis] - hold[axis])
     return np.column_stack([DT * np.arange(len(path)), path])
 
 
@@ -44,15 +46,15 @@ def figures(path: Array, step: float) -> tuple[float, float]:
 
 def main() -> None:
     """Both."""
-    one = ((CRAZYFLIE,), np.zeros((1, 3)), np.zeros(1), DT)
+    one = Stage((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
     print(f"law: {RESPONSES['crazyflie']}")
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 1.9), layout="constrained")
         panels = iter(figure.subplots(1, 4))
         for name, axis, step in STEPS:
             curves = {
-                "rigid body, firmware's cascade": flown(Drones(*one, scene=Scene.empty(), motor_lag=0.03), axis, step),
-                "fitted law": flown(Quadrotor(*one), axis, step),
+                "rigid body, firmware's cascade": flown(RigidBody().build(one), axis, step),
+                "fitted law": flown(PointMass().build(one), axis, step),
             }
             for label, path in curves.items():
                 rise, overshoot = figures(path, step)

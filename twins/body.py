@@ -43,6 +43,23 @@ class Twin:
     )  # fmt: skip
 
     motion: Motion  # of an engine
+    _jitter: HoverJitter
+    _measurement: Measurement
+    _drift: Drift
+    _latency: Latency
+    _jitters: bool  # whether these four are present
+    _measures: bool
+    _drifts: bool
+    _delays: bool
+    _drives: bool  # uses its battery all the time; what flies, with its motors on
+    _endurance: float  # of a full battery [s],
+    _used: float  # and how much of it is used [s]
+    _command: Setpoint  # given since the last step; NaN: none
+    _before: Vector  # true position before the step [m]
+    _t: float  # time of the last step [s]
+    _measured_at: float  # time of the last measurement [s], −inf before the first,
+    _measured: Vector  # its position [m],
+    _velocity: Vector  # and velocity [m/s]
 
     def __init__(
         self, motion: Motion, kind: Kind, disturbance: Disturbance, *, name: str, seed: int, dt: float
@@ -56,7 +73,7 @@ class Twin:
         self._drifts, self._delays = self._drift.present, self._latency.present
         self._drives, self._endurance = not kind.flies, kind.endurance_s
         self._command, self._before = NO_SETPOINT, motion.position
-        self._t, self._used = 0.0, 0.0  # time, and time with motors on [s]
+        self._t = self._used = 0.0
         self._measured_at, self._measured, self._velocity = -inf, ZERO, ZERO
 
     def command(self, setpoint: Setpoint) -> None:

@@ -44,6 +44,14 @@ class Differential:
     flying: bool  # never
     attitude: Attitude  # NaN: upright
     wobble: tuple[float, float]  # of no effect: hover jitter is of flying robots
+    _base: float  # distance between the wheels [m],
+    _half_base: float  # and half of it
+    _limit: float  # largest rim speed [m/s]
+    _acceleration: float  # largest, of the rim [m/s²]
+    _left: float  # rim speeds [m/s],
+    _right: float
+    _wanted_left: float  # and what they are commanded to be
+    _wanted_right: float
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad]."""
@@ -58,7 +66,7 @@ class Differential:
         v, half = setpoint[0], self._half_base * setpoint[1]
         left = v - half
         if isfinite(left):
-            self._wanted_left, self._wanted_right = left, v + half  # rim speeds [m/s]
+            self._wanted_left, self._wanted_right = left, v + half
 
     def takeoff(self, height: float) -> None:
         """Of no effect."""
@@ -74,7 +82,7 @@ class Differential:
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
         """Set position [m] and yaw [rad], at rest."""
         self.position, self.velocity, self.yaw = position, ZERO, yaw
-        self._left = self._right = self._wanted_left = self._wanted_right = 0.0  # rim speeds [m/s]
+        self._left = self._right = self._wanted_left = self._wanted_right = 0.0
 
     def push(self, velocity: Vector) -> None:
         """Drive straight ahead with the component of a velocity [m/s] along the heading."""

@@ -24,6 +24,9 @@ class HoverJitter:
 
     present: bool
     noise: Noise
+    _keep: float  # share of the displacement that is left after dt
+    _x: float  # displacement at full height [m]
+    _y: float
 
     def __init__(self, disturbance: Disturbance, name: str, seed: int, dt: float) -> None:
         """`dt`: time between two calls of `advance` [s]."""
@@ -79,6 +82,7 @@ class Drift:
     noise: Noise
     x: float  # error [m]
     y: float
+    _rate: float  # standard deviation after 1 m [m per square root of m]
 
     def __init__(self, disturbance: Disturbance, name: str, seed: int) -> None:
         self._rate = disturbance.odometry_drift or 0.0
@@ -102,10 +106,13 @@ class Latency:
     __slots__ = ("_now", "_past", "_ticks", "present")
 
     present: bool
+    _ticks: int
+    _past: list[Setpoint]  # commands of the last ticks, in a ring,
+    _now: int  # and the index of the oldest
 
     def __init__(self, disturbance: Disturbance, dt: float) -> None:
         self._ticks = round((disturbance.latency_s or 0.0) / dt)
-        self._past: list[Setpoint] = [NO_SETPOINT] * (self._ticks + 1)
+        self._past = [NO_SETPOINT] * (self._ticks + 1)
         self._now = 0
         self.present = self._ticks != 0
 

@@ -31,6 +31,9 @@ class Noise:
     ahead: list[float]  # numbers drawn ahead, one draw after the other
     next: int  # index of the next draw in `ahead`
     end: int  # value of `next` at which `refill` is due; −1 without noise
+    _scale: tuple[float, ...]  # standard deviations of the numbers of a draw
+    _block: int  # draws per refill
+    _generator: np.random.Generator  # only where there is noise
 
     def __init__(self, name: str, seed: int, purpose: str, scale: Sequence[float], block: int = BLOCK) -> None:
         """`scale`: standard deviations. The stream does not depend on `block`, the draws per refill."""

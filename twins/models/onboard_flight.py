@@ -29,13 +29,24 @@ class OnboardFlight:
     flying: bool  # motors on
     attitude: Attitude  # NaN where it is always upright
     wobble: tuple[float, float]  # hover jitter of the next step [m]
+    _by_velocity: bool  # setpoints are velocity and yaw rate
+    _target: Vector  # setpoint of the position [m],
+    _yaw_setpoint: float  # and of the yaw [rad]
+    _velocity_setpoint: Vector  # [m/s]
+    _yaw_rate: float  # [rad/s]
+    _landing: bool
+    _climbing: bool  # a take-off or landing leads the height of the target,
+    _from: float  # from this height [m]
+    _to: float  # to this one [m];
+    _elapsed: float  # time since its begin [s],
+    _climb_s: float  # and its duration [s]
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad], motors off."""
         self._by_velocity = kind.takes == "velocity"
         self.attitude, self.wobble = NO_ATTITUDE, (0.0, 0.0)
-        self._from = self._to = start[2]  # heights of a take-off or landing [m],
-        self._elapsed, self._climb_s = 0.0, 1.0  # time since its begin, and its duration [s]
+        self._from = self._to = start[2]
+        self._elapsed, self._climb_s = 0.0, 1.0
         self.place(start, yaw, flying=False)
 
     def command(self, setpoint: Setpoint) -> None:

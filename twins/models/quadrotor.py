@@ -37,17 +37,26 @@ class Quadrotor(OnboardFlight):
 
     __slots__ = ("_change", "_dt", "_gain", "_response", "_speed", "_step_gain", "_tilt", "_turn", "_turn_rate")
 
+    _response: Response
+    _gain: Vector  # k_p [1/s]
+    _speed: Vector  # limits [m/s]
+    _turn: float  # gain of the yaw [1/s]
+    _turn_rate: float  # its limit [rad/s]
+    _dt: float  # step for which the next two hold [s], 0 before the first
+    _step_gain: Vector  # k_v dt
+    _tilt: Vector  # share of the acceleration that is reached in a step
+    _change: Vector  # of velocity in a step, with the lag of tilting [m/s]
+
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         self._response = RESPONSES[kind.name]
         self._gain, self._speed = self._response.position, self._response.speed
         self._turn, self._turn_rate = kind.turn_response, kind.turn_rate
-        self._dt = 0.0  # step for which the next two hold
-        self._step_gain = self._tilt = ZERO  # k_v dt, and share of the acceleration that is reached in a step
+        self._dt, self._step_gain, self._tilt = 0.0, ZERO, ZERO
         super().__init__(kind, start, yaw)
 
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
         super().place(position, yaw, flying=flying)
-        self._change = ZERO  # of velocity in a step, with the lag of tilting [m/s]
+        self._change = ZERO
 
     def push(self, velocity: Vector) -> None:
         """Set the velocity [m/s]."""
