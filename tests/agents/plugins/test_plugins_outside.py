@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import tomllib
-from math import cos, hypot, sin
+from math import cos, hypot, isnan, sin
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +18,7 @@ import pytest
 
 from agents.body.interface import BodyError
 from agents.formation.link import Link
+from agents.plugins.avoidance import Nearby, OwnState
 from tests.agents.signals import Play, standing
 from tests.system import lab
 from tests.waiting import until
@@ -42,14 +43,15 @@ def source_of(name):
 def installed(tmp_path_factory):
     """The examples as an installer would leave them: their modules, and what their distribution registers."""
     folder = tmp_path_factory.mktemp("plugins")
-    (project,) = [block for block in re.findall(r"```toml\n(.*?)```", GUIDE, re.DOTALL) if "my-triggers" in block]
+    (project,) = [block for block in re.findall(r"```toml\n(.*?)```", GUIDE, re.DOTALL) if "my-plugins" in block]
     about = tomllib.loads(project)["project"]
     groups = about["entry-points"]
-    (folder / "my_triggers.py").write_text(source_of("SendEvery"), encoding="utf-8")
+    assert groups == {"zenpark.laws": {"spring": "my_laws:Spring"}}
+    (folder / "my_laws.py").write_text(source_of("Spring"), encoding="utf-8")
     for name, module, made, group in REGISTERED:
-        (folder / f"{module}.py").write_text(source_of(f"{made}"), encoding="utf-8")
+        (folder / f"{module}.py").write_text(source_of(made), encoding="utf-8")
         groups.setdefault(group, {})[name] = f"{module}:{made}"
-    written = folder / f"my_triggers-{about['version']}.dist-info"
+    written = folder / f"my_plugins-{about['version']}.dist-info"
     written.mkdir()
     (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {about['name']}\nVersion: {about['version']}\n")
     lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in made.items()) for group, made in groups.items()]
@@ -66,7 +68,7 @@ def zenpark(folder, *arguments):
 
 
 def test_every_group_has_an_example():
-    assert {group for _, _, _, group in REGISTERED} | {"zenpark.triggers"} == {
+    assert {group for _, _, _, group in REGISTERED} | {"zenpark.laws"} == {
         *("zenpark.triggers", "zenpark.predictors", "zenpark.laws", "zenpark.planners"),
         *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies"),
     }
@@ -77,6 +79,7 @@ def test_trigger_of_the_docs_runs_from_outside(installed):
     assert len(source_of("SendEvery").splitlines()) <= 20
     listed = zenpark(installed, "list").stdout
     assert re.search(r"Triggers: .*\bsend-every\b", listed)
+    assert re.search(r"Laws: .*\bspring\b", listed)
     assert not [name for name, _, _, group in REGISTERED if group != "zenpark.bodies" and name not in listed]
     choice = 'cases.event.trigger={ kind = "send-every", metres = 0.02, maximum_silence_s = 5.0 }'
     run = zenpark(installed, "run", "triangle", "--virtual", "--json", "--set", "duration_s=5", "--set", choice)
@@ -159,6 +162,8 @@ def test_body_of_the_docs_drives_over_udp(rover):
     assert state.time == 7.0
     body.stop([0])
     body.command([(0.5, 0.0, 0.0, 0.0)])
+    state.velocity = (0.0, 0.0, 0.0)  # as the loop does
+    assert all(map(isnan, body.read(7.1)[0].velocity))
     until(lambda: len(rover.twists) >= 5 and rover.twists[-2:] == [(0.0, 0.0)] * 2)
     body.close()
 
@@ -243,6 +248,7 @@ def test_law_of_the_docs_pulls_to_its_distance():
     law, link = names["Spring"](constant=0.3), Link(0.5)
     assert law.pull((1.0, 0.0, 0.0), link) == pytest.approx((-0.15, 0.0, 0.0))
     assert law.error((1.0, 0.0, 0.0), link) == pytest.approx(0.5)
+    assert law.pull((0.0, 0.0, 0.0), link) == (0.0, 0.0, 0.0)
 
 
 def made(name, **parameters):
@@ -253,7 +259,7 @@ def made(name, **parameters):
 
 
 def test_fading_of_the_docs_spends_what_it_saved():
-    trigger = made("Fading", threshold=0.0, floor=0.01, saving=0.1)
+    trigger = made("Fading", threshold=0.0, floor=0.01, forget=0.1)
     saved = Play(trigger, standing(100) + standing(1, (0.015, 0.0, 0.0)))
     assert not saved.fired[-1]
     assert Play(trigger, standing(1) + standing(1, (0.015, 0.0, 0.0))).fired[-1]
@@ -266,3 +272,11 @@ def test_predictor_and_planner_of_the_docs():
     shuttle = made("Shuttle", length=0.4, period_s=4.0)
     assert shuttle.target(3.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
     assert shuttle.target(5.0, (1.0, 0.0, 0.0), 0.0)[:3] == pytest.approx((1.3, 0.0, 0.0))
+
+
+def test_avoidance_of_the_docs_stops_short():
+    own, near, avoidance = OwnState(), Nearby(), made("StopShort", gap=0.2)
+    near.add().x = 0.15
+    assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (0.0, 0.0, 0.5)
+    near.count = 0  # what stands behind it is not near
+    assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (1.0, 0.0, 0.5)
