@@ -1,4 +1,4 @@
-"""Simulated bodies: models of robots in rows, engines, sensors, disturbances, and protocol twins of devices.
+"""Simulated bodies: models of one robot each, engines, sensors, disturbances, and protocol twins of devices.
 
 May import: agents, twins.models, twins.engines, twins.sensing.
 """
