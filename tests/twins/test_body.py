@@ -1,5 +1,7 @@
 """Twins behind the interface of bodies: a robot is the same alone and in company, and disturbances are exact."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import msgspec
@@ -286,3 +288,19 @@ def test_twin_is_registered():
 def test_disturbances_are_checked(word):
     with pytest.raises(msgspec.ValidationError, match=word):
         msgspec.convert({word: 1.0}, Disturbance)
+
+
+def test_quiet_robot_needs_no_numpy():
+    program = """
+import sys
+from agents.body.kinds import CRAZYFLIE
+from tests.twins.requests import request
+from twins.body import TwinBody
+body = TwinBody(request((CRAZYFLIE,)))
+body.takeoff([0], [0.5])
+for tick in range(9):
+    body.read(0.01 * tick)
+    body.command([(0.1, 0.0, 0.5, 0.0)])
+sys.exit("numpy" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
