@@ -6,12 +6,13 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from agents.vectors import NO_SETPOINT
 from bridges.crazyflie.body import CrazyflieBody
+from tests.bridges.columns import Columns
 from tests.twins.loopback import Served, request
 from twins.devices.crazyflie.device import CrazyflieTwin
 from twins.devices.crazyflie.supervisor import State
 
-NOTHING = (np.nan,) * 4
 PATIENCE_S = 30.0
 
 
@@ -32,11 +33,9 @@ class Process:
 
     def tick(self):
         self._pause.wait(0.01)
-        self.state = self.body.read(self.t)
+        self.state = Columns(self.body.read(self.t))
         rows = len(self.state.time)
-        self.body.command(
-            np.tile(NOTHING, (rows, 1)) if self.setpoint is None else np.array(self.setpoint, dtype=float)
-        )
+        self.body.command([NO_SETPOINT] * rows if self.setpoint is None else [tuple(each) for each in self.setpoint])
         return self.state
 
     def until(self, true, what):
@@ -45,7 +44,7 @@ class Process:
         self.tick()
         while not true():
             assert self.t - begin < PATIENCE_S, (
-                f"not in {PATIENCE_S} s: {what}; notes: {self.state and self.state.notes}"
+                f"not in {PATIENCE_S} s: {what}; notes: {self.state and self.state.note}"
             )
             self.tick()
         return self.t - begin
@@ -57,18 +56,18 @@ class Process:
         return self.state
 
     def takeoff(self, height=0.5):
-        rows = np.arange(len(self.tick().time))
+        rows = range(len(self.tick().time))
         self.setpoint = None
-        self.body.takeoff(rows, np.full(len(rows), height))
+        self.body.takeoff(rows, [height] * len(rows))
         self.until(lambda: bool((np.abs(self.state.position[:, 2] - height) < 0.05).all()), "take-off")
 
     def land(self):
-        self.body.land(np.arange(len(self.state.time)))
+        self.body.land(range(len(self.state.time)))
         self.until(lambda: not self.state.flying.any(), "landing")
 
     def cut(self):
         """Motors off, wherever they are: the quick end of a test."""
-        self.body.stop(np.arange(len(self.state.time)))
+        self.body.stop(range(len(self.state.time)))
         self.until(lambda: not self.state.flying.any(), "motors off")
 
     def close(self):
@@ -90,7 +89,7 @@ def flown(rows=1, *, device=None, external=False, start=None, serve=None, **faul
 
 def truth(twin, row=0):
     """Where a twin really is [m]."""
-    return twin.truth()[0][row]
+    return tuple(map(float, twin.truth()[0][row]))
 
 
 def supervised(twin, row=0):

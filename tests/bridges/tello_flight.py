@@ -15,14 +15,15 @@ import numpy as np
 
 from agents.body.interface import BodyError
 from agents.decision.position_control import PositionController
+from agents.vectors import NO_SETPOINT
 from bridges.tello import body as bridge
 from bridges.tello.body import TelloBody
+from tests.bridges.columns import Columns
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import PATIENCE_S
 from twins.devices.tello import TelloDevice
 
 TICK = 0.01
-NOBODY = np.full(4, np.nan)
 
 
 class Flight:
@@ -30,10 +31,10 @@ class Flight:
 
     def __init__(self, body, twins, rows):
         self.body, self.twins = body, twins  # (device, row of the device) per row of the body
-        self.individual = PositionController([rows.kinds[0]] * len(rows.names))
-        self.located = np.ones(len(rows.names), dtype=bool)
-        self.goal = np.full((len(rows.names), 3), np.nan)
-        self.toward = np.zeros(len(rows.names))
+        self.law = PositionController(rows.kinds[0])
+        self.located = [True] * len(rows.names)
+        self.goal = [None] * len(rows.names)  # x, y, z [m] of each drone; None: it is left alone
+        self.toward = [0.0] * len(rows.names)
         self.tick = 0
         self.zero = time.monotonic()
         self.slowest = 0.0
@@ -47,12 +48,16 @@ class Flight:
         for row, (served, at) in enumerate(self.twins):
             if served is not None and self.located[row]:
                 position, yaw = served.truth()
-                self.body.locate(row, t, position[at], float(yaw[at]))
+                self.body.locate(row, t, tuple(position[at].tolist()), float(yaw[at]))
         begin = time.monotonic()
-        self.state = self.body.read(t)
-        known = np.where(np.isfinite(self.goal), self.goal, 0.0)
-        setpoint = self.individual.setpoint(known, self.toward, self.state.position, self.state.yaw)
-        self.body.command(np.where(np.isfinite(self.goal[:, :1]), setpoint, np.nan))
+        states = self.body.read(t)
+        self.state = Columns(states)
+        self.body.command(
+            [
+                NO_SETPOINT if goal is None else self.law.setpoint(goal, yaw, state.position, state.yaw)
+                for goal, yaw, state in zip(self.goal, self.toward, states, strict=True)
+            ]
+        )
         self.slowest = max(self.slowest, time.monotonic() - begin)
         return t
 
@@ -75,20 +80,20 @@ def formation():
         body = TelloBody(reached(rows, served.addresses))
         body.open()
         flight = Flight(body, [(served, 0), (served, 1)], rows)
-        everybody = np.arange(2)
+        everybody = range(2)
         before = flight.until(lambda: False, 0.3)
-        body.takeoff(everybody, np.array([0.6, 1.1]))
+        body.takeoff(everybody, [0.6, 1.1])
         up = flight.until(lambda: np.allclose(flight.truth()[:, 2], [0.6, 1.1], atol=0.03), 10.0)
-        flight.goal = np.array([[0.8, -0.3, 0.7], [-0.4, 1.5, 1.0]])
-        flight.toward = np.array([1.2, -0.4])
+        flight.goal = [(0.8, -0.3, 0.7), (-0.4, 1.5, 1.0)]
+        flight.toward = [1.2, -0.4]
         there = flight.until(lambda: np.abs(flight.truth() - flight.goal).max() < 0.03, 10.0)
         turned = flight.until(lambda: np.abs(served.truth()[1] - flight.toward).max() < 0.05, 6.0)
         place, yaw = served.truth()
         state = flight.state
-        flight.goal[:] = np.nan
+        flight.goal = [None] * 2
         body.land(everybody)
         down = flight.until(lambda: not flight.state.flying.any(), 8.0)
-        notes = flight.state.notes
+        notes = flight.state.note
         height = flight.truth()[:, 2].max()
         body.stop(everybody)
         body.close()
@@ -118,27 +123,27 @@ def faults():
     opened = time.monotonic() - begin
     flight = Flight(body, [(served, 0) for served in twins] + [(None, 0)], rows)
     flight.until(lambda: False, 0.3)
-    said = {"absent": flight.state.notes[5], "blind": bool(np.isnan(flight.state.position[5, 0]))}
-    body.takeoff(np.arange(6), np.full(6, 0.6))
+    said = {"absent": flight.state.note[5], "blind": bool(np.isnan(flight.state.position[5, 0]))}
+    body.takeoff(range(6), [0.6] * 6)
     flight.once()
-    said["empty"], said["absent takeoff"] = flight.state.notes[4], flight.state.notes[5]
+    said["empty"], said["absent takeoff"] = flight.state.note[4], flight.state.note[5]
     flying = flight.state.flying.tolist()
     flight.until(lambda: bool((flight.truth()[:4, 2] > 0.5).all()), PATIENCE_S)
-    flight.goal[0] = [0.5, 0.5, 0.6]
+    flight.goal[0] = (0.5, 0.5, 0.6)
     killed.kill()
     aged = flight.until(lambda: flight.tick * TICK - flight.state.time[2] > 0.5, PATIENCE_S)
-    said["killed"] = flight.state.notes[2]
+    said["killed"] = flight.state.note[2]
     said["silence"] = (flight.tick * TICK - flight.state.heard)[[0, 2]].tolist()
-    body.land(np.array([2]))
+    body.land([2])
     flight.until(lambda: flight.tick * TICK - flight.state.time[1] > 0.5, PATIENCE_S)
-    said["silent"] = flight.state.notes[1]
-    body.land(np.array([1]))
+    said["silent"] = flight.state.note[1]
+    body.land([1])
     flight.until(lambda: not flight.state.flying[3], PATIENCE_S)
-    said["weak"] = flight.state.notes[3]
+    said["weak"] = flight.state.note[3]
     weak_height = float(weak.truth()[0][0, 2])
     there = flight.until(lambda: np.abs(flight.truth()[0] - flight.goal[0]).max() < 0.03, PATIENCE_S)
-    flight.goal[:] = np.nan
-    body.stop(np.array([0]))
+    flight.goal[0] = None
+    body.stop([0])
     fell = flight.until(lambda: good.truth()[0][0, 2] <= 0.0, PATIENCE_S)
     body.close()
     for served in twins:
@@ -170,19 +175,19 @@ def refusals():
         body = TelloBody(reached(rows, served.addresses))
         body.open()
         flight = Flight(body, [(served, 0)], rows)
-        flight.located[:] = False
+        flight.located[0] = False
         flight.once()
-        body.takeoff(np.array([0]), np.array([0.6]))
+        body.takeoff([0], [0.6])
         flight.once()
-        said["nowhere"], flying = flight.state.notes[0], bool(flight.state.flying[0])
-        flight.located[:] = True
+        said["nowhere"], flying = flight.state.note[0], bool(flight.state.flying[0])
+        flight.located[0] = True
         flight.once()
-        body.takeoff(np.array([0]), np.array([0.6]))
+        body.takeoff([0], [0.6])
         flight.until(lambda: flight.truth()[0, 2] > 0.5, 5.0)
         flight.pause.wait(2.3)  # the process hangs: its drone lands
         sinks = flight.until(lambda: flight.truth()[0, 2] < 0.5, 6.0)
-        said["hung"] = flight.state.notes[0]
-        body.stop(np.array([0]))
+        said["hung"] = flight.state.note[0]
+        body.stop([0])
         body.close()
     return {"said": said, "seconds": seconds, "flying": flying, "sinks": sinks}
 

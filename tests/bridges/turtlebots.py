@@ -3,15 +3,18 @@
 import threading
 import time
 from dataclasses import replace
+from math import nan
 
 import numpy as np
 
 from agents.body.interface import BodyRequest, Disturbance
 from agents.body.kinds import TURTLEBOT3
 from agents.clock import Clock
-from agents.decision.position_control import drive
+from agents.decision.position_control import PositionController
 from agents.network.keys import Keys
+from agents.vectors import NO_SETPOINT
 from bridges.turtlebot3.body import TurtleBot3
+from tests.bridges.columns import Columns
 from twins.devices.device import DeviceRequest, Faults
 from twins.devices.turtlebot3 import TurtleBot3Twin
 
@@ -93,24 +96,25 @@ class Stage:
         while self.t < end:
             pause.wait(max(0.0, (self.zero + self.t + DT - clock()) / FAST))
             self.t = clock() - self.zero
-            self.state = self.body.read(self.t)
-            setpoint = np.full((self.rows, 4), np.nan)
+            self.state = Columns(self.body.read(self.t))
+            setpoints = [NO_SETPOINT] * self.rows
             if decide is not None and (decided := decide(self.state)) is not None:
-                setpoint[:, 2:] = 0.0
-                setpoint[:, :2] = decided
-            self.body.command(setpoint)
+                setpoints = [(v, w, 0.0, 0.0) for v, w in decided]
+            self.body.command(setpoints)
         return self.state
 
     def toward(self, goal):
         """The position controller of the robot process."""
-        full = {
-            name: np.full(self.rows, getattr(TURTLEBOT3, name))
-            for name in ("response", "turn_response", "speed", "turn_rate")
-        }
-        return lambda state: drive(goal - state.position[:, :2], state.yaw, np.full(self.rows, np.nan), **full)
+        law = PositionController(TURTLEBOT3)
+
+        def decide(state):
+            for (x, y), position, yaw in zip(goal, state.position.tolist(), state.yaw.tolist(), strict=True):
+                yield law.setpoint((x, y, 0.0), nan, tuple(position), yaw)[:2]
+
+        return decide
 
     def constant(self, v, w=0.0):
-        return lambda _: np.tile([v, w], (self.rows, 1))
+        return lambda _: [(v, w)] * self.rows
 
     @property
     def place(self):

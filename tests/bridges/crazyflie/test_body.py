@@ -61,7 +61,7 @@ def test_flight_and_next_session():
         process.land()
         assert truth(twin)[2] == 0.0
         assert not twin.device.flock.quadrotor.flying[0]
-        process.body.stop(np.array([0]))
+        process.body.stop([0])
         process.close()
         assert supervised(twin) != State.LOCKED  # an emergency stop of one that stands would lock it
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
@@ -90,13 +90,13 @@ def test_emergency_stop():
     """Motors off in mid-air; the twin is locked, says so, and refuses to fly again."""
     with flown() as (twin, process):
         process.takeoff()
-        process.body.stop(np.array([0]))
+        process.body.stop([0])
         process.until(lambda: supervised(twin) == State.LOCKED, "locked")
         process.until(lambda: truth(twin)[2] == 0.0, "down")
-        process.until(lambda: not process.state.flying[0] and "locked" in process.state.notes[0], "said so")
-        process.until(lambda: process.state.refusals == ("locked: switch it off and on",), "refuses to take off")
-        process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "switch it off and on" in process.state.notes[0] and not process.state.flying[0], "no")
+        process.until(lambda: not process.state.flying[0] and "locked" in process.state.note[0], "said so")
+        process.until(lambda: process.state.refusal == ("locked: switch it off and on",), "refuses to take off")
+        process.body.takeoff([0], [0.5])
+        process.until(lambda: "switch it off and on" in process.state.note[0] and not process.state.flying[0], "no")
         assert truth(twin)[2] == 0.0
 
 
@@ -169,7 +169,7 @@ def test_lighthouse(tmp_path):
         assert struct.unpack("<fff", memories.read(Memory.LIGHTHOUSE, 0x100, 12)) == pytest.approx((1.25, 0.5, 2.0))
         assert twin.device.drones[0].value("stabilizer.estimator") == 2
         assert twin.device.flock.estimator.variance[0] < 1e-2
-        process.until(lambda: process.state.notes[0] == "", "nothing to say")
+        process.until(lambda: process.state.note[0] == "", "nothing to say")
         process.close()
         memories.stored = (0, 0)
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device=device)))
@@ -207,9 +207,9 @@ def test_external_position():
     with flown(device=device, external=True, start=[[0.5, 0.2, 0.0]]) as (twin, process):
         process.run(0.2)
         assert np.isnan(process.state.position[0]).all()
-        assert "no position from outside" in process.state.notes[0]
-        process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "position estimate has not settled" in process.state.notes[0], "refusal")
+        assert "no position from outside" in process.state.note[0]
+        process.body.takeoff([0], [0.5])
+        process.until(lambda: "position estimate has not settled" in process.state.note[0], "refusal")
         assert not process.state.flying[0]
 
         tick = process.tick
@@ -241,7 +241,7 @@ def test_end_during_arming():
     """A process that ends while a take-off is prepared leaves nothing armed."""
     with flown(device={"platform": "brushless"}) as (twin, process):
         process.tick()
-        process.body.takeoff(np.array([0]), np.array([0.5]))
+        process.body.takeoff([0], [0.5])
         process.until(lambda: supervised(twin) == State.ARMING, "arming")
         process.close()
         assert supervised(twin) == State.DISARMED
@@ -252,9 +252,9 @@ def test_end_during_arming():
 def test_order_during_arming(order, after_s):
     """It replaces the take-off: the motors stay off, and nothing stays armed."""
     with flown(device={"platform": "brushless"}) as (twin, process):
-        row = np.array([0])
+        row = [0]
         process.tick()
-        process.body.takeoff(row, np.array([0.5]))
+        process.body.takeoff(row, [0.5])
         process.until(lambda: supervised(twin) == State.ARMING, "arming")
         process.run(after_s)
         getattr(process.body, order)(row)
@@ -279,7 +279,7 @@ def test_another_session_finds_it_in_the_air():
         process.body._claims.release()
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses)))
         try:
-            assert again.tick().notes == ("",)
+            assert again.tick().note == ("",)
             assert not again.state.flying[0]
             assert truth(twin)[2] == 0.0
             assert supervised(twin) != State.LOCKED
@@ -292,8 +292,8 @@ def test_ranges():
     """Distances to the walls of the twin's room, as a scan."""
     device = {"multiranger": True, "ranges_hz": 20.0}
     with flown(device=device, start=[[0.5, 0.0, 0.0]]) as (_, process):
-        process.until(lambda: process.state.rays is not None, "scan")
-        scan = process.state.rays.scan_of(0)
+        process.until(lambda: process.state.scan[0] is not None, "scan")
+        scan = process.state.scan[0]
         assert scan.distance == pytest.approx([1.5, 2.5, 2.0, 2.0, 2.5], abs=2e-3)
         assert scan.bearing == pytest.approx(np.radians([0.0, 180.0, 90.0, -90.0, 0.0]))
         assert scan.elevation[4] == pytest.approx(np.pi / 2)

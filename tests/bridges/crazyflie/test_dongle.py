@@ -113,7 +113,7 @@ def test_nothing_is_received_any_more(begins):
     with flown(rows=3, device=RADIO, exchanges_hz=1000.0) as (twin, process):
         descent = Descent(twin, process)
         if begins == "take-off":
-            process.body.takeoff(np.arange(3), np.full(3, HEIGHT))
+            process.body.takeoff(range(3), [HEIGHT] * 3)
             process.until(lambda: twin.truth()[0][:, 2].min() > 0.3 * HEIGHT, "climbing")
         else:
             process.takeoff(HEIGHT)
@@ -121,7 +121,7 @@ def test_nothing_is_received_any_more(begins):
                 hovering(process, rows=3, x=0.3)
             process.run(0.5)
         if begins == "landing":
-            process.body.land(np.arange(3))
+            process.body.land(range(3))
             process.until(lambda: twin.truth()[0][:, 2].max() < 0.8 * HEIGHT, "sinking")
         for line, gap in zip(twin.device.lines, gaps, strict=True):
             line.silence(gap)
@@ -144,7 +144,7 @@ def test_nothing_is_received_any_more(begins):
         twin.device.lines[2].silence(0.0)
         process.until(lambda: not process.state.flying[2], "in reach again")
         assert not twin.device.flock.quadrotor.flying[2]
-        assert "connected again" not in process.state.notes[2]
+        assert "connected again" not in process.state.note[2]
 
 
 def test_a_gap_of_the_radio_that_carries_motion_capture():
@@ -194,7 +194,7 @@ def test_random_losses(loss):
         process.land()
         assert descent.fastest.max() < SINKS
         assert supervised(twin) != State.LOCKED
-        assert not any(word in process.state.notes[0] for word in ("refused", "link lost", "landed"))
+        assert not any(word in process.state.note[0] for word in ("refused", "link lost", "landed"))
 
 
 def test_setpoints_go_on_beside_external_positions():
@@ -237,7 +237,7 @@ def test_a_lost_answer_is_no_refusal():
         Unanswered(twin, Port.HIGH_LEVEL)
         process.takeoff(HEIGHT)
         process.run(2.0)
-        assert "refused" not in process.state.notes[0]
+        assert "refused" not in process.state.note[0]
         assert process.state.flying[0]
         process.land()
         assert descent.fastest.max() < SINKS
@@ -287,13 +287,13 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
         hovering(process).run(0.2)
         (dongle,) = crazyradio._find_devices()
         dongle._air = dongle._air._replace(hz=22.0)
-        process.until(lambda: "fewer logs" in process.state.notes[0], "note")
+        process.until(lambda: "fewer logs" in process.state.note[0], "note")
         process.until(lambda: process.t - process.state.time[0] < 0.3, "young poses")
         dongle._air = dongle._air._replace(hz=500.0)
-        assert "fewer logs" in process.state.notes[0]
+        assert "fewer logs" in process.state.note[0]
         process.land()
         assert supervised(twin) != State.LOCKED
-        process.until(lambda: "fewer logs" not in process.state.notes[0], "the rates that were chosen")
+        process.until(lambda: "fewer logs" not in process.state.note[0], "the rates that were chosen")
         blocks = process.body._pilots[0]._link._blocks
         assert blocks["state"].period == 5
 
@@ -301,9 +301,9 @@ def test_a_radio_that_becomes_slow_gets_fewer_logs(monkeypatch):
 def test_recovery_from_a_crash_is_asked_for():
     with flown(device=RADIO) as (twin, process):
         twin.device.flock.supervisor.state[0] = State.CRASHED
-        process.until(lambda: "crashed: put it upright" in process.state.notes[0], "note")
-        process.body.takeoff(np.array([0]), np.array([HEIGHT]))
-        process.until(lambda: "no take-off: crashed" in process.state.notes[0] and not process.state.flying[0], "no")
+        process.until(lambda: "crashed: put it upright" in process.state.note[0], "note")
+        process.body.takeoff([0], [HEIGHT])
+        process.until(lambda: "no take-off: crashed" in process.state.note[0] and not process.state.flying[0], "no")
         assert supervised(twin) == State.CRASHED
         process.close()
         again = Process(CrazyflieBody(request("crazyflie", twin.addresses, device={"recover": True})))
@@ -327,7 +327,7 @@ def test_a_fleet_on_one_radio(monkeypatch, tmp_path):
 
         def watched():
             state = tick()
-            notes.update(state.notes)
+            notes.update(state.note)
             return state
 
         process.tick = watched

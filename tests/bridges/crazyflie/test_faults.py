@@ -58,9 +58,9 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         said: list[set[str]] = [set() for _ in range(6)]
 
         def settled():
-            for row, note in enumerate(process.state.notes):
+            for row, note in enumerate(process.state.note):
                 said[row].add(note)
-            unseen = all("motors may be on" in process.state.notes[row] for row in (mute, killed))
+            unseen = all("motors may be on" in process.state.note[row] for row in (mute, killed))
             return unseen and not process.state.flying[[blinking, empty]].any()
 
         process.until(settled, "those that fail are down")
@@ -82,10 +82,10 @@ def test_each_fails_in_its_own_way_and_the_others_fly_on():
         )
         assert process.t - process.state.time[well] < 0.5
         twin.device.flock.charge[empty] = 0.02  # without load its voltage has recovered
-        process.until(lambda: process.state.notes[empty].endswith("; battery low"), "empty battery")
-        process.body.takeoff(np.array([empty]), np.array([0.5]))
-        process.until(lambda: "no take-off: battery low" in process.state.notes[empty], "refusal")
-        process.body.stop(np.arange(6))
+        process.until(lambda: process.state.note[empty].endswith("; battery low"), "empty battery")
+        process.body.takeoff([empty], [0.5])
+        process.until(lambda: "no take-off: battery low" in process.state.note[empty], "refusal")
+        process.body.stop(range(6))
         process.until(lambda: not process.state.flying[[well, lossy, blinking, empty]].any(), "motors off")
     finally:
         process.close()
@@ -103,7 +103,7 @@ def test_loop_that_stops_commanding():
         process.run(0.2)
         until(lambda: truth(twin)[2] == 0.0, "it was landed")
         assert supervised(twin) != State.LOCKED
-        assert "no commands from" in process.tick().notes[0]
+        assert "no commands from" in process.tick().note[0]
         process.cut()
 
 
@@ -134,7 +134,7 @@ def test_reset_in_the_air():
         drone._start()
         process.until(lambda: not process.state.flying[0], "seen")
         process.setpoint = None
-        process.until(lambda: drone.value("posCtlPid.thrustMin") == 5000 and not process.state.notes[0], "set up again")
+        process.until(lambda: drone.value("posCtlPid.thrustMin") == 5000 and not process.state.note[0], "set up again")
         assert truth(twin)[2] == 0.0
         assert not flock.quadrotor.flying[0]
         process.takeoff(0.3)
@@ -151,12 +151,12 @@ def test_a_new_link_does_not_move_a_flow_deck():
         process.land()
         link_before, pilot = process.body._pilots[0]._link, process.body._pilots[0]
         twin.device.lines[0].silence(1.5)
-        process.until(lambda: pilot._link is not link_before and not process.state.notes[0], "a new link")
+        process.until(lambda: pilot._link is not link_before and not process.state.note[0], "a new link")
         assert process.state.position[0, 0] == pytest.approx(truth(twin)[0], abs=0.02)
         assert truth(twin)[0] > 0.3
         twin.device.flock.restart(0)
         twin.device.drones[0]._start()
-        process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.notes[0], "at its start")
+        process.until(lambda: abs(process.state.position[0, 0]) < 0.02 and not process.state.note[0], "at its start")
 
 
 @pytest.mark.parametrize("link", ["udp", "radio"])
@@ -190,8 +190,8 @@ def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):
 def test_refused_arming():
     with flown(refuse_arming=True) as (twin, process):
         process.tick()
-        process.body.takeoff(np.array([0]), np.array([0.5]))
-        process.until(lambda: "arming refused" in process.state.notes[0], "refusal")
+        process.body.takeoff([0], [0.5])
+        process.until(lambda: "arming refused" in process.state.note[0], "refusal")
         process.until(lambda: not process.state.flying[0], "not flying")
         assert truth(twin)[2] == 0.0
 
@@ -219,8 +219,8 @@ def test_one_of_two_is_absent():
     process = Process(CrazyflieBody(request("crazyflie", [twin.addresses[0], "udp://127.0.0.1:1"])))
     try:
         process.tick()
-        assert process.state.notes[0] == ""
-        assert "udp://127.0.0.1:1" in process.state.notes[1]
+        assert process.state.note[0] == ""
+        assert "udp://127.0.0.1:1" in process.state.note[1]
         assert np.isnan(process.state.position[1]).all()
     finally:
         process.close()

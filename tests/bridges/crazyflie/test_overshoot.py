@@ -1,6 +1,5 @@
 """Take-offs that overshoot as the firmware's do: the robot gets to its height, and no hazard is seen in it."""
 
-import numpy as np
 import pytest
 
 from agents.body.kinds import CRAZYFLIE
@@ -11,37 +10,41 @@ from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.real_time.conductor.hot_changes import CLIMB_S
 from tests.bridges.crazyflie_clock import TICK, Fleet
 
-ROW = np.array([True])
-
 
 @pytest.mark.parametrize(("height", "soon"), [(0.5, 3.0), (0.8, 3.5), (1.0, 4.5), (2.0, 9.0), (4.0, CLIMB_S - 1.0)])
 def test_ready_at_height_in_spite_of_the_overshoot(monkeypatch, height, soon):
     """Followed by lifecycle and detectors as in a robot's process, for 12 s at its height."""
-    lifecycle = Lifecycle(ROW, np.array([height]), 100.0)
-    ascent, obedience = Ascent([CRAZYFLIE], np.array([height])), Obedience([CRAZYFLIE])
-    setpoint = np.array([[0.0, 0.0, height, 0.0]])
+    lifecycle, setpoint = Lifecycle(CRAZYFLIE, height, 100.0), (0.0, 0.0, height, 0.0)
+    ascent, obedience = Ascent(CRAZYFLIE, height), Obedience(CRAZYFLIE)
     with Fleet(monkeypatch, 1, 500.0) as fleet:
         flock = fleet.twin.flock
-        lifecycle.advance(0.0, ROW, flock.place, flock.velocity, ~ROW)
-        assert lifecycle.takeoff(0) == ""
+
+        def advance(t, *, ready=False):
+            position, velocity = (tuple(each[0].tolist()) for each in (flock.place, flock.velocity))
+            flying, yaw = bool(flock.quadrotor.flying[0]), float(flock.quadrotor.yaw[0])
+            lifecycle.advance(t, position, velocity, flying=flying, ready=ready)
+            ascent.update(t, lifecycle.climbing, flying, position)
+            obedience.update(t, setpoint, position, yaw, not lifecycle.climbing)
+
+        advance(0.0, ready=True)
+        assert lifecycle.takeoff() == ""
+        lifecycle.takeoff_due = False
         fleet.climb(height)
         begin, since, highest = fleet.now, None, 0.0
         while since is None or fleet.now < since + 12.0:
             fleet.run(TICK)
-            t, flying = fleet.now - begin, flock.quadrotor.flying
-            lifecycle.advance(t, ROW, flock.place, flock.velocity, flying)
-            climbing = ROW & (lifecycle.climbing is not None)
-            if since is None and lifecycle.phase[0] == Phase.AIRBORNE:
-                assert lifecycle.start(0, t + 1.0) == ""
+            t = fleet.now - begin
+            advance(t)
+            if since is None and lifecycle.phase == Phase.AIRBORNE:
+                assert lifecycle.start(t + 1.0) == ""
                 since = fleet.now
-            ascent.update(t, climbing, flying, flock.place)
-            obedience.update(t, setpoint, flock.place, flock.quadrotor.yaw, ~climbing)
-            assert not ascent.amiss
-            assert not obedience.still.any()
-            assert not obedience.strays.any()
+            assert not ascent.carried
+            assert not ascent.stalled
+            assert not obedience.still
+            assert not obedience.strays
             assert t < soon or since is not None
             highest = max(highest, float(fleet.heights[0]))
-        assert lifecycle.phase[0] == Phase.RUNNING
+        assert lifecycle.phase == Phase.RUNNING
         assert not fleet.troubles
         assert height < highest < (1.0 + CRAZYFLIE.overshoot) * height
         assert highest < height + OUTSIDE_M  # it does not count as having left an arena that ends above its height

@@ -2,8 +2,6 @@
 
 import math
 
-import numpy as np
-
 from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import PositionController
 from agents.protocols import khepera4 as protocol
@@ -92,14 +90,12 @@ class Lab:
         self.sleep(max(0.0, due - self.now))
 
     def go_to(self, goal, seconds):
-        law = PositionController([KHEPERA4])
+        law = PositionController(KHEPERA4)
         until = self.now + seconds
         while self.now < until:
             at = self.odometer
-            setpoint = law.setpoint(
-                np.array([[*goal, 0.0]]), np.array([np.nan]), np.array([[at.x, at.y, 0.0]]), np.array([at.yaw])
-            )
-            self.exchange(*setpoint[0, :2].tolist())
+            v, turn, _, _ = law.setpoint((*goal, 0.0), math.nan, (at.x, at.y, 0.0), at.yaw)
+            self.exchange(v, turn)
 
     def close(self):
         self.device._servers[0]._client = None

@@ -12,6 +12,7 @@ import time
 import tty
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from math import nan
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +29,7 @@ from bridges.khepera4 import drivers
 from bridges.khepera4.body import OPEN_S, KheperaBody
 from bridges.khepera4.link import Address, Khepera4Link, Odometry
 from bridges.khepera4.odometry import Odometer
+from tests.bridges.columns import Columns
 from tests.twins.loopback import Served, reached, request
 from tests.waiting import until
 from twins.devices import khepera4 as twin
@@ -44,7 +46,7 @@ class Drive:
 
     def __init__(self, body, goals=None, truth=None):
         self.body, self.truth = body, truth
-        self.goal = None if goals is None else np.column_stack([goals, np.zeros(len(goals))])
+        self.goal = None if goals is None else [(x, y, 0.0) for x, y in goals]
         self.zero, self.tick, self.slowest = time.monotonic(), 0, 0.0
         self.pause, self.state = threading.Event(), None
 
@@ -55,13 +57,14 @@ class Drive:
         if self.truth is not None:
             position, yaw = self.truth()
             for row in range(len(yaw)):
-                self.body.locate(row, t, position[row], float(yaw[row]))
+                self.body.locate(row, t, tuple(position[row].tolist()), float(yaw[row]))
         begin = time.monotonic()
-        self.state = self.body.read(t)
+        states = self.body.read(t)
+        self.state = Columns(states)
         if self.goal is not None:
-            law = PositionController([KHEPERA4] * len(self.goal))
-            free = np.full(len(self.goal), np.nan)
-            self.body.command(law.setpoint(self.goal, free, self.state.position, self.state.yaw))
+            law = PositionController(KHEPERA4)
+            pairs = zip(self.goal, states, strict=True)
+            self.body.command([law.setpoint(goal, nan, state.position, state.yaw) for goal, state in pairs])
         self.slowest = max(self.slowest, time.monotonic() - begin)
         return t
 
@@ -228,18 +231,18 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
         drive = Drive(body, goals)
         drive.until(lambda: np.abs(twins.truth()[0][:, :2] - goals).max() < 0.012)
         drive.goal = None
-        body.land(np.arange(2))
+        body.land(range(2))
         drive.until(lambda: np.abs(drive.state.velocity).max() < 0.01)
         state, (position, yaw) = drive.state, twins.truth()
         assert [body.inspect(row).firmware for row in (0, 1)] == [f"server {each['server']}" for each in speaks]
         if bearings:
-            drive.until(lambda: drive.state.rays is not None)
-            assert len(drive.state.rays.scan_of(0).bearing) == bearings
-            assert np.isnan(drive.state.rays.scan_of(0).distance).all()
+            drive.until(lambda: drive.state.scan[0] is not None)
+            assert len(drive.state.scan[0].bearing) == bearings
+            assert np.isnan(drive.state.scan[0].distance).all()
     assert state.position == pytest.approx(position, abs=0.01)
     assert state.yaw == pytest.approx(yaw, abs=0.03)
     assert not state.flying.any()
-    assert state.notes == ("", "")
+    assert state.note == ("", "")
     assert (state.battery > 0.98).all() if speaks[0] == KTEAM else np.isnan(state.battery).all()
     assert (np.abs(twins.truth()[0] - position) < 1e-3).all()
 
@@ -254,14 +257,14 @@ def test_a_gap_of_the_link_ends_in_a_stop_and_the_robot_goes_on_over_the_same_co
         drive.once()
 
         def forward():
-            body.command(np.array([[0.1, 0.0, 0.0, 0.0]]))
-            return bool(drive.state.notes[0])
+            body.command([(0.1, 0.0, 0.0, 0.0)])
+            return bool(drive.state.note[0])
 
         drive.until(forward)
-        assert "no answer to p; it is told to stop until it answers" in drive.state.notes[0]
-        drive.until(lambda: not drive.state.notes[0])  # nothing is commanded meanwhile
+        assert "no answer to p; it is told to stop until it answers" in drive.state.note[0]
+        drive.until(lambda: not drive.state.note[0])  # nothing is commanded meanwhile
         stood = twins.truth()[0][0, 0]
-        drive.goal = np.array([[stood + 0.3, 0.0, 0.0]])
+        drive.goal = [(stood + 0.3, 0.0, 0.0)]
         drive.until(lambda: twins.truth()[0][0, 0] > stood + 0.2)
 
 
@@ -271,7 +274,7 @@ def test_a_position_from_outside_takes_the_place_of_odometry(served):
     twins = served(rows)
     lied = reached(request("khepera4", ["-"], external=True, start=[[9.0, 9.0, 0.0]], yaw=2.0), twins.addresses)
     with opened(KheperaBody(lied)) as body:
-        drive = Drive(body, np.array([[0.5, 0.1]]))
+        drive = Drive(body, [(0.5, 0.1)])
         drive.once()
         assert np.isnan(drive.state.position).all()
         drive.truth = twins.truth
@@ -289,19 +292,19 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         absent = f"khepera4://127.0.0.1:{free.getsockname()[1]}"
-    rows = request("khepera4", [*addresses, absent], start=np.zeros((5, 3)))
+    rows = request("khepera4", [*addresses, absent], start=[(0.0, 0.0, 0.0)] * 5)
     body = KheperaBody(rows)
     begin = time.monotonic()
     with opened(body):
         assert time.monotonic() - begin < 5.0
-        drive = Drive(body, np.tile([0.3, 0.0], (5, 1)))
+        drive = Drive(body, [(0.3, 0.0)] * 5)
         drive.until(lambda: killed.truth()[0][0, 0] > 0.02)
         killed.kill()
-        drive.until(lambda: drive.state.notes[1] and drive.tick * TICK - drive.state.time[1] > 0.5)
-        drive.until(lambda: drive.state.notes[2])
+        drive.until(lambda: drive.state.note[1] and drive.tick * TICK - drive.state.time[1] > 0.5)
+        drive.until(lambda: drive.state.note[2])
         drive.until(lambda: drive.tick * TICK - drive.state.time[2] > 0.5)
-        notes = drive.state.notes
-        drive.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008 and not drive.state.notes[0])
+        notes = drive.state.note
+        drive.until(lambda: abs(good.truth()[0][0, 0] - 0.3) < 0.008 and not drive.state.note[0])
         assert drive.slowest < 0.5
     assert notes[1].startswith("silent for")
     assert any(text in notes[1] for text in ("Connection refused", "closed the connection", "reset by peer"))
@@ -318,14 +321,14 @@ def test_a_link_that_was_lost_comes_back_and_goes_on(served):
     rows = request("khepera4", ["khepera4-twin"])
     first = served(rows)
     with opened(KheperaBody(reached(rows, first.addresses))) as body:
-        drive = Drive(body, np.array([[0.5, 0.0]]))
+        drive = Drive(body, [(0.5, 0.0)])
         drive.until(lambda: first.truth()[0][0, 0] > 0.1)
         first.kill()
-        drive.until(lambda: drive.state.notes[0])
+        drive.until(lambda: drive.state.note[0])
         stood = drive.state.position[0, 0]
         place = first.addresses[0].replace("khepera4://", "khepera4-twin://")
         second = served(request("khepera4", [place], start=[[stood, 0.0, 0.0]]))
-        drive.until(lambda: not drive.state.notes[0])
+        drive.until(lambda: not drive.state.note[0])
         drive.until(lambda: abs(second.truth()[0][0, 0] - 0.5) < 0.008)
         assert drive.state.position[0, 0] == pytest.approx(second.truth()[0][0, 0], abs=0.004)
 
@@ -340,13 +343,13 @@ def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
     with opened(KheperaBody(reached(rows, twins.addresses))) as body:
         drive = Drive(body)
         drive.once()
-        body.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
+        body.command([(0.2, 0.0, 0.0, 0.0)])
         drive.until(lambda: drive.state.velocity[0, 0] > 0.1)
         drive.until(lambda: drive.state.velocity[0, 0] < 0.005)  # the setpoint is not given again
         went = twins.truth()[0][0, 0]
         assert 0.09 < went < 0.5  # half a second, the time to be heard, the time to stop
-        body.command(np.array([[np.nan, 0.0, 0.0, 0.0]]))
-        body.command(np.array([[0.2, 0.0, 0.0, 0.0]]))
+        body.command([(nan, 0.0, 0.0, 0.0)])
+        body.command([(0.2, 0.0, 0.0, 0.0)])
         drive.until(lambda: drive.state.velocity[0, 0] > 0.05)
 
     def stands():
@@ -368,7 +371,7 @@ def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient, monke
             KheperaBody(reached(rows, twins.addresses)).open()
         drive = Drive(first)
         drive.once()
-        assert drive.state.notes == ("",)
+        assert drive.state.note == ("",)
 
 
 @pytest.mark.system
@@ -407,9 +410,9 @@ def test_park_never_gets_two_commands_at_once():
         server.start()
         place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}?server=2023-01-07"
         with opened(KheperaBody(request("khepera4", [place], device={"ranges": True}))) as body:
-            drive = Drive(body, np.array([[1.0, 0.0]]))
+            drive = Drive(body, [(1.0, 0.0)])
             drive.until(lambda: len(reads) > 60)
-            scan = drive.state.rays.scan_of(0)
+            scan = drive.state.scan[0]
         server.join(2.0)
     assert {text.split()[0] for text in reads} == {"d", "p", "get_data", "stop"}
     assert all(len(text.split()) == 3 for text in reads if text[0] == "d")
@@ -442,7 +445,7 @@ def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
         server.start()
         place = f"khepera4://127.0.0.1:{listener.getsockname()[1]}"
         with opened(KheperaBody(request("khepera4", [place]))) as body:
-            drive = Drive(body, np.array([[1.0, 0.0]]))
+            drive = Drive(body, [(1.0, 0.0)])
             drive.until(lambda: any(text[0] == "d" for text in lives[0]))
         server.join(2.0)
     assert len(lives) == 2
@@ -488,7 +491,7 @@ def test_kteam_over_a_serial_line():
     """A pseudo terminal with the twin's side of the protocol at its other end."""
     ours, theirs = os.openpty()
     tty.setraw(theirs)
-    robot = twin._Robot(Faults())
+    robot = twin._Robot(request("khepera4", ["-"]), 0, Faults())
     ending = threading.Event()
     heard = []
 
@@ -507,9 +510,9 @@ def test_kteam_over_a_serial_line():
         with opened(KheperaBody(request("khepera4", [f"kteam://{os.ttyname(theirs)}"]))) as body:
             drive = Drive(body)
             drive.once()
-            body.command(np.array([[0.1, 0.5, 0.0, 0.0]]))
+            body.command([(0.1, 0.5, 0.0, 0.0)])
             drive.until(lambda: "D,109,186" in heard)
-            assert drive.state.notes == ("",)
+            assert drive.state.note == ("",)
             assert drive.state.battery[0] == 1.0
     finally:
         ending.set()
@@ -522,7 +525,6 @@ def test_kteam_over_a_serial_line():
 
 DRIVING = """
 import sys, time
-import numpy as np
 from bridges.khepera4.body import KheperaBody
 from tests.twins.loopback import request
 
@@ -532,7 +534,7 @@ zero, change = time.monotonic(), float(sys.argv[2])
 while True:
     now = time.monotonic()
     body.read(now - zero)
-    body.command(np.array([[0.10 if now < change else 0.05, 0.0, 0.0, 0.0]]))
+    body.command([(0.10 if now < change else 0.05, 0.0, 0.0, 0.0)])
     time.sleep(0.002)
 """
 

@@ -280,7 +280,7 @@ def test_one_that_cannot_be_driven_keeps_nobody_from_being_stopped():
     lost.drone.get_own_udp_object = lambda: {}
     for what in (body.land, body.stop):
         with pytest.raises(KeyError, match="responses"):
-            what(np.arange(2))
+            what(range(2))
     assert good.drone.said[-2:] == ["land", "emergency"]
 
 

@@ -124,11 +124,11 @@ def test_stop_counts_while_the_body_closes(monkeypatch):
     body, cockpit = TelloBody(request("tello", ["tello://10.0.0.2"], external=True)), Cockpit().fly()
     body._pilots = [cockpit.pilot]
     cockpit.drone.said.clear()
-    monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop(np.array([0])))
+    monkeypatch.setattr(pilot.time, "sleep", lambda _: body.stop([0]))
     body.close()
     assert cockpit.drone.said[:2] == ["land", "emergency"]
     assert set(cockpit.drone.said[1:-1]) == {"emergency"}
-    body.stop(np.array([0]))  # nobody is left
+    body.stop([0])  # nobody is left
     assert cockpit.drone.said[-1] == "(end)"
 
 
@@ -194,7 +194,7 @@ def test_sleep_of_the_machine_ends_its_flight(monkeypatch):
     pilot.state_received = pilot._aloft = np.inf
     body._pilots, body._ending = [pilot], Rounds(1)
     body.read(0.0)
-    body.command(np.array([[0.5, 0.0, 0.0, 0.0]]))
+    body.command([(0.5, 0.0, 0.0, 0.0)])
     cockpit.drone.sticks.clear()
     gettime = time.clock_gettime
     monkeypatch.setattr(time, "clock_gettime", lambda which: gettime(which) + 3.0)

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from agents.body.interface import UNANSWERED, BodyError
@@ -34,7 +33,7 @@ def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
         stage.body.open()
         assert stage.moved(1.0, stage.constant(0.2))[0] == 0.0
         assert stage.twin.commands_received == [0]
-        assert stage.state.notes[0] == (
+        assert stage.state.note[0] == (
             "cmd_vel is not received: the robot expects a geometry_msgs/msg/Twist, "
             "we send a geometry_msgs/msg/TwistStamped as on jazzy: set distro or stamped"
         )
@@ -44,13 +43,13 @@ def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
 def test_a_robot_that_does_not_move_is_said_so(hub):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
-        stage.twin._top[:] = 0.0  # as with its motors off
+        stage.twin._robots[0].model._acceleration = 0.0  # as with its motors off
         stage.run(1.0, stage.constant(0.2))
-        assert stage.state.notes == ("",)
+        assert stage.state.note == ("",)
         stage.run(1.0, stage.constant(0.2))
-        assert stage.state.notes[0].startswith("does not move despite commands: motors on?")
+        assert stage.state.note[0].startswith("does not move despite commands: motors on?")
         stage.run(0.1, stage.constant(0.0))
-        assert stage.state.notes == ("",)
+        assert stage.state.note == ("",)
 
 
 @pytest.mark.system
@@ -61,14 +60,14 @@ def test_a_silent_robot_gets_zeros_until_it_hears_them(hub, watchdog):
     device = {"watchdog_s": watchdog} if watchdog else {}
     with Stage(request(hub.endpoint, device=device), faults=Faults(silent_from_s=3.0, silent_for_s=3.0)) as stage:
         stage.body.open()
-        until(lambda: stage.run(0.1, stage.constant(0.2)).notes[0], "its silence is noticed")
-        assert stage.state.notes[0].startswith("odometry silent for ")
+        until(lambda: stage.run(0.1, stage.constant(0.2)).note[0], "its silence is noticed")
+        assert stage.state.note[0].startswith("odometry silent for ")
         assert stage.t - stage.state.time[0] > 0.5
         if watchdog:
             until(lambda: stage.moved(0.2)[0] == 0.0, "its watchdog stops it")
         else:  # it goes on with the last command
             assert stage.moved(1.0)[0] == pytest.approx(0.2, abs=0.1)
-        until(lambda: not stage.run(0.1).notes[0], "it is heard again")
+        until(lambda: not stage.run(0.1).note[0], "it is heard again")
         until(lambda: stage.moved(0.5)[0] == 0.0, "zeros have reached it")
         until(lambda: stage.moved(0.5, stage.constant(0.2))[0] > 0.05, "it drives on")
 
@@ -77,14 +76,14 @@ def test_a_silent_robot_gets_zeros_until_it_hears_them(hub, watchdog):
 def test_a_stop_that_is_not_answered_is_said(hub):
     with Stage(request(hub.endpoint), faults=Faults(silent_from_s=2.0, silent_for_s=8.0)) as stage:
         stage.body.open()
-        while stage.run(0.1, stage.constant(0.2)).notes[0] == "":
+        while stage.run(0.1, stage.constant(0.2)).note[0] == "":
             assert stage.t < 6.0
-        stage.body.stop(np.array([0]))
+        stage.body.stop([0])
         stage.run(1.0, stage.constant(0.0))
-        assert stage.state.notes[0].startswith("odometry silent")
-        while not stage.run(0.1).notes[0].startswith(f"{UNANSWERED}; odometry silent"):
+        assert stage.state.note[0].startswith("odometry silent")
+        while not stage.run(0.1).note[0].startswith(f"{UNANSWERED}; odometry silent"):
             assert stage.t < 9.0
-        while stage.run(0.1).notes[0]:
+        while stage.run(0.1).note[0]:
             assert stage.t < 15.0
         assert stage.moved(0.5)[0] == 0.0
 
@@ -99,7 +98,7 @@ def test_one_that_cannot_be_told_keeps_nobody_from_being_stopped():
     body._robots[0].halt, body._robots[1].halt, body._sessions = fails, told.append, {(): None}
     for what in (body.land, body.stop):
         with pytest.raises(OSError, match="its session is closed"):
-            what(np.arange(2))
+            what(range(2))
     assert len(told) == 2
 
 
@@ -140,22 +139,21 @@ def test_a_killed_robot_goes_stale_and_comes_back(hub, eventually):
     body = TurtleBot3(request(hub.endpoint, start=((1.0, 1.0),), addresses=(twin.address,)))
     body.open()
     zero = time.monotonic()
-    go = np.array([[0.2, 0.0, 0.0, 0.0]])
 
     def read():
-        state = body.read(time.monotonic() - zero)
-        body.command(go)
+        (state,) = body.read(time.monotonic() - zero)
+        body.command([(0.2, 0.0, 0.0, 0.0)])
         return state
 
-    eventually(lambda: read().position[0, 0] > 1.15)
+    eventually(lambda: read().position[0] > 1.15)
     twin.kill()
-    eventually(lambda: read().notes[0] == "odometry silent for 1 s")
+    eventually(lambda: read().note == "odometry silent for 1 s")
     last = read()
-    assert time.monotonic() - zero - last.time[0] > 0.5
+    assert time.monotonic() - zero - last.time > 0.5
     twin = TwinProcess(hub.endpoint)  # counts from zero again
-    eventually(lambda: read().notes[0].startswith("odometry was restarted"))
-    assert abs(read().position[0, 0] - last.position[0, 0]) < 0.1
-    eventually(lambda: read().position[0, 0] > last.position[0, 0] + 0.1)
+    eventually(lambda: read().note.startswith("odometry was restarted"))
+    assert abs(read().position[0] - last.position[0]) < 0.1
+    eventually(lambda: read().position[0] > last.position[0] + 0.1)
     body.close()
     twin.kill()
 
@@ -166,11 +164,11 @@ def test_the_router_dies_and_comes_back(router, eventually):
         stage.body.open()
         stage.run(0.5, stage.constant(0.2))
         router.kill()
-        eventually(lambda: stage.run(0.1, stage.constant(0.2)).notes == ("no router",))
+        eventually(lambda: stage.run(0.1, stage.constant(0.2)).note == ("no router",))
         stage.run(1.0, stage.constant(0.2))
         assert stage.moved(0.5, stage.constant(0.2))[0] == 0.0
         router.start()
-        eventually(lambda: stage.run(0.1, stage.constant(0.2)).notes == ("",))
+        eventually(lambda: stage.run(0.1, stage.constant(0.2)).note == ("",))
         assert stage.moved(1.0, stage.constant(0.2))[0] > 0.1
 
 
