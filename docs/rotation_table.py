@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from agents.plugins import registry
 from experiments.definition.experiment import Experiment, Formation, Link, Robot, Start
 from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
@@ -48,18 +47,16 @@ class Row:
 
 def measured(name: str, experiment: Experiment) -> Row:
     """Of one experiment, from 40 s on."""
-    log = simulation.simulate(experiment, SEEDS)
-    late = (log.time >= SETTLED_S) & (log.time < experiment.duration_s)
-    rows, time = len(log.names), log.time[late]
-    follow = [row for row, each in enumerate(log.names) if each != experiment.formation.leader]
-    pattern = Plan(experiment).formation
-    law = registry.build(registry.LAWS, experiment.formation.law)
-    rate, error = [], []
-    for copy in range(len(SEEDS)):
-        position = log.true_position[late, copy * rows : (copy + 1) * rows]
+    plan, rate, error, messages = Plan(experiment), [], [], []
+    follow = [row for row, each in enumerate(plan.names) if each != experiment.formation.leader]
+    for seed in SEEDS:
+        log = simulation.simulate(experiment, seed)
+        late = (log.time >= SETTLED_S) & (log.time < experiment.duration_s)
+        position, time = log.true_position[late], log.time[late]
         rate.append(1e3 * (net_rotation(position[:, follow], time) or 0.0))
-        error.append(1e3 * float(errors_over_time(law, pattern, time, position).mean()))
-    return Row(name, rate, float(np.mean(error)), len(log.sent) / len(SEEDS))
+        error.append(1e3 * float(errors_over_time(plan.law, plan.formation, time, position).mean()))
+        messages.append(len(log.sent))
+    return Row(name, rate, float(np.mean(error)), float(np.mean(messages)))
 
 
 def disagreeing(experiment: Experiment, by: float) -> Experiment:

@@ -23,7 +23,7 @@ NOTEBOOKS: Final = ("experiments.run",)
 FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
     "agents.arrays",
-    "agents.formation.graph",
+    "experiments.definition.graph",
     "agents.plugins.laws",
     "agents.plugins.triggers",
     "agents.plugins.predictors",

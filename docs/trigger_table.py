@@ -23,7 +23,6 @@ from experiments.virtual_time.log import Logbook
 
 TUNING: Final = tuple(range(1001, 1011))
 REPORTED: Final = tuple(range(1, 51))
-BATCH: Final = 10  # seeds side by side: more take more memory, not less time
 BAD: Final = Channel(delay_s=0.05, loss=0.1)
 CHOSEN: Final = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
 
@@ -55,12 +54,8 @@ UPDATES: Final[dict[str, dict[str, Any] | None]] = {
 
 def measured(experiment: Experiment, seeds: Sequence[int]) -> list[CaseMetrics]:
     """The metrics of each seed."""
-    found = []
-    for begin in range(0, len(seeds), BATCH):
-        batch = seeds[begin : begin + BATCH]
-        log = simulation.simulate(experiment, batch)
-        found += [measure.measure(Logbook(log, experiment, "", copy).trace()) for copy in range(len(batch))]
-    return found
+    logs = (simulation.simulate(experiment, seed) for seed in seeds)
+    return [measure.measure(Logbook(log, experiment, "").trace()) for log in logs]
 
 
 def mean(cases: Sequence[CaseMetrics], index: str) -> float:

@@ -16,14 +16,14 @@ TOPS = ("agents", "twins", "bridges", "experiments", "tools")
 MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one other imports
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
-agents.errors
+agents.errors agents.vectors
 agents.arrays agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body
 agents.decision agents.protocols
 agents.safety
-agents.agent
+agents.robot
 agents.runtime
 twins.models twins.scene
 twins.engines

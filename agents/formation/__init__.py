@@ -1,4 +1,4 @@
-"""Formation graph and its theory: links, rigidity, anchors, changes of shape.
+"""What a robot knows of its formation: targets of links, anchors, changes of shape.
 
-May import: agents.arrays.
+May import: agents.vectors.
 """

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from agents.arrays import Array
 from agents.body.kinds import TELLO
-from agents.formation.graph import components, laplacian, links
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import bearable_factors, closed_shares
 from experiments.check.realisation import algebraic_connectivity
+from experiments.definition.graph import components, laplacian, links
 from experiments.file.document import Document, loads
 from experiments.recording.trace import Trace
 from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled

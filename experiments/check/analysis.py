@@ -12,12 +12,10 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
-from agents.decision.assignment import Assignment
+from agents.body.kinds import Kind
+from agents.body.limits import Limits
 from agents.decision.position_control import REACHED
-from agents.formation.changes import changed_targets
-from agents.formation.graph import Links, components, edges
-from agents.formation.rigidity import Redundancy, Rigidity
-from agents.plugins.laws import Law
+from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
 from experiments.check.ideal_run import Prediction, bearable_factors, closed_shares
@@ -31,10 +29,19 @@ from experiments.check.realisation import (
     targets_of_law,
     unfold_distances,
 )
+from experiments.check.rigidity import Redundancy, Rigidity
 from experiments.check.stability import Modes, modes
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Link
-from experiments.definition.formation import FormationArrays, errors_over_time
+from experiments.definition.formation import (
+    Anchored,
+    Pattern,
+    anchor_errors,
+    anchor_offsets,
+    errors_over_time,
+    law_offsets,
+)
+from experiments.definition.graph import Links, components, edges
 from experiments.definition.links import link_pairs
 from experiments.definition.plan import Plan
 from experiments.file.problems import Path
@@ -53,7 +60,6 @@ class Analysis:
     """Figures of one case."""
 
     plan: Plan  # the case, compiled
-    assignment: Assignment  # of all its robots; without avoidance, and without the links that only avoidance needs
     without_neighbours: Index  # rows without neighbours
     start: Array  # (N, 3) on the floor [m]
     parts: int  # of the network
@@ -79,8 +85,35 @@ class Analysis:
         return self.plan.experiment
 
     @property
-    def pattern(self) -> FormationArrays:
+    def pattern(self) -> Pattern:
         return self.plan.formation
+
+    @property
+    def law(self) -> Gradient:
+        return self.plan.law
+
+    @property
+    def links(self) -> Links:
+        """Every link of the law that there may be, with the targets of the beginning."""
+        return self.plan.links
+
+    @property
+    def anchors(self) -> Anchored:
+        return self.plan.anchors_by_row
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        return self.plan.kinds
+
+    @property
+    def height(self) -> Array:
+        """(N,) that each robot holds [m]: 0 on wheels."""
+        return np.nan_to_num(bodies.hover_heights(self.experiment, self.names))
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of every robot, but for `hold_s`."""
+        return self.plan.limits(self.names[0])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -89,14 +122,14 @@ class Analysis:
     @property
     def speed(self) -> Array:
         """(N,) that each robot may drive or fly at [m/s]."""
-        own = np.array([kind.speed for kind in self.assignment.kinds])
-        return np.asarray(np.minimum(own, self.assignment.limits.top_speed))
+        own = np.array([kind.speed for kind in self.kinds])
+        return np.asarray(np.minimum(own, self.limits.top_speed))
 
     @property
     def pull(self) -> Array:
         """(N,) the speed at which each robot follows a goal that is a full clamp away [m/s]."""
         hz = self.experiment.rates.coordination_hz
-        return np.minimum(self.speed, closed_shares(self.assignment.kinds, hz) * self.assignment.clamp * hz)
+        return np.minimum(self.speed, closed_shares(self.kinds, hz) * self.experiment.formation.clamp * hz)
 
     @property
     def legs(self) -> list[tuple[int, str, Planner]]:
@@ -120,7 +153,7 @@ class Analysis:
     def follower(self) -> int | None:
         """The slowest row that follows the formation and no plan."""
         planned = [self.names.index(robot) for _, robot, _ in self.legs]
-        rows = np.setdiff1d(self.assignment.links.receiver, planned)
+        rows = np.setdiff1d(self.links.receiver, np.array(planned, dtype=np.intp))
         return int(rows[self.pull[rows].argmin()]) if len(rows) else None
 
     @property
@@ -140,8 +173,8 @@ class Analysis:
         return replace(
             self,
             prediction=prediction,
-            error=link_errors(self.assignment.law, self.pattern, prediction),
-            anchored=anchor_errors(self.assignment, prediction),
+            error=link_errors(self.law, self.pattern, prediction),
+            anchored=anchor_errors(self.anchors, prediction.position),
         )
 
     @cached_property
@@ -168,20 +201,17 @@ class Analysis:
         """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
         at %= len(self.prediction.time)
         time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
-        links, anchors, hz = pattern.links, self.assignment.anchors, self.experiment.rates.coordination_hz
-        if pattern.changes:
-            links = changed_targets(links, pattern.changes, np.full(len(links), time[at]))
+        links, hz = pattern.at(float(time[at])), self.experiment.rates.coordination_hz
         there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
         links = links if there is None else links.take(there[0])
-        offset = self.assignment.law.offset(here, here[links.sender], links)
-        offset = offset if anchors is None else offset + anchors.offset(here)
+        offset = law_offsets(self.law, here, here[links.sender], links) + anchor_offsets(self.anchors, here)
         stands = norm(position[at] - position[max(0, at - round(WINDOW_S * hz))]) < STANDS
-        wheels = np.array([not kind.flies for kind in self.assignment.kinds])
+        wheels = np.array([not kind.flies for kind in self.kinds])
         length = norm(offset[:, :2])
         return np.flatnonzero(wheels & stands & (length > 0.1 * REACHED) & (length < 2.0 * REACHED))
 
     def link(self, number: int) -> str:
-        links = self.assignment.links
+        links = self.links
         return f"{self.names[links.sender[number]]} - {self.names[links.receiver[number]]}"
 
     def pair(self, number: int) -> str:
@@ -190,7 +220,7 @@ class Analysis:
         return f"{self.names[first]} - {self.names[second]}"
 
     def link_path(self, number: int) -> Path:
-        wanted = self.assignment.links.receiver[number], self.assignment.links.sender[number]
+        wanted = self.links.receiver[number], self.links.sender[number]
         ends = tuple(self.names[row] for row in wanted)
         return next(
             (("formation", "links", text) for text in self.experiment.formation.links if ends in link_pairs(text)),
@@ -230,41 +260,37 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     """Analysis of one case with this predicted motion."""
     names = tuple(experiment.robots)
     plan = Plan(experiment)
-    bare = Plan(msgspec.structs.replace(experiment, avoidance=None, architecture="distributed"))
-    assignment, pattern = bare.assignment(), plan.formation
-    links, rows, hz = assignment.links, len(names), experiment.rates.coordination_hz
+    law, kinds, pattern, anchors = plan.law, plan.kinds, plan.formation, plan.anchors_by_row
+    links, rows, hz = pattern.links, len(names), experiment.rates.coordination_hz
     starts, _ = bodies.start_poses(experiment, names)
     start = np.array(starts)
     aloft = start.copy()
-    aloft[:, 2] = np.nan_to_num(assignment.hover)
-    anchored = np.zeros(0, dtype=np.intp) if assignment.anchors is None else assignment.anchors.row
+    aloft[:, 2] = np.nan_to_num(bodies.hover_heights(experiment, names))
+    anchored = np.array([row for row, _ in anchors], dtype=np.intp)
     silent = np.setdiff1d(np.arange(rows), np.concatenate([links.receiver, anchored]))
-    standing = np.ones(len(links), dtype=bool) if pattern.presence is None else pattern.presence.planned_at(0.0)
+    standing = pattern.planned_at(0.0)
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
-    asked = targets_of_law(assignment.law, links)
+    asked = targets_of_law(law, links)
     if standing.any() or len(anchored):
         for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
-            there = standing if pattern.presence is None else pattern.presence.planned_at(at)
-            stage = _shapes(
-                experiment, assignment, targets_of_law(assignment.law, wanted), there, prediction, aloft, silent
-            )
+            there = pattern.planned_at(at)
+            stage = _shapes(plan, targets_of_law(law, wanted), there, prediction, aloft, silent)
             stages.append(stage)
         shape = best_shape(stages[0])
         here = asked.take(standing)
-        planar, spatial = formation_rigidity(shape.position, here, silent, assignment.anchors)
+        planar, spatial = formation_rigidity(shape.position, here, silent, anchors)
         if planar.rigid and spatial is not None and rows <= MANY:
             spare = formation_redundancy(shape.position, here, silent)
-        share = closed_shares(assignment.kinds, hz)
+        share = closed_shares(kinds, hz)
         within = experiment.duration_s
-        bearable = bearable_factors(assignment.kinds, hz)
+        bearable = bearable_factors(kinds, hz)
         loop = modes(
-            assignment.law, here, shape.position, share, hz,
-            bearable=bearable, anchors=assignment.anchors, within_s=within,
+            law, here, shape.position, share, hz,
+            bearable=bearable, anchors=anchors, within_s=within,
         )  # fmt: skip
     return Analysis(
         plan=plan,
-        assignment=assignment,
         without_neighbours=silent,
         start=start,
         parts=components(links, rows),
@@ -278,36 +304,23 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         spare=spare,
         modes=loop,
         prediction=prediction,
-        error=link_errors(assignment.law, pattern, prediction),
-        anchored=anchor_errors(assignment, prediction),
+        error=link_errors(law, pattern, prediction),
+        anchored=anchor_errors(anchors, prediction.position),
         scene=bodies.scene(experiment),
     )
 
 
-def link_errors(law: Law, pattern: FormationArrays, prediction: Prediction) -> Array:
+def link_errors(law: Gradient, pattern: Pattern, prediction: Prediction) -> Array:
     """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
     return np.nan_to_num(errors_over_time(law, pattern, prediction.time, prediction.position))
 
 
-def anchor_errors(assignment: Assignment, prediction: Prediction) -> Array:
-    """Error of each anchor (T, A) along the motion [m]."""
-    count, rows = prediction.position.shape[:2]
-    if assignment.anchors is None:
-        return np.zeros((count, 0))
-    return assignment.anchors.repeated(count, rows).error(prediction.position.reshape(-1, 3)).reshape(count, -1)
-
-
 def _shapes(  # noqa: PLR0917 - one caller
-    experiment: Experiment,
-    assignment: Assignment,
-    wanted: Links,
-    there: Mask,
-    prediction: Prediction,
-    aloft: Array,
-    silent: Index,
+    plan: Plan, wanted: Links, there: Mask, prediction: Prediction, aloft: Array, silent: Index
 ) -> list[Shape]:
     """Shapes from the ends, the starts, the scaled distances and random places as guesses, until one is exact."""
-    end, rows, links = prediction.position[-1], len(aloft), wanted.take(there)
+    experiment, end = plan.experiment, prediction.position[-1]
+    rows, links = len(aloft), wanted.take(there)
     moves = np.ones(rows, dtype=bool)
     moves[silent] = False
     rng = np.random.default_rng(experiment.seed)
@@ -325,8 +338,8 @@ def _shapes(  # noqa: PLR0917 - one caller
             place = rng.uniform(-0.5, 0.5, (rows, 2)) * experiment.arena.size[:2]
             yield _resting_place(np.column_stack([place, aloft[:, 2]]), end, moves)
 
-    found, solids = [], Solids.of(assignment.kinds, links, moves)
-    for each in find_shapes(links, guesses(), moves, assignment.anchors, solids=solids):
+    found, solids = [], Solids.of(plan.kinds, links, moves)
+    for each in find_shapes(links, guesses(), moves, plan.anchors_by_row, solids=solids):
         error = np.zeros(len(there))
         error[there] = each.error
         found.append(replace(each, error=error))

@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.formation.graph import edges
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
@@ -21,6 +20,7 @@ from experiments.check.ideal_run import predict
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
+from experiments.definition.graph import edges
 from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
 
@@ -131,7 +131,7 @@ def _figures(analysis: Analysis) -> Figures:
     experiment = analysis.experiment
     shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
     spare = analysis.spare
-    assignment, prediction, limits = analysis.assignment, analysis.prediction, analysis.assignment.limits
+    links, prediction, limits = analysis.links, analysis.prediction, analysis.limits
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
     last = float(prediction.time[-1])
     return Figures(
@@ -140,11 +140,11 @@ def _figures(analysis: Analysis) -> Figures:
         obstacles={
             name: surroundings.describe_obstacle(obstacle) for name, obstacle in experiment.arena.obstacles.items()
         },
-        links=len(assignment.links),
-        edges=len(edges(assignment.links)),
+        links=len(links),
+        edges=len(edges(links)),
         parts=analysis.parts,
         leaders=analysis.plan.leaders,
-        algebraic_connectivity=algebraic_connectivity(assignment.links, len(analysis.names)),
+        algebraic_connectivity=algebraic_connectivity(links, len(analysis.names)),
         rank=planar.rank if planar else None,
         rank_needed=planar.needed if planar else None,
         rank_space=spatial.rank if spatial else None,
@@ -163,9 +163,9 @@ def _figures(analysis: Analysis) -> Figures:
         speed_available=None if follower is None else float(analysis.pull[follower]),
         acquired_s=analysis.acquired(min(analysis.departure, last)) if shape else None,
         acquired_noisy_s=analysis.noisy.acquired(min(analysis.departure, last)) if shape and analysis.noisy else None,
-        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(assignment.links) else None,
+        end_error_mm=_finite(1e3 * float(analysis.error[-1].max())) if shape and len(links) else None,
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
-        end_inside=bool(((end >= limits.low - FORGIVEN) & (end <= limits.high + FORGIVEN)).all()),
+        end_inside=bool(((end >= np.array(limits.low) - FORGIVEN) & (end <= np.array(limits.high) + FORGIVEN)).all()),
         messages_hz=prediction.messages_hz,
         predicted_s=last,
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.arrays import Array, Mask, norm
 from agents.decision.position_control import REACHED
-from agents.formation.graph import BY_DISTANCE, BY_RELATIVE
+from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
@@ -29,8 +29,8 @@ SETTLED: Final = 1e-3  # [m] slower than this per decision, robots have come to 
 
 def starts(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots start inside the arena and clear of one another; flying ones too start on the floor."""
-    names, limits, start = analysis.names, analysis.assignment.limits, analysis.start[:, :2]
-    inside = np.minimum(start - limits.low[:2], limits.high[:2] - start).min(axis=1)
+    names, limits, start = analysis.names, analysis.limits, analysis.start[:, :2]
+    inside = np.minimum(start - limits.low[:2], np.array(limits.high[:2]) - start).min(axis=1)
     problems = []
     for row in np.flatnonzero(inside < limits.margin - FORGIVEN):
         message = (
@@ -38,7 +38,7 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
         )
         remedy = "start it farther inside, or reduce margin in [safety]"
         problems.append(Finding("warning", "start-margin", message, remedy, ("robots", names[row], "start")))
-    radius = np.array([kind.radius for kind in analysis.assignment.kinds])
+    radius = np.array([kind.radius for kind in analysis.kinds])
     i, j = np.triu_indices(len(names), 1)
     apart = norm(start[i] - start[j])
     for k in np.flatnonzero(apart < radius[i] + radius[j] - FORGIVEN):
@@ -150,11 +150,11 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
 
 def anchors(analysis: Analysis) -> Iterator[Finding]:
     """Check that anchored robots reach their places."""
-    shape, places, end = analysis.shape, analysis.assignment.anchors, float(analysis.prediction.time[-1])
-    if shape is None or places is None or shape.worst > FAR_OFF or analysis.prediction.stuck or _cut(analysis):
+    shape, places, end = analysis.shape, analysis.anchors, float(analysis.prediction.time[-1])
+    if shape is None or not places or shape.worst > FAR_OFF or analysis.prediction.stuck or _cut(analysis):
         return
     last = analysis.anchored[-1]
-    name, worst = analysis.names[int(places.row[last.argmax()])], 1e3 * float(last.max())
+    name, worst = analysis.names[places[int(last.argmax())][0]], 1e3 * float(last.max())
     if worst <= 1e3 * analysis.experiment.tolerance:
         yield Finding(
             "note", "anchored", f"anchored robots reach their places: {name} is {worst:.0f} mm off at the end"
@@ -170,7 +170,7 @@ def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
     end, links = analysis.prediction.position[-1], analysis.asked.take(analysis.standing)
     moves = np.ones(len(end), dtype=bool)
     moves[analysis.without_neighbours] = False
-    flips = mirrored_robots(links, end, moves, analysis.assignment.anchors)
+    flips = mirrored_robots(links, end, moves, analysis.anchors)
     if not flips:
         return None
     names = analysis.names
@@ -191,7 +191,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
         return None
     near = f"{1e3 * REACHED:g} mm"
     by_distance = links.wants is None or (links.wants[off] == BY_DISTANCE).any()
-    name = gain_key(analysis.assignment.law, BY_DISTANCE if by_distance else BY_RELATIVE)
+    name = gain_key(analysis.law, BY_DISTANCE if by_distance else BY_RELATIVE)
     message = (
         f"the formation is not acquired, because robots on wheels stop {near} before their goals: links may stay "
         f"e = {near}/{'(μ d²)' if name == 'gain' else 'k'} off; {left}"
@@ -205,7 +205,7 @@ def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
 
 def walls(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robot leaves the arena, or is held back by the margin at a wall."""
-    names, limits, track = analysis.names, analysis.assignment.limits, analysis.prediction.position
+    names, limits, track = analysis.names, analysis.limits, analysis.prediction.position
     beyond = np.maximum(track - limits.high, limits.low - track)  # (T, N, 3), positive outside
     outside = beyond.max(axis=2) > FORGIVEN
     tight = beyond[..., :2].max(axis=2) > FORGIVEN - limits.margin
@@ -223,7 +223,7 @@ def walls(analysis: Analysis) -> Iterator[Finding]:
 
 def encounters(analysis: Analysis) -> Iterator[Finding]:
     """Check that no robots collide or land on each other; pairs too near at the start are not repeated."""
-    names, kinds, start = analysis.names, analysis.assignment.kinds, analysis.start
+    names, kinds, start = analysis.names, analysis.kinds, analysis.start
     radius = np.array([kind.radius for kind in kinds])
     near = [
         each
@@ -247,7 +247,7 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
             yield Finding("note", "avoidance-acts", f"{message}: avoidance will have to act", "", path)
     if _cut(analysis) or analysis.prediction.stuck:
         return
-    final, links = analysis.prediction.position[-1], analysis.assignment.links
+    final, links = analysis.prediction.position[-1], analysis.links
     for row in np.flatnonzero([kind.flies for kind in kinds]):
         below = (final[:, 2] < final[row, 2] - FORGIVEN) & (norm(final[:, :2] - final[row, :2]) < radius + radius[row])
         for under in np.flatnonzero(below):
@@ -318,7 +318,7 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
         if has < asked:
             rates = f"follows at {has:.2g} m/s at most, {robot} leads at {asked:.2g} m/s"
             message = f"{names[analysis.follower]} {rates}: it lags, and catches up afterwards"
-            clamp = math.ceil(110.0 * analysis.assignment.clamp * asked / has) / 100.0
+            clamp = math.ceil(110.0 * analysis.experiment.formation.clamp * asked / has) / 100.0
             slow = asked > analysis.speed[analysis.follower]
             remedy = "lead more slowly" if slow else f"lead more slowly, or raise clamp in [formation] to {clamp:g}"
             problems.append(Finding("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
@@ -330,11 +330,11 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
 
 def rates(analysis: Analysis) -> Iterator[Finding]:
     """Check the rates: trigger period against pose_hz, pose_hz against coordination_hz."""
-    rates, trigger = analysis.experiment.rates, analysis.assignment.trigger
+    rates, trigger = analysis.experiment.rates, analysis.plan.trigger
     asked = 1.0 / rates.pose_hz
     for field in ("period_s", "maximum_silence_s"):
-        period = getattr(trigger, field, None)
-        if period is None:
+        period = getattr(trigger, field, math.inf)
+        if not 0.0 < period < math.inf:
             continue
         times, path = period / asked, ("trigger", field)
         message = f"the trigger asks for a transmission every {period:g} s, but is asked every {asked:g} s"
@@ -366,9 +366,9 @@ def ends(analysis: Analysis) -> Iterator[Finding]:
 
 def _plan_duration(plan: Planner, anchor: Array, start: Sequence[float]) -> float | None:
     """Duration for which a plan moves its robot [s], to within 1 %; None: for ever."""
-    elapsed = np.geomspace(0.01, 1e6, 2000)
-    heading = np.full(len(elapsed), start[2] if len(start) > 2 else 0.0)
-    target, _ = plan.target(elapsed, np.tile(anchor, (len(elapsed), 1)), heading)
+    elapsed, heading = np.geomspace(0.01, 1e6, 2000), start[2] if len(start) > 2 else 0.0
+    begin = tuple(anchor.tolist())
+    target = np.array([plan.target(t, begin, heading)[:3] for t in elapsed.tolist()])
     away = np.flatnonzero(norm(target - target[-1]) > OFF)
     if not len(away):
         return 0.0

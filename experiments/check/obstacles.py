@@ -37,7 +37,7 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
     scene, prediction = analysis.scene, analysis.prediction
     if not scene.names:
         return
-    radius = np.array([kind.radius for kind in analysis.assignment.kinds])
+    radius = np.array([kind.radius for kind in analysis.kinds])
     low, high = _heights(analysis, prediction.position[..., 2])
     poses = scene.along(prediction.time)
     robots = analysis.experiment.robots.values()
@@ -94,8 +94,8 @@ def contacts(analysis: Analysis) -> Iterator[Finding]:
     if touching and scene.walled:
         start = analysis.start[:, :2]
         gap = np.minimum(start - scene.low[:2], scene.high[:2] - start).min(axis=1)
-        for row in np.flatnonzero(gap < [kind.radius - FORGIVEN for kind in analysis.assignment.kinds]):
-            name, needed = analysis.names[row], analysis.assignment.kinds[row].radius
+        for row in np.flatnonzero(gap < [kind.radius - FORGIVEN for kind in analysis.kinds]):
+            name, needed = analysis.names[row], analysis.kinds[row].radius
             message = f"{name} starts in a wall of the arena: {max(gap[row], 0.0):.2f} m off, but needs {needed:.2f} m"
             remedy = "start it farther inside, or leave the walls out: walls = false in [arena]"
             yield Finding("error", "start-overlap", message, remedy, ("robots", name, "start"))
@@ -108,14 +108,14 @@ def perception(analysis: Analysis) -> Iterator[Finding]:
     if avoidance is None:
         return
     isolated = set() if avoidance.hears == "all" else {analysis.names[row] for row in analysis.without_neighbours}
-    height = np.nan_to_num(analysis.assignment.hover)
+    height = analysis.height
     low, high = _heights(analysis, height)
     for row, name in enumerate(analysis.names):
         if _sensors(experiment.robots[name]) or not experiment.robots[name].avoids:
             continue
         in_height = [k for k in range(len(scene.names)) if outlines.at_height(scene, k, low[row], high[row])]
         there = [f"'{scene.names[k]}'" for k in in_height]
-        flies = analysis.assignment.kinds[row].flies
+        flies = analysis.kinds[row].flies
         remedy = f'give it some: sensors = ["{"multiranger" if flies else "lds01"}"] in [robots.{name}]'
         if there:
             message = f"{name} has no range sensors: it cannot avoid {join_names(there)}"
@@ -158,7 +158,7 @@ def _sensors(robot: Robot) -> tuple[str, ...]:
 
 def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:
     """Lower and upper end (..., N) of robots whose position is at `z` (..., N) [m]."""
-    kinds = analysis.assignment.kinds
+    kinds = analysis.kinds
     height = np.array([kind.height for kind in kinds])
     low = np.where([kind.flies for kind in kinds], z - 0.5 * height, 0.0)
     return low, low + height

@@ -13,10 +13,11 @@ import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import Kind
-from agents.formation.anchors import Anchors
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, Links, edges, part_of_rows
-from agents.formation.rigidity import Redundancy, Rigidity, redundancy, rigidity
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins.laws import Law, Mixed
+from experiments.check.rigidity import Redundancy, Rigidity, redundancy, rigidity
+from experiments.definition.formation import Anchored, anchor_errors, law_errors
+from experiments.definition.graph import Links, edges, part_of_rows
 
 TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 TINY: Final = 1e-18  # [m²] no length is zero
@@ -71,13 +72,13 @@ class Residuals:
 
 def targets_of_law(law: Law, links: Links) -> Links:
     """Links with the targets that the law reads: `distance` reads the distance of a relative position as well."""
-    wants = TAKES.get(getattr(law, "NEEDS", "any"))
+    wants = TAKES.get(law.NEEDS)
     if wants is None or links.wants is None:
         return links
     return msgspec.structs.replace(links, wants=None if wants == BY_DISTANCE else np.full(len(links), wants))
 
 
-def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residuals:
+def residuals(links: Links, anchors: Anchored, position: Array) -> Residuals:
     """The equations at `position` (N, 3) [m]; of links as `targets_of_law` gives them."""
     apart = position[links.receiver] - position[links.sender]
     wants = np.full(len(links), BY_DISTANCE) if links.wants is None else links.wants
@@ -89,7 +90,7 @@ def residuals(links: Links, anchors: Anchors | None, position: Array) -> Residua
         )
         at = np.flatnonzero(wants == BY_BEARING)
         parts.append(_of_vectors(*_from_ray(apart[at], links.bearing[at]), links, at))
-    if anchors is not None:
+    if anchors:
         parts.append(_of_anchors(anchors, position))
     columns = zip(*((each.value, each.tail, each.head, each.slope) for each in parts), strict=True)
     return Residuals(*(np.concatenate(column) for column in columns))
@@ -119,18 +120,18 @@ def _from_ray(apart: Array, bearing: Array) -> tuple[Array, Array]:
     return value, np.eye(3) - np.where(ahead, bearing[:, :, None] * bearing[:, None, :], 0.0)
 
 
-def _of_anchors(anchors: Anchors, position: Array) -> Residuals:
-    away = anchors.displacement(position)
-    matrix = anchors.whole[:, None, None] * np.eye(3) + anchors.along[:, None, None] * (
-        anchors.axis[:, :, None] * anchors.axis[:, None, :]
-    )
-    ring = np.flatnonzero(anchors.distance > 0.0)
+def _of_anchors(anchors: Anchored, position: Array) -> Residuals:
+    row = np.array([number for number, _ in anchors], dtype=np.intp)
+    distance = np.array([each.distance for _, each in anchors])
+    away = np.array([each.displacement(tuple(position[number].tolist())) for number, each in anchors])
+    matrix = np.array([each.whole * np.eye(3) + each.along * np.outer(each.axis, each.axis) for _, each in anchors])
+    ring = np.flatnonzero(distance > 0.0)
     length = np.sqrt(norm(away[ring]) ** 2 + TINY)
     direction = np.einsum("ak,akl->al", away[ring] / length[:, None], matrix[ring])
-    on = np.flatnonzero(anchors.distance == 0.0)
-    tail = np.concatenate([anchors.row[ring], np.repeat(anchors.row[on], 3)])
+    on = np.flatnonzero(distance == 0.0)
+    tail = np.concatenate([row[ring], np.repeat(row[on], 3)])
     return Residuals(
-        np.concatenate([length - anchors.distance[ring], away[on].reshape(-1)]),
+        np.concatenate([length - distance[ring], away[on].reshape(-1)]),
         tail,
         np.full(len(tail), -1),
         np.concatenate([direction, matrix[on].reshape(-1, 3)]),
@@ -189,7 +190,7 @@ def find_shapes(
     links: Links,
     guesses: Iterable[Array],
     moves: Mask,
-    anchors: Anchors | None = None,
+    anchors: Anchored = (),
     climbs: Mask | None = None,
     *,
     solids: Solids | None = None,
@@ -248,7 +249,7 @@ def unfold_distances(links: Links, height: Array) -> Array:
 @np.errstate(
     over="ignore", invalid="ignore"
 )  # too far a step, or too high a height, is no better, whatever it comes to
-def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask) -> Shape:
+def fitted_shape(links: Links, anchors: Anchored, guess: Array, free: Mask) -> Shape:
     """Least squares of the residuals from a guess (N, 3) [m], by Levenberg's and Marquardt's method.
 
     `free` (N, 3) are the coordinates that may change.
@@ -274,8 +275,8 @@ def fitted_shape(links: Links, anchors: Anchors | None, guess: Array, free: Mask
         least = SLOWLY * before if small else 1e-9 * before
         if damping > 1e9 or before < (EXACT / 100) ** 2 or 0.0 <= before - after < least:
             break
-    error = Mixed().error(position, position[links.sender], links)
-    return Shape(position, error, np.zeros(0) if anchors is None else anchors.error(position))
+    error = law_errors(Mixed(), position, position[links.sender], links)
+    return Shape(position, error, anchor_errors(anchors, position[None])[0])
 
 
 class Mirrored(NamedTuple):
@@ -286,7 +287,7 @@ class Mirrored(NamedTuple):
     place: Array  # (3,) on the right side [m]
 
 
-def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchors | None = None) -> list[Mirrored]:
+def mirrored_robots(links: Links, end: Array, moves: Mask, anchors: Anchored = ()) -> list[Mirrored]:
     """Robots that have to change sides, at most `MIRRORS`, for the formation to get from `end` (N, 3) to its shape.
 
     One after the other that one is mirrored that leads to the shape, or nearest to it, with the least motion of all.
@@ -421,7 +422,7 @@ def contradictions(links: Links) -> list[Contradiction]:
 
 
 def formation_rigidity(
-    position: Array, links: Links, led: Index, anchors: Anchors | None = None
+    position: Array, links: Links, led: Index, anchors: Anchored = ()
 ) -> tuple[Rigidity, Rigidity | None]:
     """Infinitesimal rigidity when heights are held, and in full space if all links ask for distances.
 
@@ -430,7 +431,7 @@ def formation_rigidity(
     translations, a rotation and a growth: as many of those as they leave free.
     """
     pairs = np.array([(i, j) for i in led for j in led if i < j], dtype=np.intp).reshape(-1, 2)
-    if links.wants is not None or anchors is not None:
+    if links.wants is not None or anchors:
         return _told_more(position, links, pairs, anchors), None
     pairs = np.unique(np.concatenate([edges(links), pairs]), axis=0).astype(np.intp)
     moves = np.ones_like(position, dtype=bool)
@@ -452,7 +453,7 @@ def formation_redundancy(position: Array, links: Links, led: Index) -> Redundanc
     return Redundancy(found.pairs[: len(own)], found.robots)
 
 
-def _told_more(position: Array, links: Links, bars: Index, anchors: Anchors | None) -> Rigidity:
+def _told_more(position: Array, links: Links, bars: Index, anchors: Anchored) -> Rigidity:
     rows = len(position)
     matrix = residuals(links, anchors, position).jacobian(np.arange(rows), rows)
     stiff = np.zeros((len(bars), 2, rows, 2))

@@ -128,7 +128,7 @@ def architecture(analysis: Analysis) -> Iterator[Finding]:
         message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
         remedy = "give safety.link_silence_s more than twice that, or decide more often"
         yield Finding("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
-    if getattr(analysis.plan.trigger, "judges_errors", False):
+    if analysis.plan.trigger.JUDGES_ERRORS:
         kind, _ = registry.split(experiment.trigger)
         message = f"the trigger '{kind}' judges by the formation error, which is 0 where the centre guides"
         yield Finding("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))

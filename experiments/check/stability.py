@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.arrays import Array, Index, norm
-from agents.formation.anchors import Anchors
-from agents.formation.graph import Links
-from agents.plugins.laws import Law
+from agents.formation.link import Link
+from agents.plugins.laws import Gradient
+from agents.vectors import Vector
+from experiments.definition.formation import Anchored, anchor_offsets, law_offsets, unlinked
+from experiments.definition.graph import Links
 
 STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all
@@ -34,14 +37,14 @@ class Modes:
 
 
 def modes(
-    law: Law,
+    law: Gradient,
     links: Links,
     position: Array,
     closed: Array,
     hz: float,
     *,
     bearable: Array | None = None,
-    anchors: Anchors | None = None,
+    anchors: Anchored = (),
     within_s: float = math.inf,
 ) -> Modes:
     """Eigenvalues of p⁺ = p + H u(p) at `position`, over x and y of the robots that listen.
@@ -51,14 +54,14 @@ def modes(
     distances were rounded, u is not 0 at the best shape, and a rotation is not left alone but answered by just that.
 
     Args:
-        law: Its offset is differentiated numerically.
+        law: Its pull is differentiated numerically.
         position: (N, 3) where the formation is met [m].
         closed: (N,) h_i, the share of a position error that robot i closes until its next decision.
         bearable: (N,) largest factor between the error of a robot and what it is asked for with which it settles when
             it is alone; None: 2/h_i.
         within_s: Modes with a longer time constant than this are free [s].
     """
-    anchored = np.zeros(0, dtype=np.intp) if anchors is None else anchors.row
+    anchored = np.array([row for row, _ in anchors], dtype=np.intp)
     receivers = np.unique(np.concatenate([links.receiver, anchored]))
     share = np.repeat(closed[receivers], 2)
     slope = -_derivative(law, links, position, anchors, receivers)
@@ -67,8 +70,7 @@ def modes(
     # H M and H^½ M H^½ have the same eigenvalues, and the second is symmetric where M is
     root = np.sqrt(share)
     taken = root[:, None] * slope * root[None, :]
-    offset = law.offset(position, position[links.sender], links)
-    offset = offset if anchors is None else offset + anchors.offset(position)
+    offset = law_offsets(law, position, position[links.sender], links) + anchor_offsets(anchors, position)
     factor = 2.0 / closed if bearable is None else bearable
     hardest = np.sqrt(np.repeat(2.0 / factor[receivers], 2))
     gain = _eigenvalues(hardest[:, None] * slope * hardest[None, :]).real.max(initial=0.0)
@@ -93,35 +95,32 @@ def _eigenvalues(matrix: Array) -> NDArray[np.complex128]:
     return np.linalg.eigvals(matrix).astype(complex)
 
 
-def _derivative(law: Law, links: Links, position: Array, anchors: Anchors | None, receivers: Index) -> Array:
-    """∂u/∂p (2 L, 2 L) of the receivers.
-
-    The decision of a robot depends on its own position and on the poses received on its own links alone. So all robots
-    are moved at once with the received poses kept, and then one link of every robot at once: two evaluations for each
-    coordinate and link of a robot, however many robots there are.
-    """
+def _derivative(law: Gradient, links: Links, position: Array, anchors: Anchored, receivers: Index) -> Array:
+    """∂u/∂p (2 L, 2 L) of the receivers: the sum of what each link and each anchor adds."""
     rows, count = len(position), len(receivers)
     column = np.full(rows, -1)
     column[receivers] = np.arange(count)
-    received = position[links.sender]
     blocks = np.zeros((count, 2, count, 2))
-    rank = np.arange(len(links)) - np.searchsorted(links.receiver, links.receiver)
-    for axis in (0, 1):
-        step = np.zeros(3)
-        step[axis] = STEP
-        own = law.offset(position + step, received, links) - law.offset(position - step, received, links)
-        if anchors is not None:
-            own = own + anchors.offset(position + step) - anchors.offset(position - step)
-        blocks[np.arange(count), :, np.arange(count), axis] += own[receivers, :2] / (2.0 * STEP)
-        for turn in range(int(rank.max(initial=-1)) + 1):
-            mine = rank == turn
-            shift = mine[:, None] * step
-            answer = law.offset(position, received + shift, links) - law.offset(position, received - shift, links)
-            receiver, sender = links.receiver[mine], column[links.sender[mine]]
-            known = sender >= 0
-            at = column[receiver[known]], sender[known]
-            blocks[at[0], :, at[1], axis] += answer[receiver[known], :2] / (2.0 * STEP)
+    apart = (position[links.receiver] - position[links.sender]).tolist()
+    ends = zip(column[links.receiver].tolist(), column[links.sender].tolist(), strict=True)
+    for (receiver, sender), (x, y, z), link in zip(ends, apart, unlinked(links), strict=True):
+        slope = _slope(law.pull, (x, y, z), link)
+        blocks[receiver, :, receiver] += slope
+        if sender >= 0:
+            blocks[receiver, :, sender] -= slope
+    for row, anchor in anchors:
+        x, y, z = position[row].tolist()
+        blocks[column[row], :, column[row]] += _slope(anchor.pull, (x, y, z))
     return blocks.reshape(2 * count, 2 * count)
+
+
+def _slope(pull: Callable[..., Vector], at: Vector, *link: Link) -> Array:
+    """Derivative (2, 2) of x and y of a pull by x and y of the place [m] at which it is asked for."""
+    x, y, z = at
+    ahead, behind = pull((x + STEP, y, z), *link), pull((x - STEP, y, z), *link)
+    left, right = pull((x, y + STEP, z), *link), pull((x, y - STEP, z), *link)
+    changes = [[ahead[k] - behind[k], left[k] - right[k]] for k in (0, 1)]
+    return np.array(changes) / (2.0 * STEP)
 
 
 def _rigid_motions(position: Array, receivers: Index, rows: int) -> Array:

@@ -10,11 +10,13 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Index, Mask, norm
-from agents.formation.graph import BY_BEARING, BY_DISTANCE, BY_RELATIVE, components, reachable
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
+from experiments.definition.formation import law_offsets
+from experiments.definition.graph import components, reachable
 from experiments.definition.links import gain_key
 from experiments.file.problems import Path
 
@@ -28,7 +30,7 @@ RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for l
 
 def network(analysis: Analysis) -> Iterator[Finding]:
     """Check that the network is connected, and that every robot is reached by a leader."""
-    names, links = analysis.names, analysis.assignment.links
+    names, links = analysis.names, analysis.links
     path = ("formation", "links")
     if not len(links):
         how = "goes to its anchor" if analysis.experiment.formation.anchors else "follows its own plan"
@@ -40,9 +42,9 @@ def network(analysis: Analysis) -> Iterator[Finding]:
     leaders = tuple(name for name in analysis.plan.leaders if name == named or names.index(name) in linked)
     sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
     receives = np.isin(np.arange(rows), links.receiver)
-    anchors = analysis.assignment.anchors
-    if anchors is not None and len(sources):  # an anchored robot is led by its place
-        sources = np.union1d(sources, anchors.row)
+    anchored = np.array([row for row, _ in analysis.anchors], dtype=np.intp)
+    if len(anchored) and len(sources):  # an anchored robot is led by its place
+        sources = np.union1d(sources, anchored)
     problems = []
     if len(sources):
         lost = np.flatnonzero(~reachable(links, rows, sources) & receives)
@@ -53,7 +55,7 @@ def network(analysis: Analysis) -> Iterator[Finding]:
             problems.append(Finding("error", "leader-unknown", message, remedy, path))
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
     apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
-    if parts > 1 and anchors is not None and reachable(links, rows, anchors.row)[linked].all():
+    if parts > 1 and len(anchored) and reachable(links, rows, anchored)[linked].all():
         yield Finding("note", "parts", f"{parts} formations, each of which is anchored", "", path)
     elif parts > 1 and apart:
         message = f"{parts} formations that know of each other only to keep clear"
@@ -142,9 +144,9 @@ def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
 
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
     severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
-    anchors = analysis.assignment.anchors
-    if anchors is not None and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
-        name = analysis.names[int(anchors.row[shape.anchored.argmax()])]
+    anchors = analysis.anchors
+    if anchors and shape.anchored.max(initial=0.0) >= shape.error.max(initial=0.0):
+        name = analysis.names[anchors[int(shape.anchored.argmax())][0]]
         message = f"{name} cannot keep the distance of its anchor: at best, it is {1e3 * shape.worst:.1f} mm off"
         remedy = "change it, or the links of this robot; it holds its height, and distances are in space"
         yield Finding(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
@@ -158,7 +160,7 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
         link = int(np.flatnonzero(analysis.standing)[ring.link])
         remedy = "give offsets of one drawing: those around a ring add up to zero"
         yield Finding(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
-    found = conflicts(analysis.asked.take(_measured(analysis)), np.nan_to_num(analysis.assignment.hover))
+    found = conflicts(analysis.asked.take(_measured(analysis)), analysis.height)
     heights = [each for each in found if math.isfinite(each.ceiling)]
     for high in list(dict.fromkeys(each.high for each in heights)):
         lowest = min((each for each in heights if each.high == high), key=lambda each: each.ceiling)
@@ -194,7 +196,7 @@ def _inside(analysis: Analysis, conflict: Conflict) -> Index:
 
 def _pair(analysis: Analysis, link: int | np.intp) -> str:
     """Name of a link, the same for both directions."""
-    links = analysis.assignment.links
+    links = analysis.links
     i, j = sorted((int(links.sender[link]), int(links.receiver[link])))
     return f"{analysis.names[i]} - {analysis.names[j]}"
 
@@ -208,7 +210,7 @@ def _sides(analysis: Analysis, conflict: Conflict) -> str:
 def _too_high(analysis: Analysis, conflict: Conflict, off: str) -> Finding:
     names = analysis.names
     subject = join_names([names[row] for row in conflict.high])
-    held = max(float(np.nan_to_num(analysis.assignment.hover[row])) for row in conflict.high)
+    held = max(float(analysis.height[row]) for row in conflict.high)
     message = f"{subject} is too high at {held:g} m for {_sides(analysis, conflict)}; {off}"
     remedy = f"hover lower than {conflict.ceiling:.3f} m, or lengthen these links"
     return Finding("error", "too-high", message, remedy, ("robots", names[conflict.high[0]], "hover"))
@@ -284,12 +286,13 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
 
 def strength(analysis: Analysis) -> str:
     """Parameters that make the law ask for more or less: one of `GAIN`, or its own if it goes by these alone."""
-    law, links = analysis.assignment.law, analysis.asked
+    law, links = analysis.law, analysis.asked
     place = analysis.start + 0.1 * np.random.default_rng(0).normal(size=analysis.start.shape)
-    single = law.offset(place, place[links.sender], links)
-    double = law.offset(place, place[links.sender], msgspec.structs.replace(links, gain=2.0 * links.gain))
-    if analysis.assignment.anchors is not None or not np.array_equal(single, double, equal_nan=True):
-        return GAIN[getattr(law, "PULLS_BY", "gain")]
+    single = law_offsets(law, place, place[links.sender], links)
+    stronger = msgspec.structs.replace(links, gain=2.0 * links.gain)
+    double = law_offsets(law, place, place[links.sender], stronger)
+    if analysis.anchors or not np.array_equal(single, double, equal_nan=True):
+        return GAIN[law.PULLS_BY]
     plugin = registry.struct(registry.LAWS, registry.split(analysis.experiment.formation.law)[0])
     return f"the law's own parameters ({', '.join(plugin.__struct_fields__) or 'it has none yet'})"
 
@@ -299,10 +302,10 @@ def stability(analysis: Analysis) -> Iterator[Finding]:
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF or next(lengths(analysis), None) is not None:
         return
-    law, choice = analysis.assignment.law, registry.split(formation.law)[0]
+    law, choice = analysis.law, registry.split(formation.law)[0]
     if not math.isfinite(loop.gain):
         place = shape.position
-        offset = law.offset(place, place[analysis.asked.sender], analysis.asked)
+        offset = law_offsets(law, place, place[analysis.asked.sender], analysis.asked)
         bad = join_names([analysis.names[row] for row in np.flatnonzero(~np.isfinite(offset).all(axis=1))])
         what = f"for {bad} no number" if bad else "numbers that jump between neighbouring places"
         message = f"the law '{choice}' gives {what} where the formation is met"

@@ -14,12 +14,14 @@ from msgspec.structs import replace
 from agents.arrays import Array, Mask, norm
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
-from agents.formation.graph import Links
 from agents.formation.link import BY_DISTANCE, Link
 from agents.plugins.laws import Distance, Gradient
 from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
+from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, held_height, link_pairs, link_target
+
+Anchored = Sequence[tuple[int, anchors.Anchor]]  # anchors, each with the row of its robot
 
 AT_ONCE: Final = 2_000_000  # distances of links that are held in memory at once
 
@@ -141,15 +143,15 @@ def law_errors(law: Gradient, position: Array, received: Array, links: Links) ->
     return np.array([law.error(tuple(away), link) for away, link in zip(apart, unlinked(links), strict=True)])
 
 
-def anchor_offsets(held: Sequence[tuple[int, anchors.Anchor]], position: Array) -> Array:
-    """Offset (N, 3) [m] by which anchors, each with its row, pull robots at `position` (N, 3) [m]."""
+def anchor_offsets(held: Anchored, position: Array) -> Array:
+    """Offset (N, 3) [m] by which anchors pull robots at `position` (N, 3) [m]."""
     offset = np.zeros_like(position)
     for row, anchor in held:
         offset[row] += anchor.pull(tuple(position[row].tolist()))
     return offset
 
 
-def anchor_errors(held: Sequence[tuple[int, anchors.Anchor]], position: Array) -> Array:
+def anchor_errors(held: Anchored, position: Array) -> Array:
     """Error of each anchor (T, A) [m] along positions (T, N, 3) [m]."""
     found = [[anchor.error(tuple(place)) for place in position[:, row].tolist()] for row, anchor in held]
     return np.array(found, dtype=float).reshape(len(held), len(position)).T
@@ -185,7 +187,7 @@ def compile_anchors(experiment: Experiment) -> dict[str, tuple[anchors.Anchor, .
     """Anchors of each robot that has one."""
     formation = experiment.formation
     to_origin = 2.0 * formation.gain  # twice that of a link: as the authors' controllers pull to the origin
-    found = {}
+    found: dict[str, tuple[anchors.Anchor, ...]] = {}
     for name, given in formation.anchors.items():
         each = given if isinstance(given, Anchor) else Anchor(distance=given)
         gain = each.gain or (to_origin if each.distance > 0.0 else formation.stiffness)

@@ -20,7 +20,7 @@ RELEASE: Final = 1.1  # of the range: what separates coming from going, so that 
 
 @dataclass(frozen=True)
 class LinkTarget:
-    """Target of a one-way link, see `agents.formation.graph.Links`."""
+    """Target of a one-way link, see `agents.formation.link.Link`."""
 
     wants: int
     distance: float
@@ -118,10 +118,9 @@ def held_height(experiment: Experiment, name: str) -> float:
 
 def gain_key(law: Law, wants: int) -> str:
     """Key of `[formation]`, `gain` or `stiffness`, that is the gain of links with a kind of target, as the law says."""
-    by = getattr(law, "PULLS_BY", "gain")
-    if by == "by link":
-        by = "gain" if wants == BY_DISTANCE else "stiffness"
-    return str(by)
+    if law.PULLS_BY == "by link":
+        return "gain" if wants == BY_DISTANCE else "stiffness"
+    return law.PULLS_BY
 
 
 def _gain(experiment: Experiment, law: Law, wants: int) -> float:

@@ -16,17 +16,17 @@ from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Incoming
 from agents.formation.anchors import Anchor
-from agents.formation.graph import Links
 from agents.formation.link import Link
 from agents.plugins import registry
 from agents.plugins.avoidance import Avoidance
-from agents.plugins.laws import Law
+from agents.plugins.laws import Gradient
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
 from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, kinds, start_poses
 from experiments.definition.experiment import Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
+from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, one_way_links
 
 
@@ -53,8 +53,8 @@ class Plan:
         return kinds(self.experiment, self.names)
 
     @cached_property
-    def law(self) -> Law:
-        built: Law = registry.build(registry.LAWS, self.experiment.formation.law)
+    def law(self) -> Gradient:
+        built: Gradient = registry.build(registry.LAWS, self.experiment.formation.law)
         return built
 
     @cached_property
@@ -73,7 +73,7 @@ class Plan:
         """Extrapolation between two transmissions: as the experiment says, else as its trigger needs it."""
         chosen = self.experiment.prediction
         if chosen is None:
-            chosen = registry.struct(registry.TRIGGERS, registry.split(self.experiment.trigger)[0]).PREDICTION
+            chosen = self.trigger.PREDICTION
         built: Predictor = registry.build(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
@@ -104,6 +104,11 @@ class Plan:
     def anchors(self) -> dict[str, tuple[Anchor, ...]]:
         """Anchors of each robot that has one."""
         return compile_anchors(self.experiment)
+
+    @cached_property
+    def anchors_by_row(self) -> list[tuple[int, Anchor]]:
+        """Every anchor with the row of its robot, in the order of the rows."""
+        return [(self._row[name], each) for name in self.names for each in self.anchors.get(name, ())]
 
     @property
     def links(self) -> Links:

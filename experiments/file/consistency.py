@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 
 from agents.body.kinds import KINDS
 from agents.plugins import registry
+from agents.plugins.laws import Law
 from agents.plugins.registry import did_you_mean
+from agents.plugins.triggers import Trigger
 from experiments.definition.bodies import DRIVES, WORLD
 from experiments.definition.experiment import Arena, Change, Experiment, Hybrid, Link, Robot, Target
 from experiments.definition.links import FORM, held_height, link_pairs
@@ -235,11 +237,11 @@ def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
 def _triggers(experiment: Experiment) -> Iterator[Fault]:
     """Triggers in the wrong place, or without the prediction that they need."""
     kind, _ = registry.split(experiment.trigger)
-    spoken = registry.struct(registry.TRIGGERS, kind)
-    if "communication" not in getattr(spoken, "places", ("communication",)):
+    spoken = cast(type[Trigger], registry.struct(registry.TRIGGERS, kind))
+    if "communication" not in spoken.PLACES:
         message = f"'{kind}' decides when the law is computed anew, not when a robot transmits"
         yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
-    needed = getattr(spoken, "prediction", "hold")
+    needed = spoken.PREDICTION
     if experiment.prediction is not None and needed != "hold":
         given, _ = registry.split(experiment.prediction)
         if given == "hold":
@@ -249,7 +251,7 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
     if experiment.formation.update is None:
         return
     kind, given_too = registry.split(experiment.formation.update)
-    if "control" not in getattr(registry.struct(registry.TRIGGERS, kind), "places", ("control",)):
+    if "control" not in cast(type[Trigger], registry.struct(registry.TRIGGERS, kind)).PLACES:
         message = f"'{kind}' decides when a robot transmits, not when the law is computed anew"
         yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
     if given_too.get("smoothing_s"):
@@ -346,7 +348,7 @@ def _kind_of(given: Target | float) -> str:
 def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
     """Targets that the law does not take, or that robots with held heights cannot meet."""
     name, _ = registry.split(experiment.formation.law)
-    needs, kind = getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"), _kind_of(given)
+    needs, kind = cast(type[Law], registry.struct(registry.LAWS, name)).NEEDS, _kind_of(given)
     can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}
     words = {"distance": "a distance or an offset", "relative": "an offset", "bearing": "a bearing or an offset"}
     if needs in can and kind not in can[needs]:

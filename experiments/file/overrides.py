@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from agents.plugins import registry
+from agents.plugins.laws import Law
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import link_pairs, pairs_or_none
@@ -175,7 +176,7 @@ def _needed_target(law: object) -> str:
     if not isinstance(name, str) or name not in registry.names(registry.LAWS):
         return "any"
     try:
-        return str(getattr(registry.struct(registry.LAWS, name), "NEEDS", "any"))
+        return cast(type[Law], registry.struct(registry.LAWS, name)).NEEDS
     except registry.PluginError:  # said with its place where the law is read
         return "any"
 

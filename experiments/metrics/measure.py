@@ -17,12 +17,11 @@ import msgspec
 import numpy as np
 
 from agents.arrays import norm
-from agents.formation.graph import Links
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
 from agents.safety.hazards import UNRESOLVED, failed, is_blind
 from experiments.definition import link_conditions
-from experiments.definition.formation import compile_anchors
+from experiments.definition.graph import Links
 from experiments.metrics import centralised
 from experiments.metrics.clearance import Clearance, collisions
 from experiments.metrics.comparable import reasons
@@ -323,20 +322,19 @@ def _benchmark_cost(trace: Trace, errors: LinkErrors) -> float:
     their changes in the samples, in proportion to all that were computed.
     """
     plan, time, place = trace.plan, trace.time, trace.true_position
-    links, anchors = errors.net, compile_anchors(trace.experiment, trace.robots)
+    links, anchors = errors.net, plan.anchors_by_row
     plain = isinstance(plan.law, Distance) and not plan.formation.changes
     new = (np.diff(trace.goal, axis=0) != 0.0).any(axis=2) & np.isfinite(trace.goal[1:]).all(axis=2)
-    held = None if anchors is None else norm(np.array([anchors.displacement(each) for each in place]))
     cost = 0.0
     for i in sorted({*links.receiver.tolist()}):
         own = np.flatnonzero(links.receiver == i)
         error, gap = errors.error[:, own], errors.error[:, own]
         if plain:
             gap = norm(place[:, i, None] - place[:, links.sender[own]]) ** 2 - links.distance[own] ** 2
-        if anchors is not None and held is not None:
-            mine = np.flatnonzero(anchors.row == i)
-            away, wanted = held[:, mine], anchors.distance[mine]
-            error, gap = np.hstack([error, np.abs(away - wanted)]), np.hstack([gap, away**2 - wanted**2])
+        for anchor in (each for row, each in anchors if row == i):
+            away = norm(np.array([anchor.displacement(tuple(each)) for each in place[:, i].tolist()]))[:, None]
+            error = np.hstack([error, np.abs(away - anchor.distance)])
+            gap = np.hstack([gap, away**2 - anchor.distance**2])
         signal = np.where(np.isfinite(gap), gap, 0.0).sum(axis=1)
         known = np.flatnonzero(np.isfinite(gap).any(axis=1))
         if not len(known):

@@ -9,14 +9,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from agents.arrays import Array, Index, Mask, norm
-from agents.formation.graph import Links
+from agents.plugins.predictors import HOLD, Predictor
 from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
+from agents.vectors import Vector
 from experiments.definition.formation import errors_over_time
+from experiments.definition.graph import Links
 from experiments.metrics.results import Passage
 from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import Trace
@@ -262,10 +264,25 @@ def belief_errors(trace: Trace, net: Links) -> Array:
         at = np.searchsorted(received.arrival[mine], trace.time, side="right") - 1
         newest = mine[at]
         age = np.maximum(trace.time - received.stamp[newest], 0.0)
-        believed = trace.plan.predictor.position(received.position[newest], received.velocity[newest], age)
+        believed = _predicted(trace.plan.predictor, received.position[newest], received.velocity[newest], age)
         error[:, k] = norm(believed - trace.true_position[:, net.sender[k]])
         error[at < 0, k] = np.nan
     return error
+
+
+class _Sent(NamedTuple):
+    """A transmitted pose."""
+
+    position: Vector  # [m]
+    velocity: Vector  # [m/s]
+
+
+def _predicted(predictor: Predictor, position: Array, velocity: Array, age: Array) -> Array:
+    """Believed positions (T, 3) [m] from poses of an age (T,) [s] with position and velocity (T, 3)."""
+    if predictor is HOLD:
+        return position
+    sent = zip(map(tuple, position.tolist()), map(tuple, velocity.tolist()), age.tolist(), strict=True)
+    return np.array([predictor.position(_Sent(place, speed), since) for place, speed, since in sent]).reshape(-1, 3)
 
 
 def closest_distance(position: Array) -> float:

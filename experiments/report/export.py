@@ -17,7 +17,7 @@ from typing import Any, Final, get_args, get_type_hints
 import numpy as np
 
 from agents.errors import ExplainedError
-from agents.formation.graph import adjacency
+from experiments.definition.graph import adjacency
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, phase_starts
 from experiments.recording.trace import Trace

@@ -22,9 +22,9 @@ from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
 from agents.arrays import Array
-from agents.formation.graph import edges
 from experiments.check.analysis import Analysis
 from experiments.definition.formation import errors_over_time
+from experiments.definition.graph import edges
 from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
@@ -205,7 +205,7 @@ def _laid_upon(known: Analysis, shape: Array, place: Array) -> Array:
     Leaders and anchors keep it where it is. Distances leave it free to turn and be mirrored, about a single leader.
     """
     fixed = known.without_neighbours
-    if known.assignment.anchors is not None:
+    if known.anchors:
         return shape
     about = fixed if len(fixed) else np.arange(len(shape))
     middle, at = shape[about, :2].mean(axis=0), place[about, :2].mean(axis=0)

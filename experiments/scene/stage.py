@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import KHEPERA4, Kind
 from agents.decision.lifecycle import Phase
-from agents.formation.graph import Links, links
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
 from experiments.definition import bodies
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
+from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from twins.scene import Scene
 
@@ -152,7 +152,7 @@ class Stage:
         plan = Plan(experiment)
         avoidance = _if_installed(lambda: plan.avoidance)
         formation = _if_installed(lambda: plan.formation)
-        margin = getattr(avoidance, "margin", getattr(avoidance, "clearance", 0.0)) or 0.0
+        margin = getattr(avoidance, "margin", getattr(avoidance, "clearance", 0.0))
         return cls(
             title=experiment.title,
             names=plan.names,

@@ -16,12 +16,12 @@ from msgspec.structs import replace
 
 from agents.arrays import Array, Index, PoseTable
 from agents.decision.lifecycle import FINISHED, Phase
-from agents.formation.graph import Links
 from agents.network import messages
 from agents.plugins import registry
 from agents.safety.hazards import Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
+from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
 from experiments.recording.topics import Message
 from experiments.recording.trace import (

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from agents.body.interface import BodyRequest, BodyState
-from agents.formation.graph import Links
+from experiments.definition.graph import Links
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS

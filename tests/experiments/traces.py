@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 
 from agents.arrays import Array, PoseTable, norm
-from agents.formation.graph import links
 from agents.network.messages import Event
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.recording.trace import Trace
 

@@ -44,10 +44,8 @@ class Invariants:
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
         self.position: Array = np.full((len(kinds), 3), np.nan)
         plan = Plan(experiment)
-        self._law, formation = plan.law, plan.formation
-        if formation.presence is not None:  # links by range may end at any time
-            formation = formation.select(np.flatnonzero(np.isinf(formation.presence.reach)))
-        self._formation = formation
+        self._law, self._formation = plan.law, plan.formation
+        self._lasting = np.array([link.reach == np.inf for link in plan.one_way_links], dtype=bool)
         self.nearest = np.inf  # [m] between surfaces of any two robots, so far
         self._wrong: set[str] = set()
 
@@ -91,7 +89,7 @@ class Invariants:
         """
         here = np.array([name in live for name in self.names])
         links = self._formation.links
-        counted = here[links.receiver] & here[links.sender]
+        counted = here[links.receiver] & here[links.sender] & self._lasting  # links by range may end at any time
         position = self.position[np.union1d(links.receiver[counted], links.sender[counted])]
         if not np.isfinite(position).all():
             return np.inf

@@ -111,7 +111,7 @@ def _break_body(broken: Sequence[Switch]) -> None:
 
     read = ExternalBody.read
 
-    def failing(body: ExternalBody, t: float) -> BodyState:
+    def failing(body: ExternalBody, t: float) -> Sequence[BodyState]:
         if any(switch.read() for switch in broken):
             raise OSError("read fails, as the laboratory wants")
         return read(body, t)

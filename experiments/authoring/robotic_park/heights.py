@@ -10,11 +10,13 @@ import numpy as np
 
 from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
-from agents.formation.anchors import Anchors
-from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links
+from agents.formation.anchors import Anchor
+from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from experiments.authoring.robotic_park.file import Park, Relation, Robot
 from experiments.check.motion import CLEARANCE
 from experiments.check.realisation import Shape, Solids, find_shapes
+from experiments.definition.formation import Anchored
+from experiments.definition.graph import Links
 
 BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
 ATTEMPTS: Final = 40  # random beginnings
@@ -41,7 +43,7 @@ class Room:
         return not len(self.solids.overlaps(shape.position)) and bool(low >= self.lowest)
 
 
-def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mask, room: Room | None = None) -> Shape:
+def find_shape(wanted: Links, anchors: Anchored, start: Array, climbs: Mask, room: Room | None = None) -> Shape:
     """Best places for what links and anchors ask for, with robots apart from one another and drones in the air.
 
     A formation that can be met at the heights of the starts stays there. Else heights are free, and least squares
@@ -59,7 +61,7 @@ def find_shape(wanted: Links, anchors: Anchors | None, start: Array, climbs: Mas
     mirrored = start * [1.0, -1.0, 1.0] + [0.0, 2.0 * start[:, 1].mean(), 0.0]
     found = find_shapes(wanted, [start, mirrored], moves, anchors, solids=solids)
     beginnings = _guesses_in_space(start, climbs) if climbs.any() and not found[-1].good else iter(())
-    fixed = np.concatenate([start[~climbs, 2], np.zeros(0) if anchors is None else anchors.point[:, 2]])
+    fixed = np.concatenate([start[~climbs, 2], [each.point[2] for _, each in anchors]])
     mirror = float(fixed.mean()) if len(fixed) else 0.0
     for guess in beginnings:
         found += find_shapes(wanted, [guess], moves, anchors, climbs, solids=solids)
@@ -116,12 +118,12 @@ def find_heights(park: Park, notes: list[str]) -> Heights:
     kinds = [KINDS[robot.kind] for robot in park.robots]
     solids = Solids.of(kinds, wanted, np.ones_like(flies), CLEARANCE)
     room = Room(solids, flies, -np.inf if flies.all() and not given else LOWEST)
-    found, anchored = find_shape(wanted, anchors, start, flies, room), anchors is not None
+    found, anchored = find_shape(wanted, anchors, start, flies, room), bool(anchors)
     missed = found.worst
     if anchored and (missed > SHAPE_MET or not room.holds(found)):
         given, anchored = False, False
         room = replace(room, lowest=-np.inf if flies.all() else LOWEST)
-        found = find_shape(wanted, None, start, flies, room)
+        found = find_shape(wanted, (), start, flies, room)
         if found.worst <= SHAPE_MET:
             how = f"misses by {1e3 * missed:.0f} mm" if missed > SHAPE_MET else "has robots in one place or too low"
             notes.append(
@@ -180,7 +182,7 @@ def _starts(park: Park, notes: list[str]) -> Array:
     return np.array([ring[row] if robot.start is None else robot.start for row, robot in enumerate(park.robots)])
 
 
-def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchors | None]:
+def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anchored]:
     """Links, and distances to points, as the tasks have them."""
     row = {robot.name: number for number, robot in enumerate(park.robots)}
     every = [(robot, task.kind, relation) for robot, task in park.tasks for relation in task.relations]
@@ -193,9 +195,12 @@ def _wanted_distances(park: Park, start: Array, flies: Mask) -> tuple[Links, Anc
     wants, distance = np.where(by_pose, BY_RELATIVE, BY_DISTANCE), np.where(by_pose, np.nan, value[:, 0])
     links = Links(i, j, distance, np.ones(len(i)), value, np.full_like(value, np.nan), wants)
     rings = [(robot, each) for robot, _, each in every if each.name == "origin" and len(each.values) != 3]
-    if not rings:
-        return links, None
-    points = np.array([origin_of(park, robot, each) or (0.0, 0.0, 0.0) for robot, each in rings])
-    rows, radii = np.array([row[robot.name] for robot, _ in rings]), np.array([each.values[0] for _, each in rings])
-    one = np.ones(len(rows))
-    return links, Anchors(rows, points, np.zeros_like(points), one, 0.0 * one, radii, one)
+    return links, [
+        (row[robot.name], Anchor(_point(park, robot, each), (0.0, 0.0, 0.0), 1.0, 0.0, each.values[0], 1.0))
+        for robot, each in rings
+    ]
+
+
+def _point(park: Park, robot: Robot, relation: Relation) -> tuple[float, float, float]:
+    x, y, z = origin_of(park, robot, relation) or (0.0, 0.0, 0.0)
+    return x, y, z

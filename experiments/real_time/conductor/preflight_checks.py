@@ -262,9 +262,9 @@ def _clock(name: str, each: Observed, safety: Safety) -> Check:
         return _not_known("clock", each)
     if not AHEAD_S < each.behind_s < BEHIND_S:
         return _bad("clock", f"its computer's is {-each.behind_s:+.2f} s off", "set it (chrony or NTP), or use [hosts]")
-    ahead = np.array([math.nan if each.last.ahead_s is None else each.last.ahead_s])
-    if clock_off(ahead, safety.own_silence_s)[0]:
-        return _bad("clock", clock_text([name], ahead, 0), "set the clock of the computer that measures positions")
+    ahead = math.nan if each.last.ahead_s is None else each.last.ahead_s
+    if clock_off(ahead, safety.own_silence_s):
+        return _bad("clock", clock_text(name, ahead), "set the clock of the computer that measures positions")
     return Check(check="clock", verdict="ok", found=f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
 
 

@@ -11,7 +11,7 @@ from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import NeighbourPoses
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
-from agents.formation.graph import links
+from experiments.definition.graph import links
 from agents.plugins.avoidance import Avoidance
 
 LIMITS = Limits(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 2.5]), speed=0.5)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.formation.changes import Change, NewTargets, Presence, Reshaping, changed_targets, progress
-from agents.formation.graph import Links
+from experiments.definition.graph import Links
 from tests.agents.plugins.test_laws import told_more
 
 FEW = settings(max_examples=25)

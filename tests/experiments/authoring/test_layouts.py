@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.rigidity import rigidity
 from experiments.authoring import layouts
 from experiments.authoring.layouts import LayoutError
+from experiments.check.rigidity import rigidity
 
 
 def held(made):

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
-from agents.formation.graph import Links, links
 from experiments.check.check import check
 from experiments.check.realisation import (
     Solids,
@@ -23,6 +22,7 @@ from experiments.check.realisation import (
     unfold_distances,
 )
 from experiments.definition.experiment import Experiment, Formation, Robot
+from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.experiments.checked import of

@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.formation.anchors import Anchors
-from agents.formation.graph import BY_RELATIVE, Links, links
 from agents.plugins.laws import Displacement, Distance
 from experiments.authoring import layouts
 from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
+from experiments.definition.graph import BY_RELATIVE, Links, links
 from experiments.definition.plan import Plan
 from experiments.file import document
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import KINDS
-from agents.formation.graph import edges, links
-from agents.formation.rigidity import rigidity
 from agents.plugins import registry
 from experiments.catalogue import index
+from experiments.check.rigidity import rigidity
+from experiments.definition.graph import edges, links
 from experiments.file import catalogue as entries
 from experiments.file import json_schema
 from experiments.file.document import DocumentError, read

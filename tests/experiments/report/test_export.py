@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from agents.errors import ExplainedError
-from agents.formation.graph import laplacian
+from experiments.definition.graph import laplacian
 from experiments.file.document import load, loads
 from experiments.metrics.signals import formation_errors
 from experiments.recording.run_folder import SOURCE

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agents.arrays import PoseTable
-from agents.formation.graph import links
 from agents.network import messages
 from experiments.definition.experiment import Channel as Parameters
 from experiments.definition.experiment import Experiment, LinkChannel, Network, Outage, Robot
+from experiments.definition.graph import links
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.network import VirtualChannel
 

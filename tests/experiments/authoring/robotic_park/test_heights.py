@@ -5,10 +5,10 @@ from hypothesis import strategies as st
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.formation.anchors import Anchors
-from agents.formation.graph import BY_DISTANCE, BY_RELATIVE, Links, links
 from experiments.authoring import layouts
 from experiments.authoring.robotic_park.heights import Room, find_shape
 from experiments.check.realisation import ENOUGH, Solids
+from experiments.definition.graph import BY_DISTANCE, BY_RELATIVE, Links, links
 
 
 def asked(position, pairs=None, *, relative=False):

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.rigidity import redundancy, rigidity
+from experiments.check.rigidity import redundancy, rigidity
 
 
 def planar(rows):
