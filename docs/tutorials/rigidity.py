@@ -18,7 +18,7 @@ from agents.arrays import Array, Mask, norm
 from agents.body.kinds import CRAZYFLIE
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import closed_shares
-from experiments.check.rigidity import rigid_motions, rigidity, rigidity_matrix
+from experiments.definition.rigidity import rigid_motions, rigidity, rigidity_matrix
 from experiments.file.document import Document, load, loads
 from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
 from experiments.run import folder, show, simulate

@@ -29,7 +29,6 @@ from experiments.check.realisation import (
     targets_of_law,
     unfold_distances,
 )
-from experiments.check.rigidity import Redundancy, Rigidity
 from experiments.check.stability import Modes, modes
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Link
@@ -42,8 +41,9 @@ from experiments.definition.formation import (
     law_offsets,
 )
 from experiments.definition.graph import Links, components, edges
-from experiments.definition.links import link_pairs
+from experiments.definition.links import held_height, link_pairs
 from experiments.definition.plan import Plan
+from experiments.definition.rigidity import Redundancy, Rigidity
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
 from experiments.metrics.signals import after_last, moving_mean
@@ -108,7 +108,7 @@ class Analysis:
     @property
     def height(self) -> Array:
         """(N,) that each robot holds [m]: 0 on wheels."""
-        return np.nan_to_num(bodies.hover_heights(self.experiment, self.names))
+        return np.array([held_height(self.experiment, name) for name in self.names])
 
     @property
     def limits(self) -> Limits:
@@ -265,7 +265,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     starts, _ = bodies.start_poses(experiment, names)
     start = np.array(starts)
     aloft = start.copy()
-    aloft[:, 2] = np.nan_to_num(bodies.hover_heights(experiment, names))
+    aloft[:, 2] = [held_height(experiment, name) for name in names]
     anchored = np.array([row for row, _ in anchors], dtype=np.intp)
     silent = np.setdiff1d(np.arange(rows), np.concatenate([links.receiver, anchored]))
     standing = pattern.planned_at(0.0)

@@ -264,9 +264,7 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
 def ceiling(analysis: Analysis) -> Iterator[Finding]:
     """Check that the overshoot of a take-off stays below the top of the arena."""
     top = analysis.experiment.arena.size[2]
-    for name, kind, hover in zip(
-        analysis.names, analysis.assignment.kinds, analysis.assignment.hover.tolist(), strict=True
-    ):
+    for name, kind, hover in zip(analysis.names, analysis.kinds, analysis.height.tolist(), strict=True):
         highest = (1.0 + kind.overshoot) * hover
         if kind.overshoot and highest > top + FORGIVEN:
             message = (

@@ -15,9 +15,9 @@ from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import Kind
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins.laws import Law, Mixed
-from experiments.check.rigidity import Redundancy, Rigidity, redundancy, rigidity
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
 from experiments.definition.graph import Links, edges, part_of_rows
+from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity
 
 TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 TINY: Final = 1e-18  # [m²] no length is zero

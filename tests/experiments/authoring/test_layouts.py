@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from experiments.authoring import layouts
 from experiments.authoring.layouts import LayoutError
-from experiments.check.rigidity import rigidity
+from experiments.definition.rigidity import rigidity
 
 
 def held(made):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.check.rigidity import rigidity, rigidity_matrix
+from experiments.definition.rigidity import rigidity, rigidity_matrix
 from experiments.definition.graph import Links, adjacency, components, degree, edges, laplacian, links, reachable
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")

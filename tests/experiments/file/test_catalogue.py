@@ -13,7 +13,7 @@ import pytest
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.catalogue import index
-from experiments.check.rigidity import rigidity
+from experiments.definition.rigidity import rigidity
 from experiments.definition.graph import edges, links
 from experiments.file import catalogue as entries
 from experiments.file import json_schema

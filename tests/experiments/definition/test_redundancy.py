@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.check.rigidity import redundancy, rigidity
+from experiments.definition.rigidity import redundancy, rigidity
 
 
 def planar(rows):
