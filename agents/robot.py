@@ -75,7 +75,7 @@ class Robot:
         """Take the `assignment`, and the `health` of the process, which sets it."""
         kind, limits = assignment.kind, assignment.limits
         self.assignment, self.health = assignment, health or ProcessHealth()
-        self.goals = GoalComputer(assignment)
+        self.goals = GoalComputer(assignment, passive=assignment.guided)
         self.neighbours: Neighbours = self.goals.neighbours
         self.guidance: Guidance | None = None
         if assignment.guided:

@@ -38,7 +38,8 @@ class GoalComputer:
     error: float  # Σ|e| of the links, of the last call of `errors` [m]
     energy: float  # Σ ½e², likewise [m²]
 
-    def __init__(self, assignment: Assignment) -> None:
+    def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
+        """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
         links = assignment.neighbours
         self.law: Law = assignment.law
         self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
@@ -56,7 +57,7 @@ class GoalComputer:
             sender.present = sender.in_law and planned_at(sender.since, sender.until, sender.reach, 0.0)
         legs = assignment.legs
         self.itinerary: Itinerary | None = None
-        if legs or not (self.follows or assignment.guided):  # neither law nor plan: stay in place
+        if legs or not (self.follows or passive):  # neither law nor plan: stay in place
             self.itinerary = Itinerary(legs, holds_before=not self.follows)
         self._detour: Itinerary | None = None
         self._detour_since = 0.0

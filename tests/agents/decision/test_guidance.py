@@ -1,233 +1,191 @@
-"""Robots that a centre guides: what they obey, when they hold, and what stays in the robot."""
+"""Guided robots: which goals they pursue, when they hold, and what stays in the robot."""
 
-import numpy as np
+from math import inf, isnan, nan
+
 import pytest
 
-from agents.agent import Agent
-from agents.body.interface import BodyState
 from agents.decision.centralised import Guidance
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING
-from experiments.definition.experiment import Experiment, Formation, Hybrid, Robot, Start
+from agents.robot import Robot
+from experiments.definition.experiment import Experiment, Formation, Hybrid, Start
+from experiments.definition.experiment import Robot as Member
 from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
 
-NAN = np.nan
+PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.8)}
 
 
 def pair(**parts):
-    """A Khepera and a Tello that listen to each other, decided for by a centre; `parts` changes that."""
-    given = {
-        "title": "A pair",
-        "duration_s": 60.0,
-        "robots": {
-            "A": Robot(kind="khepera4", start=[-0.4, 0.0]),
-            "B": Robot(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
-        },
-        "formation": Formation(links={"A - B": 0.9}),
-        "architecture": "centralised",
-        **parts,
+    """A Khepera and a Crazyflie that receive each other, guided by a central controller; `parts` changes that."""
+    robots = {
+        "A": Member(kind="khepera4", start=[-0.4, 0.0]),
+        "B": Member(kind="crazyflie", start=[0.4, 0.1], hover=0.8),
     }
+    given = {
+        "title": "A pair", "duration_s": 60.0, "robots": robots, "formation": Formation(links={"A - B": 0.9}),
+        "architecture": "centralised", **parts,
+    }  # fmt: skip
     return Experiment(**given)
 
 
-class Bench:
-    """The rows of an experiment on a clock, where they are put."""
-
-    def __init__(self, experiment, names=("A", "B")):
-        self.agent = Agent(Plan(experiment).assignment(names))
-        self.agent.neighbours.mark_alive(np.arange(len(self.agent.assignment.links)))
-        self.position = np.array([[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])[: len(names)]
-        self.climbed = np.zeros(len(names))
-        self.t = 0.0
-
-    def step(self, count=1):
-        for _ in range(count):
-            rows = len(self.position)
-            still, flying = np.zeros((rows, 3)), np.array([False, True])[:rows]
-            life, position = self.agent.lifecycle, self.position.copy()
-            waits = (life.phase <= READY) & ~life.active  # on the floor, until it is told to climb
-            self.climbed = np.where(waits, 0.0, self.climbed + 0.005)
-            position[:, 2] = np.minimum(position[:, 2], self.climbed)
-            state = BodyState(
-                time=np.full(rows, self.t), position=position, velocity=still, yaw=np.zeros(rows),
-                battery=np.full(rows, NAN), flying=flying, true_position=position, true_yaw=np.zeros(rows),
-            )  # fmt: skip
-            self.actions = self.agent.step(self.t, state)
-            self.t = round(self.t + 0.01, 9)
-        return self
-
-    def told(self, rows, goal, *, stamp=None, toward=NAN):
-        count = len(rows)
-        stamps = np.full(count, self.t if stamp is None else stamp)
-        return self.agent.guidance.receive(np.array(rows), np.array(goal, dtype=float), np.full(count, toward), stamps)
-
-    def running(self):
-        rows = range(len(self.position))
-        self.told(list(rows), self.position)
-        self.step()
-        for row in rows:
-            assert self.agent.lifecycle.takeoff(row) == ""
-        self.step(200)  # up at 0.5 m/s
-        for row in rows:
-            assert self.agent.start(row, self.t) == ""
-        self.told(list(rows), self.position)
-        return self.step()
-
-    @property
-    def phases(self):
-        return self.agent.lifecycle.phase.tolist()
+def guided(name="A", **parts):
+    return Bench(Plan(pair(**parts)).assignment(name), PLACES[name])
 
 
-def test_it_is_ready_when_the_centre_has_spoken():
-    bench = Bench(pair()).step()
-    assert bench.phases == [IDLE, IDLE]
-    assert bench.agent.lifecycle.reason == ["never heard centre"] * 2
-    assert bench.agent.missing_neighbours(0) == ["centre"]
-    bench.told([0], [[0.0, 0.0, 0.0]])
+def guide(bench, goal=None, yaw=nan, *, stamp=None):
+    """Receive a goal; returns whether it is new."""
+    stamp = bench.t if stamp is None else stamp
+    return bench.robot.guidance.receive(goal or bench.position, yaw, stamp)
+
+
+def running(name="A"):
+    bench = guided(name)
+    bench.running(guide)
+    return bench
+
+
+def test_ready_once_the_centre_is_known():
+    bench = guided().step()
+    assert (bench.life.phase, bench.life.reason) == (IDLE, "never heard centre")
+    assert bench.robot.missing_neighbours() == ["centre"]
+    guide(bench)
+    assert bench.step().life.phase == READY
+    assert bench.robot.missing_neighbours() == []
+
+
+def test_patience_for_the_centre_ends():
+    bench = guided(start=Start(deadline_s=0.05, missing="go-on")).step(0.05)
+    assert bench.life.phase == IDLE
+    assert bench.step(0.02).life.phase == READY
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_nothing_is_pursued_before_the_start(name):
+    bench = guided(name)
+    guide(bench, (1.0, 0.0, 0.8))
     bench.step()
-    assert bench.phases == [READY, IDLE]
-    assert bench.agent.missing_neighbours(0) == []
+    assert bench.life.takeoff() == ""
+    bench.step(2.0)
+    assert bench.life.phase == AIRBORNE
+    assert bench.robot.goal == PLACES[name]
+    assert bench.robot.updates == 0
 
 
-def test_without_a_centre_it_goes_on_after_the_deadline_where_the_file_says_so():
-    bench = Bench(pair(start=Start(deadline_s=0.05, missing="go-on"))).step(5)
-    assert bench.phases == [IDLE, IDLE]
-    assert bench.step(2).phases == [READY, READY]
-
-
-def test_nothing_is_pursued_before_the_start():
-    bench = Bench(pair())
-    bench.told([0, 1], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.8]])
+@pytest.mark.parametrize(("name", "height"), [("A", 0.0), ("B", 0.7)])  # on wheels there is none
+def test_goal_is_pursued_on_its_tick(name, height):
+    bench = running(name).step(0.03)  # no decision falls on the next tick
+    robot, before = bench.robot, bench.robot.updates
+    x, y, _ = bench.position
+    assert guide(bench, (x + 0.1, y + 0.1, 0.7), 0.5)
     bench.step()
-    assert bench.agent.lifecycle.takeoff(0) == bench.agent.lifecycle.takeoff(1) == ""
-    bench.step(200)
-    assert bench.phases == [AIRBORNE, AIRBORNE]
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.4, 0.0, 0.0], [0.4, 0.1, 0.8]])
-    assert bench.agent.updates.tolist() == [0, 0]
+    assert (robot.goal, robot.goal_yaw) == ((x + 0.1, y + 0.1, height), 0.5)
+    assert name == "A" or robot.setpoint == (*robot.goal, 0.5)
+    bench.step(0.05)
+    assert robot.updates - before == 1  # one goal is one update
 
 
-def test_a_goal_is_pursued_on_the_tick_on_which_it_comes():
-    bench = Bench(pair()).running().step(3)  # no decision falls on the next tick
-    before = bench.agent.updates.copy()
-    assert bench.told([0, 1], [[-0.3, 0.1, 0.7], [0.5, 0.2, 0.7]], toward=0.5).all()
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.7]])  # the Khepera has no height
-    assert bench.agent.goal_yaw.tolist() == [0.5, 0.5]
-    np.testing.assert_array_equal(bench.actions.setpoint[1], [0.5, 0.2, 0.7, 0.5])
-    assert (bench.agent.updates - before).tolist() == [1, 1]
-    bench.step(5)
-    assert (bench.agent.updates - before).tolist() == [1, 1]  # one goal is one update
+def test_older_and_unknown_goals_are_left_out():
+    bench = running()
+    assert guide(bench, (0.1, 0.0, 0.0))
+    assert not guide(bench, (nan, 0.0, 0.0), stamp=bench.t + 1.0)
+    assert not guide(bench, (0.2, 0.0, 0.0), stamp=bench.t - 0.1)
+    assert not guide(bench, (0.2, 0.0, 0.0))  # the same instant once more
+    assert bench.step().robot.goal == (0.1, 0.0, 0.0)
 
 
-def test_older_goals_and_those_of_nobody_are_left_out():
-    bench = Bench(pair()).running()
-    assert bench.told([0, 1], [[0.1, 0.0, 0.0], [NAN, 0.0, 0.8]]).tolist() == [True, False]
-    assert not bench.told([0], [[0.2, 0.0, 0.0]], stamp=bench.t - 0.1).any()
-    assert not bench.told([0], [[0.2, 0.0, 0.0]]).any()  # the same instant once more
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal[0], [0.1, 0.0, 0.0])
-
-
-def test_an_old_goal_is_none_and_the_robot_stays_where_it_is_then():
-    bench = Bench(pair()).running()
+def test_old_goal_makes_it_stay():
+    bench = running()
     at = bench.t
-    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
-    bench.step(50)
-    bench.position[0, 0] = -0.35
-    bench.told([1], [[0.5, 0.25, 0.8]])
+    guide(bench, (-0.3, 0.1, 0.0), 0.3)
+    bench.step(0.5)
+    bench.position = (-0.35, 0.0, 0.0)
     while bench.t <= at + 1.0 + 1e-9:
-        np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
+        assert bench.robot.goal == (-0.3, 0.1, 0.0)
         bench.step()
     bench.step()
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.35, 0.0, 0.0], [0.5, 0.25, 0.8]])  # the other has a fresh one
-    assert np.isnan(bench.agent.goal_yaw[0])
-    bench.position[0] = [-0.34, 0.01, 0.0]
-    bench.step(5)
-    np.testing.assert_array_equal(bench.agent.goal[0], [-0.35, 0.0, 0.0])  # drift does not move the place
-    bench.told([0], [[-0.2, 0.1, 0.0]])
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal[0], [-0.2, 0.1, 0.0])
+    assert bench.robot.goal == (-0.35, 0.0, 0.0)
+    assert isnan(bench.robot.goal_yaw)
+    bench.position = (-0.34, 0.01, 0.0)
+    assert bench.step(0.05).robot.goal == (-0.35, 0.0, 0.0)  # drift does not move the place
+    guide(bench, (-0.2, 0.1, 0.0))
+    assert bench.step().robot.goal == (-0.2, 0.1, 0.0)
 
 
-def test_a_dead_centre_stops_all_that_it_guides_at_once():
-    bench = Bench(pair()).running()
-    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
+@pytest.mark.parametrize("name", PLACES)
+def test_dead_centre_stops_at_once(name):
+    bench = running(name)
+    x, y, z = bench.position
+    goal = (x + 0.1, y + 0.1, z)
+    guide(bench, goal)
     bench.step()
-    bench.agent.guidance.mark_lost(bench.t)
+    bench.robot.guidance.mark_lost(bench.t)
+    assert bench.step().robot.goal == bench.position
+    assert bench.robot.missing_neighbours() == ["centre"]
+    assert bench.life.phase == RUNNING
+    bench.robot.guidance.mark_alive()
+    assert bench.step().robot.goal == goal  # back in time: the last goal is still young
+    bench.robot.guidance.mark_lost(bench.t)
     bench.step()
-    np.testing.assert_array_equal(bench.agent.goal, bench.position)
-    assert bench.agent.missing_neighbours(1) == ["centre"]
-    assert bench.phases == [RUNNING, RUNNING]
-    bench.agent.guidance.mark_alive()
-    bench.step()  # back in time: the last goal is still young
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
-    bench.agent.guidance.mark_lost(bench.t)
-    bench.step()
-    bench.told([0], [[-0.25, 0.1, 0.0]])  # whoever is heard is there
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.25, 0.1, 0.0], [0.5, 0.2, 0.8]])
+    guide(bench, (x + 0.05, y + 0.1, z))  # who is received is there
+    assert bench.step().robot.goal == (x + 0.05, y + 0.1, z)
 
 
-def test_orders_are_obeyed_whatever_the_centre_says():
-    bench = Bench(pair()).running()
-    assert bench.agent.hold(0) == ""
-    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal, [[-0.4, 0.0, 0.0], [0.5, 0.2, 0.8]])
-    assert bench.agent.start(0, 0.0) == ""
-    bench.step()
-    np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
-    bench.agent.lifecycle.land(1, "told to")
-    bench.told([1], [[0.6, 0.2, 0.8]])
-    bench.step()
-    assert bench.phases == [RUNNING, LANDING]
-    assert np.isnan(bench.actions.setpoint[1]).all()
+def test_orders_come_before_goals():
+    bench = running()
+    assert bench.robot.hold() == ""
+    guide(bench, (-0.3, 0.1, 0.0))
+    assert bench.step().robot.goal == (-0.4, 0.0, 0.0)
+    assert bench.robot.start(0.0) == ""
+    assert bench.step().robot.goal == (-0.3, 0.1, 0.0)
+    drone = running("B")
+    drone.life.land("told to")
+    guide(drone, (0.6, 0.2, 0.8))
+    drone.step()
+    assert drone.life.phase == LANDING
+    assert isnan(drone.robot.setpoint[0])
 
 
 def test_cut_off_from_the_network_it_holds():
-    bench = Bench(pair()).running()
-    bench.agent.health.offline_since = bench.t
-    bench.step(50)
-    bench.told([0, 1], [[-0.3, 0.1, 0.0], [0.5, 0.2, 0.8]])  # the last that came through
-    bench.step(50)
-    np.testing.assert_array_equal(bench.agent.goal[0], [-0.3, 0.1, 0.0])
-    bench.step(2)
-    np.testing.assert_array_equal(bench.agent.goal, bench.position)
+    bench = running()
+    bench.robot.health.offline_since = bench.t
+    bench.step(0.5)
+    guide(bench, (-0.3, 0.1, 0.0))  # the last that came through
+    assert bench.step(0.5).robot.goal == (-0.3, 0.1, 0.0)
+    assert bench.step(0.02).robot.goal == bench.position
 
 
-def test_safety_has_the_last_word_on_goals_too():
-    bench = Bench(pair()).running()
-    bench.told([1], [[3.0, 0.1, 0.8]])
+def test_safety_limits_received_goals():
+    bench = running("B")
+    guide(bench, (3.0, 0.1, 0.8))
     bench.step()
-    assert bench.actions.changed.tolist() == [False, True]
-    assert bench.actions.setpoint[1, 0] == pytest.approx(0.9)  # goal_step from where it is
+    assert bench.robot.changed
+    assert bench.robot.setpoint[0] == pytest.approx(0.9, abs=1e-3)  # goal_step from where it is
 
 
-def test_who_is_guided_listens_to_nobody_but_to_keep_clear():
-    assert len(Plan(pair()).assignment(["A", "B"]).links) == 0
-    told = Plan(pair(avoidance={"kind": "barrier", "hears": "neighbours"})).assignment(["A"])
-    assert told.avoidance_only.tolist() == [True]
-    assert told.robots[told.links.sender[0]] == "B"
+def test_guided_robot_receives_for_avoidance_alone():
+    assert Plan(pair()).assignment("A").neighbours == ()
+    avoids = pair(avoidance={"kind": "barrier", "hears": "neighbours"})
+    assert [(each.name, each.in_law) for each in Plan(avoids).assignment("A").neighbours] == [("B", False)]
 
 
-def test_in_a_hybrid_only_the_others_have_a_law_of_their_own():
-    hybrid = pair(architecture=Hybrid(kind="hybrid", robots=["B"]))
-    told = Plan(hybrid).assignment(["A", "B"])
-    assert told.guided.tolist() == [False, True]
-    assert told.links.receiver.tolist() == [0]
-    assert told.links.sender.tolist() == [1]
-    assert Agent(Plan(hybrid).assignment(["A"])).guidance is None  # whoever decides for himself takes no goals
+def test_hybrid_leaves_the_law_to_others():
+    plan = Plan(pair(architecture=Hybrid(kind="hybrid", robots=["B"])))
+    alone, led = plan.assignment("A"), plan.assignment("B")
+    assert (alone.guided, led.guided) == (False, True)
+    assert [each.name for each in alone.neighbours] == ["B"]
+    assert led.neighbours == ()
+    assert Robot(alone).guidance is None  # a robot that decides for itself takes no goals
 
 
-def test_rows_are_guided_each_for_itself():
-    guided, flies = np.array([True, False, True]), np.array([False, True, True])
-    many, one = Guidance(guided, flies, 1.0), Guidance(np.array([True]), np.array([True]), 1.0)
-    rng = np.random.default_rng(7)
-    for t in rng.uniform(0.0, 5.0, 40):
-        goal = rng.normal(size=(3, 3))
-        many.receive(np.array([0, 1, 2]), goal, np.zeros(3), np.full(3, t))
-        one.receive(np.array([0]), goal[2:], np.zeros(1), np.array([t]))
-        np.testing.assert_array_equal(many.goal[2], one.goal[0])
-        for now in (t, t + 0.7, t + 2.0):
-            assert many.unguided(now)[2] == one.unguided(now)[0]
-    assert np.isnan(many.goal[1]).all()
-    assert not many.unguided(99.0)[1]
+def test_age_of_guidance():
+    guidance = Guidance(flies=True, silence_s=1.0)
+    assert guidance.missing
+    assert guidance.unguided(0.0)
+    guidance.receive((0.0, 0.0, 1.0), nan, 4.0)
+    assert [guidance.unguided(t) for t in (4.0, 5.0, 5.1)] == [False, False, True]
+    guidance.mark_lost(4.5)
+    assert guidance.unguided(4.6)
+    assert guidance.receive((0.0, 0.0, 1.0), nan, 4.7)  # another controller
+    assert guidance.lost_since == inf
+    guidance.begin_anew()
+    assert guidance.receive((0.0, 0.0, 1.0), nan, -3.0)  # whose clock is behind

@@ -1,255 +1,229 @@
-"""Lives of robots under any orders in any order: phases only grow, DONE is the end, every refusal has its reason."""
+"""Life of a robot under any orders in any order: phases only grow, DONE is the end, every refusal has its reason."""
 
-import numpy as np
+from math import nan
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
 
-DT = 0.1
-HOVER = 0.8
+DT, HOVER = 0.1, 0.8
 ORDERS = ("takeoff", "start", "start late", "land", "stop", "nothing", "nothing")
+COMMANDS = ("takeoff", "land", "stop")
 
 
-class Robots:
-    """Bodies as simple as can be: a ramp up, a ramp down, a wheel that stops at once."""
+class Life:
+    """A body as simple as can be: a ramp up, a ramp down, a wheel that stops at once."""
 
-    def __init__(self, flies, duration=1.0):
-        self.flies = np.array(flies)
-        rows = len(flies)
-        self.life = Lifecycle(self.flies, np.where(self.flies, HOVER, np.nan), duration)
-        self.position, self.velocity = np.zeros((rows, 3)), np.zeros((rows, 3))
-        self.flying = np.zeros(rows, dtype=bool)
-        self.climb = np.zeros(rows)
-        self.ready = np.ones(rows, dtype=bool)
-        self.tick = 0
-        self.told = []
+    def __init__(self, flies=True, duration=1.0):
+        self.flies = flies
+        self.life = Lifecycle(CRAZYFLIE if flies else KHEPERA4, HOVER if flies else nan, duration)
+        self.height, self.speed, self.climb, self.flying, self.ready = 0.0, (0.0, 0.0, 0.0), 0.0, False, True
+        self.tick, self.told = 0, []
 
     @property
     def t(self):
         return self.tick * DT
 
     def step(self):
-        """One tick of the life, then of the bodies, which do their duties in the order in which the runtime does."""
-        duties = self.life.advance(self.t, self.ready, self.position, self.velocity, self.flying)
-        if duties is not None:
-            self.told.append((self.tick, duties))
-            self.flying[duties.stop], self.climb[duties.stop] = False, 0.0
-            self.climb[duties.land] = -0.4
-            up = duties.takeoff[self.flies[duties.takeoff]]
-            self.flying[up], self.climb[up] = True, 0.4
-        height = np.clip(self.position[:, 2] + DT * self.climb * self.flying, 0.0, HOVER)
-        self.velocity[:, 2] = (height - self.position[:, 2]) / DT
-        self.position[:, 2] = height
-        self.flying &= (height > 0.0) | (self.climb > 0.0)
+        """One tick of the life, then of the body, which gets its commands in the order of the runtime."""
+        life = self.life
+        life.advance(self.t, (0.0, 0.0, self.height), self.speed, flying=self.flying, ready=self.ready)
+        due = [name for name in COMMANDS if getattr(life, f"{name}_due")]
+        life.takeoff_due = life.land_due = life.stop_due = False
+        self.told += due
+        if "stop" in due:
+            self.flying, self.climb = False, 0.0
+        if "land" in due:
+            self.climb = -0.4
+        if "takeoff" in due and self.flies:
+            self.flying, self.climb = True, 0.4
+        height = min(max(self.height + DT * self.climb * self.flying, 0.0), HOVER)
+        if self.flies:
+            self.speed = (0.0, 0.0, (height - self.height) / DT)
+        self.height = height
+        self.flying = self.flying and (height > 0.0 or self.climb > 0.0)
         self.tick += 1
 
-    def until(self, phase, row=0, most=100):
+    def until(self, phase, most=100):
         for _ in range(most):
-            if self.life.phase[row] == phase:
-                return
+            if self.life.phase == phase:
+                return self
             self.step()
-        raise AssertionError(f"never {phase!r}, but {self.life.phase[row]}")
+        raise AssertionError(f"never {phase!r}, but {self.life.phase}")
 
-    def order(self, row, order):
-        """Why it was refused; empty if it was not."""
+    def order(self, order):
+        """Reason of a refusal; empty if there was none."""
         match order:
             case "takeoff":
-                return self.life.takeoff(row)
+                return self.life.takeoff()
             case "start":
-                return self.life.start(row, self.t + 0.3)
+                return self.life.start(self.t + 0.3)
             case "start late":
-                return self.life.start(row, self.t - 0.5)
+                return self.life.start(self.t - 0.5)
             case "land":
-                self.life.land(row, "told to")
+                self.life.land("told to")
             case "stop":
-                self.life.stop(row, "told to")
+                self.life.stop("told to")
         return ""
 
 
 @pytest.mark.slow
-@settings(max_examples=75)
+@settings(max_examples=100)
 @given(
-    st.lists(st.booleans(), min_size=1, max_size=3),
-    st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 2), st.integers(0, 12)), max_size=25),
+    st.booleans(),
+    st.lists(st.tuples(st.sampled_from(ORDERS), st.integers(0, 12)), max_size=25),
     st.booleans(),
 )
 def test_any_orders_in_any_order(flies, orders, ready):
-    robots = Robots(flies)
-    robots.ready[:] = ready
-    before = robots.life.phase.copy()
-    for order, number, wait in orders:
-        row = number % len(flies)
-        phase = robots.life.phase[row]
-        refusal = robots.order(row, order)
+    robot = Life(flies)
+    robot.ready, life = ready, robot.life
+    before = life.phase
+    for order, wait in orders:
+        phase = life.phase
+        refusal = robot.order(order)
         if order == "takeoff":
             assert (refusal == "") == (phase in (READY, AIRBORNE, RUNNING))
         elif order.startswith("start"):
             assert (refusal == "") == (phase in (AIRBORNE, RUNNING))
         assert refusal == "" or Phase(phase).word in refusal
         for _ in range(wait):
-            robots.step()
-            assert (robots.life.phase >= before).all()
-            assert robots.life.moved == (robots.life.phase != before).any()
-            assert not (robots.flying & (robots.life.phase == DONE) & (robots.climb > 0.0)).any()
-            before = robots.life.phase.copy()
-    for row in range(len(flies)):
-        robots.life.land(row, "the end")
+            robot.step()
+            assert life.phase >= before
+            assert life.moved == (life.phase != before)
+            assert not (robot.flying and life.phase == DONE and robot.climb > 0.0)
+            before = life.phase
+    life.land("the end")
     for _ in range(60):
-        robots.step()
-    assert (robots.life.phase == DONE).all()
-    assert not robots.flying.any()
-    assert not robots.position[:, 2].any() or any(order == "stop" for order, _, _ in orders)
-    assert all(robots.life.reason)
+        robot.step()
+    assert life.phase == DONE
+    assert not robot.flying
+    assert robot.height == 0.0 or "stop" in dict(orders)
+    assert life.reason
 
 
-def test_a_whole_life():
-    robots = Robots([True, False], duration=2.0)
-    life = robots.life
-    assert life.waiting
-    assert life.takeoff(0) == "cannot take off while idle"
-    robots.step()
-    assert life.phase.tolist() == [READY, READY]
-    assert life.waiting  # what makes it ready may be lost again
-    assert life.start(0, 1.0) == "cannot start while ready"
-    assert [life.takeoff(row) for row in (0, 1)] == ["", ""]
-    assert life.takeoff(0) == ""  # an order may be repeated when its reply was lost
-    robots.step()
-    (_, duties), *_ = robots.told
-    assert (duties.takeoff.tolist(), duties.land.tolist(), duties.stop.tolist()) == ([0, 1], [], [])
-    robots.until(AIRBORNE, row=1)
-    assert life.phase.tolist() == [READY, AIRBORNE]
-    robots.until(AIRBORNE, row=0)
-    assert robots.position[0, 2] == pytest.approx(HOVER)
-    begin = robots.t + 0.5
-    assert [life.start(row, begin) for row in (0, 1)] == ["", ""]
-    robots.until(RUNNING)
-    assert robots.tick - 1 == round(begin / DT)
-    assert life.all_running
-    assert not life.waiting
-    robots.until(LANDING)
-    assert robots.tick - 1 == round((begin + 2.0) / DT)
-    assert life.reason == ["finished", "finished"]
-    robots.until(DONE)
-    assert len(robots.told) == 2
-    assert life.takeoff(0) == "cannot take off while done: finished"
-    assert life.start(1, 9.0) == "cannot start while done"
+@pytest.mark.parametrize("flies", [True, False])
+def test_whole_life(flies):
+    robot = Life(flies, duration=2.0)
+    life = robot.life
+    assert life.takeoff() == "cannot take off while idle"
+    robot.step()
+    assert life.phase == READY
+    assert life.start(1.0) == "cannot start while ready"
+    assert life.takeoff() == life.takeoff() == ""  # an order may be repeated when its reply was lost
+    robot.step()
+    assert robot.told == ["takeoff"]
+    robot.until(AIRBORNE)
+    assert robot.height == pytest.approx(HOVER if flies else 0.0)
+    begin = robot.t + 0.5
+    assert life.start(begin) == ""
+    robot.until(RUNNING)
+    assert robot.tick - 1 == round(begin / DT)
+    robot.until(LANDING)
+    assert robot.tick - 1 == round((begin + 2.0) / DT)
+    robot.until(DONE)
+    assert life.reason == "finished"
+    assert robot.told == ["takeoff", "land"]
+    assert life.takeoff() == "cannot take off while done: finished"
+    assert life.start(9.0) == "cannot start while done"
 
 
-def airborne(flies=(True,), duration=5.0):
-    robots = Robots(flies, duration)
-    robots.step()
-    for row in range(len(flies)):
-        robots.life.takeoff(row)
-    robots.until(AIRBORNE)
-    return robots
+def airborne(*, flies=True):
+    robot = Life(flies, 5.0)
+    robot.step()
+    robot.life.takeoff()
+    return robot.until(AIRBORNE)
 
 
-def test_a_start_in_the_past_joins_what_is_under_way():
-    robots = airborne()
-    begin = robots.t - 3.0
-    robots.life.start(0, begin)
-    robots.step()
-    assert robots.life.phase[0] == RUNNING
-    robots.until(LANDING)
-    assert robots.tick - 1 == round((begin + 5.0) / DT)
+def test_start_in_the_past_joins():
+    robot = airborne()
+    begin = robot.t - 3.0
+    robot.life.start(begin)
+    robot.step()
+    assert robot.life.phase == RUNNING
+    robot.until(LANDING)
+    assert robot.tick - 1 == round((begin + 5.0) / DT)
 
 
-def test_a_start_after_the_end_lands():
-    robots = airborne()
-    robots.life.start(0, robots.t - 99.0)
-    robots.until(DONE)
-    assert robots.life.reason == ["finished"]
+def test_start_after_the_end_lands():
+    robot = airborne()
+    robot.life.start(robot.t - 99.0)
+    assert robot.until(DONE).life.reason == "finished"
 
 
-def test_land_in_the_same_tick_as_take_off_stays_on_the_ground():
-    robots = Robots([True])
-    robots.step()
-    robots.life.takeoff(0)
-    robots.life.land(0, "changed our mind")
-    robots.step()
-    robots.step()
-    (_, duties), *_ = robots.told
-    assert (duties.takeoff.tolist(), duties.land.tolist()) == ([], [0])
-    assert not robots.flying[0]
-    assert robots.life.phase[0] == DONE
+@pytest.mark.parametrize(("order", "told"), [("land", ["land"]), ("stop", ["stop"])])
+def test_order_in_the_tick_of_take_off(order, told):
+    robot = Life()
+    robot.step()
+    robot.life.takeoff()
+    robot.order(order)
+    robot.step()
+    robot.step()
+    assert robot.told == told
+    assert not robot.flying
+    assert robot.life.phase == DONE
 
 
-def test_stop_in_the_same_tick_as_take_off_stays_on_the_ground():
-    robots = Robots([True])
-    robots.step()
-    robots.life.takeoff(0)
-    robots.life.stop(0, "emergency")
-    robots.step()
-    (_, duties), *_ = robots.told
-    assert (duties.takeoff.tolist(), duties.stop.tolist()) == ([], [0])
-    assert robots.life.phase[0] == DONE
+def test_stop_in_the_tick_of_landing():
+    robot = airborne()
+    robot.told.clear()
+    robot.life.land("ordered to land")
+    robot.life.stop("ordered to stop")
+    robot.step()
+    assert robot.told == ["stop"]
 
 
-def test_stop_in_the_tick_of_landing_is_the_last_order():
-    robots = Robots([True])
-    robots.life.phase[:] = RUNNING
-    robots.life.land(0, "ordered to land")
-    robots.life.stop(0, "ordered to stop")
-    robots.step()
-    ((_, duties),) = robots.told
-    assert (duties.stop.tolist(), duties.land.tolist()) == ([0], [])
+def test_second_landing_keeps_the_first_reason():
+    robot = airborne()
+    robot.life.land("first")
+    robot.life.land("second")
+    robot.until(DONE)
+    assert robot.life.reason == "first"
+    assert robot.told.count("land") == 1
 
 
-def test_a_second_landing_keeps_the_first_reason():
-    robots = airborne()
-    robots.life.land(0, "first")
-    robots.life.land(0, "second")
-    robots.until(DONE)
-    assert robots.life.reason == ["first"]
-    assert sum(len(duties.land) for _, duties in robots.told) == 1
+@pytest.mark.parametrize(
+    ("speeds", "phases"), [((nan, nan), (LANDING, DONE)), ((0.2, 0.2, 0.05), (LANDING, LANDING, DONE))]
+)
+def test_wheels_are_done_when_they_stand(speeds, phases):
+    robot = airborne(flies=False)
+    robot.life.land("told to")
+    for speed, phase in zip(speeds, phases, strict=True):
+        robot.speed = (speed, 0.0, 0.0)
+        robot.step()
+        assert robot.life.phase == phase
 
 
-def test_a_ground_robot_whose_speed_nobody_knows_is_done_when_told_to_land():
-    robots = airborne([False])
-    robots.velocity[:] = np.nan
-    robots.life.land(0, "position lost")
-    for _ in range(3):
-        robots.life.advance(robots.t, robots.ready, robots.position, robots.velocity, robots.flying)
-    assert robots.life.phase[0] == DONE
+def test_climbing_waiting_and_running_are_active():
+    robot = Life()
+    robot.step()
+    assert not robot.life.active
+    robot.life.takeoff()
+    assert robot.life.active
+    robot.until(AIRBORNE)
+    assert robot.life.active
+    robot.life.start(robot.t)
+    robot.step()
+    assert robot.life.phase == RUNNING
+    assert robot.life.active
+    robot.life.land("told to")
+    assert not robot.life.active
+    assert robot.life.in_motion
 
 
-def test_a_ground_robot_is_done_when_it_stands():
-    robots = airborne([False])
-    robots.life.land(0, "told to")
-    for speed, phase in ((0.2, LANDING), (0.2, LANDING), (0.05, DONE)):
-        robots.velocity[0] = [speed, 0.0, 0.0]
-        robots.life.advance(robots.t, robots.ready, robots.position, robots.velocity, robots.flying)
-        assert robots.life.phase[0] == phase
-
-
-def test_whoever_climbs_waits_or_runs_is_active():
-    robots = Robots([True, True, True, False])
-    robots.step()
-    for row in (0, 1, 3):
-        robots.life.takeoff(row)
-    assert robots.life.active.tolist() == [True, True, False, True]
-    robots.until(AIRBORNE)
-    assert robots.life.active.tolist() == [True, True, False, True]
-    robots.life.start(0, robots.t)
-    robots.life.land(1, "told to")
-    robots.step()
-    assert robots.life.phase.tolist() == [RUNNING, LANDING, READY, AIRBORNE]
-    assert robots.life.active.tolist() == [True, False, False, True]
-
-
-def test_an_idle_robot_says_what_it_waits_for():
-    robots = Robots([True])
-    robots.ready[:] = False
-    robots.step()
-    robots.life.set_missing(0, "never heard KH01")
-    assert robots.life.takeoff(0) == "cannot take off while idle: never heard KH01"
-    robots.ready[:] = True
-    robots.step()
-    assert (robots.life.phase[0], robots.life.reason[0]) == (READY, "")
-    robots.life.set_missing(0, "too late to say")
-    assert robots.life.reason[0] == ""
+def test_idle_robot_tells_what_it_waits_for():
+    robot = Life()
+    robot.ready = False
+    robot.step()
+    robot.life.set_missing("never heard KH01")
+    assert robot.life.takeoff() == "cannot take off while idle: never heard KH01"
+    robot.ready = True
+    robot.step()
+    assert (robot.life.phase, robot.life.reason) == (READY, "")
+    robot.life.set_missing("too late to say")
+    assert robot.life.reason == ""
 
 
 def test_phases_have_words():
@@ -257,19 +231,30 @@ def test_phases_have_words():
     assert (IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE) == (0, 1, 2, 3, 4, 5)
 
 
-def test_who_was_ready_and_is_not_is_idle_again_unless_it_climbs():
-    robots = Robots([True, True, False])
-    robots.step()
-    assert robots.life.takeoff(1) == ""
-    robots.ready[:] = False
-    for row in range(3):
-        robots.life.set_missing(row, "its battery is low")
-    robots.step()
-    assert robots.life.phase.tolist() == [IDLE, READY, IDLE]
-    assert robots.life.reason == ["its battery is low", "", "its battery is low"]
-    assert robots.life.moved
-    assert robots.life.takeoff(0) == "cannot take off while idle: its battery is low"
-    robots.until(AIRBORNE, row=1)
-    robots.ready[:] = True
-    robots.step()
-    assert robots.life.phase.tolist() == [READY, AIRBORNE, READY]
+def test_ready_robot_may_become_idle():
+    robot = Life()
+    robot.step()
+    robot.ready = False
+    robot.life.set_missing("its battery is low")
+    robot.step()
+    assert (robot.life.phase, robot.life.reason, robot.life.moved) == (IDLE, "its battery is low", True)
+    assert robot.life.takeoff() == "cannot take off while idle: its battery is low"
+    robot.ready = True
+    robot.step()
+    assert robot.life.phase == READY
+
+
+def test_climbing_robot_stays_ready():
+    robot = Life()
+    robot.step()
+    assert robot.life.takeoff() == ""
+    robot.ready = False
+    robot.life.set_missing("its battery is low")
+    assert robot.until(AIRBORNE).life.reason == ""
+
+
+def test_failure_of_a_moment_refuses_take_off():
+    robot = Life()
+    robot.step()
+    robot.life.failing = "it is being lifted"
+    assert robot.life.takeoff() == "cannot take off now: it is being lifted"

@@ -1,125 +1,117 @@
-"""What is said: smoothed positions without lag, and nothing by those who do not know where they are."""
+"""Transmitted poses: smoothed without lag, and none of a robot that does not know where it is."""
 
-import math
+from math import dist, exp, floor, inf, isnan, log, nan, sqrt
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, TELLO
+from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
 from agents.decision.transmission import LowPass, Transmitter
-from agents.plugins.predictors import ConstantVelocity
-from agents.plugins.registry import PluginError
-from agents.plugins.triggers import SendOnDelta, Trigger
+from agents.plugins.predictors import HOLD, ConstantVelocity
+from agents.plugins.triggers import SendOnDelta
+from agents.vectors import NO_SETPOINT
 
 DT = 0.02
+STILL, LOST = (0.0, 0.0, 0.0), (nan, nan, nan)
 
 
-def say(voice, t, position, velocity=None):
-    rows = len(position)
-    zeros = np.zeros(rows)
-    still = np.zeros((rows, 3)) if velocity is None else velocity
-    return voice.transmit(t, position, still, error=zeros, energy=zeros, start=zeros, offset=np.zeros((rows, 3)))
+def say(transmitter, t, position, velocity=STILL):
+    return transmitter.transmits(t, position, velocity, 0.0, 0.0, t, STILL, NO_SETPOINT)
 
 
 @settings(max_examples=25)
 @given(st.floats(0.05, 2.0), st.floats(-0.5, 0.5))
-def test_the_low_pass_does_not_lag_behind_a_constant_velocity(constant, speed):
-    smooth, velocity = LowPass(1), np.array([[speed, 0.0, 0.0]])
+def test_low_pass_does_not_lag(constant, speed):
+    smooth, velocity = LowPass(KHEPERA4), (speed, 0.0, 0.0)
     for k in range(200):
-        position, moves = smooth.smooth(k * DT, velocity * (k * DT), velocity, constant)
-    np.testing.assert_allclose(position, velocity * (199 * DT), atol=1e-12)
-    np.testing.assert_allclose(moves, velocity, atol=1e-12)
+        smooth.smooth(k * DT, (speed * k * DT, 0.0, 0.0), velocity, constant, NO_SETPOINT)
+    assert smooth.position == pytest.approx((speed * 199 * DT, 0.0, 0.0), abs=1e-12)
+    assert smooth.velocity == pytest.approx(velocity, abs=1e-12)
 
 
-def test_the_low_pass_has_its_time_constant():
-    smooth, still = LowPass(1), np.zeros((1, 3))
-    smooth.smooth(0.0, still, still, 0.5)
-    step = np.array([[1.0, 0.0, 0.0]])
+def test_low_pass_has_its_time_constant():
+    smooth, step = LowPass(KHEPERA4), (1.0, 0.0, 0.0)
+    smooth.smooth(0.0, STILL, STILL, 0.5, NO_SETPOINT)
     for k in range(1, 51):
-        position, velocity = smooth.smooth(k * 0.01, step, step, 0.5)
+        smooth.smooth(k * 0.01, step, step, 0.5, NO_SETPOINT)
     # the speed carries it on as well, by 1 m/s · τ · (1 − 1/e)
-    assert velocity[0, 0] == pytest.approx(1.0 - math.exp(-1.0), rel=1e-9)
-    assert position[0, 0] == pytest.approx((1.0 - math.exp(-1.0)) * 1.5, rel=0.01)
+    assert smooth.velocity[0] == pytest.approx(1.0 - exp(-1.0), rel=1e-9)
+    assert smooth.position[0] == pytest.approx((1.0 - exp(-1.0)) * 1.5, rel=0.01)
 
 
-def test_the_low_pass_takes_away_what_wobbles():
-    rng = np.random.default_rng(1)
-    noise = rng.normal(0.0, 0.01, (3000, 4, 3))
-    smooth = LowPass(4)
-    said = np.array([smooth.smooth(k * DT, at, np.zeros((4, 3)), 0.4)[0] for k, at in enumerate(noise)])
-    share = 1.0 - math.exp(-DT / 0.4)
-    assert said[200:].std() == pytest.approx(0.01 * math.sqrt(share / (2.0 - share)), rel=0.05)
+def test_low_pass_takes_noise_away():
+    smooth, said = LowPass(KHEPERA4), []
+    for k, place in enumerate(np.random.default_rng(1).normal(0.0, 0.01, (6000, 3)).tolist()):
+        smooth.smooth(k * DT, tuple(place), STILL, 0.4, NO_SETPOINT)
+        said.append(smooth.position)
+    share = 1.0 - exp(-DT / 0.4)
+    assert np.std(said[200:]) == pytest.approx(0.01 * sqrt(share / (2.0 - share)), rel=0.1)
 
 
-def test_what_wobbles_is_carried_by_its_setpoints_and_follows_them_without_a_lag():
-    rng = np.random.default_rng(2)
-    response, speed = np.array([[CRAZYFLIE.response], [TELLO.response]]), 0.2
-    smooth, place, velocity, wobble = LowPass(2, (CRAZYFLIE, TELLO)), np.zeros((2, 3)), np.zeros((2, 3)), 0.0
-    said = []
-    for k in range(3000):
-        wobble = 0.96 * wobble + 0.28 * rng.normal(0.0, 0.01, (2, 3)) * [1.0, 1.0, 0.0]
-        asked = np.array([[speed, 0.0, 0.0]] * 2)
-        setpoint = np.zeros((2, 4))
-        setpoint[0, :3], setpoint[1, :3] = place[0] + asked[0] / response[0], asked[1]
-        position, said_velocity = smooth.smooth(k * DT, place + wobble, velocity + 9.0, 0.4, setpoint)
-        said.append(np.concatenate([position - place, said_velocity - asked], axis=1)[:, :2])
-        place = place + DT * asked
-    off = np.array(said)[1500:]
-    assert np.abs(off.mean(axis=0)).max() < 0.003
-    assert off.std(axis=0).max() < 0.009  # of a wobble of 0.01 m; its velocity would be 0.1 m/s and more
-    smooth = LowPass(1, (CRAZYFLIE,))
-    for k in range(200):  # who drives itself, while it takes off or lands, is believed what it measures
-        _, said_velocity = smooth.smooth(k * DT, np.zeros((1, 3)), np.full((1, 3), 0.3), 0.4, np.full((1, 4), np.nan))
-    np.testing.assert_allclose(said_velocity, [[0.3] * 3], atol=1e-3)
+@pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
+def test_drones_are_carried_by_their_setpoints(kind):
+    rng, speed, wobble = np.random.default_rng(2), 0.2, np.zeros(2)
+    smooth, off, x = LowPass(kind), [], 0.0
+    for k in range(9000):
+        wobble = 0.96 * wobble + 0.28 * rng.normal(0.0, 0.01, 2)
+        setpoint = (x + speed / kind.response, 0.0, 0.0, 0.0) if kind is CRAZYFLIE else (speed, 0.0, 0.0, 0.0)
+        measured = (x + float(wobble[0]), float(wobble[1]), 0.0)
+        smooth.smooth(k * DT, measured, (9.0 + speed, 9.0, 0.0), 0.4, setpoint)
+        off.append([smooth.position[0] - x, smooth.position[1]])
+        x += DT * speed
+    assert np.abs(np.mean(off[2000:], axis=0)).max() < 0.003
+    assert np.std(off[2000:], axis=0).max() < 0.009  # of a wobble of 0.01 m; its velocity would be 0.1 m/s and more
 
 
-def test_who_was_lost_begins_anew_where_it_is():
-    smooth, here, there = LowPass(2), np.zeros((2, 3)), np.ones((2, 3))
-    lost = np.array([[np.nan] * 3, [0.0] * 3])
-    smooth.smooth(0.0, here, here, 1.0)
-    assert np.isnan(smooth.smooth(DT, lost, here, 1.0)[0][0]).all()
-    position, _ = smooth.smooth(2 * DT, there, here, 1.0)
-    np.testing.assert_array_equal(position[0], there[0])
-    assert 0.0 < position[1, 0] < 0.1
+def test_drone_without_setpoints_is_believed():
+    smooth = LowPass(CRAZYFLIE)
+    for k in range(200):
+        smooth.smooth(k * DT, STILL, (0.3, 0.3, 0.3), 0.4, NO_SETPOINT)
+    assert smooth.velocity == pytest.approx((0.3, 0.3, 0.3), abs=1e-3)
 
 
-def test_what_is_judged_is_what_is_said():
-    voice = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=0.5), 1)
-    assert say(voice, 0.0, np.zeros((1, 3))).rows.tolist() == [0]
-    aside = np.array([[0.1, 0.0, 0.0]])
+def test_low_pass_begins_anew_after_a_loss():
+    smooth = LowPass(KHEPERA4)
+    for k, place in enumerate((STILL, LOST, (1.0, 1.0, 1.0))):
+        smooth.smooth(k * DT, place, STILL, 1.0, NO_SETPOINT)
+        assert smooth.position == place or (isnan(place[0]) and isnan(smooth.position[0]))
+    smooth.smooth(3 * DT, (2.0, 1.0, 1.0), STILL, 1.0, NO_SETPOINT)
+    assert 1.0 < smooth.position[0] < 1.1
+
+
+def test_smoothed_pose_is_judged_and_transmitted():
+    transmitter = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=0.5), HOLD, KHEPERA4)
+    assert say(transmitter, 0.0, STILL)
     quiet = 0
-    while not len((said := say(voice, (quiet + 1) * DT, aside)).rows):
+    while not say(transmitter, (quiet + 1) * DT, (0.1, 0.0, 0.0)):
         quiet += 1
-    assert quiet == math.floor(-0.5 * math.log(0.9) / DT)
-    np.testing.assert_array_equal(voice.last_event.position, said.position)
-    assert 0.01 < said.position[0, 0] < 0.0137
+    assert quiet == floor(-0.5 * log(0.9) / DT)
+    assert transmitter.position == transmitter.asking.last.position
+    assert 0.01 < transmitter.position[0] < 0.0137
 
 
-def test_who_does_not_know_where_it_is_says_nothing():
-    voice = Transmitter(SendOnDelta(), 2)
-    said = say(voice, 0.0, np.array([[np.nan] * 3, [0.0] * 3]))
-    assert said.rows.tolist() == [1]
-    assert voice.last_event.time.tolist() == [-np.inf, 0.0]
+def test_unknown_place_is_not_transmitted():
+    transmitter = Transmitter(SendOnDelta(), HOLD, KHEPERA4)
+    assert not say(transmitter, 0.0, LOST)
+    assert transmitter.asking.last.time == -inf
+    assert say(transmitter, DT, STILL)
 
 
-def test_a_trigger_that_fails_is_named():
-    class Broken(Trigger, frozen=True):
-        def fires(self, view, memory):
-            return view.nothing
+@pytest.mark.parametrize("smoothing_s", [0.0, 0.5])
+@pytest.mark.parametrize("velocity", [LOST, (60.0, 0.0, 0.0), (inf, 0.0, 0.0)])
+def test_unknown_velocity_counts_as_standing(smoothing_s, velocity):
+    transmitter = Transmitter(SendOnDelta(threshold=0.01, smoothing_s=smoothing_s), ConstantVelocity(), KHEPERA4)
+    assert say(transmitter, 0.0, STILL, velocity)
+    assert all(map(isnan, transmitter.velocity))
+    assert transmitter.asking.last.velocity == STILL
+    assert say(transmitter, 4.0, (1.0, 0.0, 0.0), velocity)
 
-    with pytest.raises(PluginError, match=r"the trigger Broken failed: AttributeError.* \(.*\.py:\d+\)$"):
-        say(Transmitter(Broken(), 1), 0.0, np.zeros((1, 3)))
 
-
-def test_an_unknown_velocity_is_said_as_unknown_and_counts_as_standing():
-    position, velocity = np.zeros((2, 3)), np.array([[np.nan] * 3, [0.1, 0.0, 0.0]])
-    for trigger in (SendOnDelta(threshold=0.01), SendOnDelta(threshold=0.01, smoothing_s=0.5)):
-        voice = Transmitter(trigger, 2, ConstantVelocity())
-        said = say(voice, 0.0, position, velocity)
-        assert said.rows.tolist() == [0, 1]
-        np.testing.assert_array_equal(said.velocity, velocity)
-        np.testing.assert_array_equal(voice.last_event.velocity, [[0.0] * 3, [0.1, 0.0, 0.0]])
-        moved = np.array([[1.0, 0.0, 0.0], [DT * 0.1, 0.0, 0.0]])
-        assert say(voice, DT, moved, velocity).rows.tolist() == [0]
+def test_believed_motion_is_not_transmitted():
+    transmitter = Transmitter(SendOnDelta(threshold=0.01), ConstantVelocity(), KHEPERA4)
+    assert say(transmitter, 0.0, STILL, (0.1, 0.0, 0.0))
+    assert transmitter.velocity == (0.1, 0.0, 0.0)
+    assert not say(transmitter, DT, (0.1 * DT, 0.0, 0.0), (0.1, 0.0, 0.0))
+    assert dist(transmitter.position, (0.1 * DT, 0.0, 0.0)) == 0.0

@@ -1,66 +1,38 @@
-"""Anchors pull to points, lines and planes by the gradient that they claim, row by row."""
+"""Anchors pull to points, lines and planes by the gradient that they claim."""
 
-import numpy as np
+from math import sqrt
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.anchors import Anchors
-from tests.agents.plugins.test_laws import slope_of
+from agents.formation.anchors import Anchor
+from agents.vectors import norm
+from tests.agents.plugins.test_laws import VECTOR, slope
 
-FEW = settings(max_examples=25)
-
-
-def some(seed, count=6, rows=4):
-    """Anchors of each sort, half of them at a distance of 0."""
-    rng = np.random.default_rng(seed)
-    axis = rng.normal(size=(count, 3))
-    sort = np.arange(count) % 3
-    anchors = Anchors(
-        row=rng.integers(0, rows, count),
-        point=rng.uniform(-1, 1, (count, 3)),
-        axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        whole=np.where(sort == 2, 0.0, 1.0),
-        along=np.array([0.0, -1.0, 1.0])[sort],
-        distance=np.where(np.arange(count) < count // 2, 0.0, rng.uniform(0.2, 1.0, count)),
-        gain=rng.uniform(0.5, 3.0, count),
-    )
-    return rng.uniform(-1, 1, (rows, 3)), anchors
+SORTS = {"point": (1.0, 0.0), "line": (1.0, -1.0), "plane": (0.0, 1.0)}  # `whole` and `along`
+SORT = pytest.mark.parametrize("sort", SORTS)
 
 
-@FEW
-@given(st.integers(0, 2**31))
-def test_the_pull_is_a_gradient(seed):
-    position, anchors = some(seed)
+@SORT
+@pytest.mark.parametrize("distance", [0.0, 0.7])
+@settings(max_examples=25)
+@given(st.tuples(VECTOR, VECTOR, VECTOR.filter(lambda v: norm(v) > 0.1)), st.floats(0.5, 3.0))
+def test_pull_is_a_gradient(sort, distance, vectors, gain):
+    place, point, axis = vectors
+    length = norm(axis)
+    anchor = Anchor(point, tuple(each / length for each in axis), *SORTS[sort], distance, gain)
 
-    def potential(place):
-        square = (anchors.displacement(place) ** 2).sum(axis=1)
-        ring = anchors.gain / 8.0 * (anchors.distance**2 - square) ** 2
-        return np.where(anchors.distance > 0.0, ring, anchors.gain / 2.0 * square).sum()
+    def potential(position):
+        square = norm(anchor.displacement(position)) ** 2
+        return gain / 8.0 * (distance**2 - square) ** 2 if distance > 0.0 else gain / 2.0 * square
 
-    np.testing.assert_allclose(anchors.offset(position), -slope_of(potential, position), atol=1e-6)
-
-
-@FEW
-@given(st.integers(0, 2**31))
-def test_a_row_gets_what_it_gets_in_every_copy(seed):
-    position, anchors = some(seed)
-    whole = anchors.offset(position)
-    twice = anchors.repeated(2, len(position)).offset(np.tile(position, (2, 1)))
-    np.testing.assert_array_equal(twice, np.tile(whole, (2, 1)))
+    assert anchor.pull(place) == pytest.approx([-s for s in slope(potential, place)], rel=1e-5, abs=1e-6)
+    assert anchor.error(place) == abs(distance - norm(anchor.displacement(place)))
 
 
-@pytest.mark.parametrize(
-    ("whole", "along", "distance"),
-    [(1.0, 0.0, np.sqrt(14.0)), (1.0, -1.0, np.sqrt(5.0)), (0.0, 1.0, 3.0)],
-    ids=["point", "line", "plane"],
-)
-def test_distances_to_the_origin_to_the_z_axis_and_to_the_floor(whole, along, distance):
-    one = np.ones(1)
-    anchors = Anchors(
-        np.zeros(1, dtype=np.intp), np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]),
-        whole * one, along * one, distance * one, one,
-    )  # fmt: skip
-    place = np.array([[1.0, 2.0, 3.0]])
-    np.testing.assert_allclose(anchors.error(place), 0.0, atol=1e-15)
-    np.testing.assert_allclose(anchors.offset(place), 0.0, atol=1e-13)
+@pytest.mark.parametrize(("sort", "distance"), [("point", sqrt(14.0)), ("line", sqrt(5.0)), ("plane", 3.0)])
+def test_distance_to_origin_axis_and_floor(sort, distance):
+    anchor = Anchor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), *SORTS[sort], distance, 1.0)
+    assert anchor.error((1.0, 2.0, 3.0)) == pytest.approx(0.0, abs=1e-15)
+    assert anchor.pull((1.0, 2.0, 3.0)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-13)
