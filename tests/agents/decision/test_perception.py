@@ -10,10 +10,6 @@ from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
-<<<<<<< HEAD
-from experiments.definition.graph import links
-=======
->>>>>>> b9ba2a1 (Tests of decisions and of the channel for one robot)
 from agents.plugins.avoidance import Avoidance
 from agents.safety.situation import Situation
 

@@ -7,16 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-<<<<<<< HEAD
-from agents.formation.changes import Change, NewTargets, Presence, Reshaping, changed_targets, progress
-from experiments.definition.graph import Links
-from tests.agents.plugins.test_laws import told_more
-=======
 from agents.formation.changes import Change, Target, change_target, exists, planned_at, progress
 from agents.formation.link import BY_DISTANCE, Link
 from agents.vectors import UNKNOWN, norm
 from tests.agents.plugins.test_laws import BEARING, VECTOR
->>>>>>> b9ba2a1 (Tests of decisions and of the channel for one robot)
 
 FEW = settings(max_examples=50)
 TIME = st.floats(10.0, 14.0)
