@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 NOTEBOOKS: Final = ("experiments.run",)
 FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
-    "agents.arrays",
-    "experiments.definition.graph",
+    "agents.vectors",
+    "agents.formation.link",
     "agents.plugins.laws",
     "agents.plugins.triggers",
     "agents.plugins.predictors",

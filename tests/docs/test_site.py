@@ -1,6 +1,5 @@
 """The documentation site: builds without a warning, has every page, and its reference has every key."""
 
-import dataclasses
 import os
 import re
 import subprocess
@@ -11,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from agents.body.interface import BodyRequest, BodyState
-from experiments.definition.graph import Links
+from agents.formation.link import Link
+from agents.plugins.triggers import View
 from experiments.file import reference
 from experiments.metrics.results import RobotMetrics
 from experiments.recording.topics import TOPICS
@@ -94,5 +94,5 @@ def test_the_reference_has_every_key_command_topic_and_column(site):
     assert not [name for name, words in pages.items() if "&lt;" in words or "None \\|" in words or "\\| None" in words]
     assert "park/CF01/pose" in text(site / "reference" / "network.html")
     api = text(site / "reference" / "api.html")
-    fields = [each.name for made in (BodyRequest, BodyState) for each in dataclasses.fields(made)]
-    assert not {"simulate", *Links.__annotations__, *fields} - set(api.split())
+    fields = {name for made in (BodyRequest, BodyState, Link, View) for name in made.__annotations__}
+    assert not {"simulate", *fields} - set(api.split())
