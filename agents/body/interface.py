@@ -150,7 +150,8 @@ class Body(Protocol):
     def read(self, t: float) -> Sequence[BodyState]:
         """The newest state of each robot at time `t` [s] of the process's clock. Never blocks; a twin advances to `t`.
 
-        The states may be the same objects at every call, and others write to them: the body sets its `note` each time.
+        The states may be the same objects at every call, and others write to them: the body sets `velocity` and `note`
+        each time.
         """
         ...
 
