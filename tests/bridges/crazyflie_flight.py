@@ -89,7 +89,7 @@ def flown(rows=1, *, device=None, external=False, start=None, serve=None, **faul
 
 def truth(twin, row=0):
     """Where a twin really is [m]."""
-    return tuple(map(float, twin.truth()[0][row]))
+    return twin.truth()[0][row]
 
 
 def supervised(twin, row=0):

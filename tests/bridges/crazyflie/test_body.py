@@ -215,7 +215,7 @@ def test_external_position():
         tick = process.tick
 
         def located():
-            process.body.locate(0, process.t, truth(twin), 0.0)
+            process.body.locate(0, process.t, tuple(truth(twin).tolist()), 0.0)
             return tick()
 
         process.tick = located

@@ -153,7 +153,7 @@ def test_a_gap_of_the_radio_that_carries_motion_capture():
         tick = process.tick
 
         def located():
-            process.body.locate(0, process.t, truth(twin), 0.0)
+            process.body.locate(0, process.t, tuple(truth(twin).tolist()), 0.0)
             return tick()
 
         process.tick = located
@@ -204,7 +204,7 @@ def test_setpoints_go_on_beside_external_positions():
 
         def located():
             for row in range(2):
-                process.body.locate(row, process.t, truth(twin, row), 0.0)
+                process.body.locate(row, process.t, tuple(truth(twin, row).tolist()), 0.0)
             return tick()
 
         process.tick = located
