@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
 from agents.decision.neighbours import NeighbourStates
-from experiments.definition.graph import links
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
+from experiments.definition.graph import links
 from experiments.real_time.hosts.launcher import Launcher
 from tests.agents.things import poses
 

@@ -23,17 +23,17 @@ def test_run_ends_beside_a_robot_below():
     links = {"G > F": 0.8, "H > F": 0.4}
     swarm = Swarm(Experiment(title="over", duration_s=3.0, robots=robots, formation=Formation(links=links)))
     swarm.running()
-    agent = swarm.agent("F")
+    robot = swarm.robot("F")
     swarm.until(LANDING)
     waited = False
     while swarm.phase("F") != DONE:
         assert swarm.since < 15.0
         swarm.step()
-        waited |= agent.landing.aside
-    gap = dist(swarm.row("F", "truth")[:2], swarm.row("G", "truth")[:2])
+        waited |= robot.landing.aside
+    gap = dist(swarm.last("F", "truth")[:2], swarm.last("G", "truth")[:2])
     assert waited
     assert gap > 0.09
-    told = [each.text for each in agent.hazards.incidents if each.cause == Cause.BELOW]
+    told = [each.text for each in robot.hazards.incidents if each.cause == Cause.BELOW]
     assert told[0] == "warn: a robot is below it: G; it goes aside first"
     assert swarm.phase("G") == DONE
 
@@ -52,17 +52,16 @@ def test_drone_lands_beside_robot_that_died_moving(trigger):
             trigger={"kind": trigger, "threshold": 0.01},
             avoidance={"kind": "barrier", "hears": "all"},
             timeline=[leg],
-        ),
-        [["F"], ["K"]],
+        )
     ).running()
-    while swarm.row("K", "truth")[0] < -0.02:
+    while swarm.last("K", "truth")[0] < -0.02:
         swarm.step()
-    dead, agent = swarm.where["K"][0], swarm.agent("F")
-    place = swarm.row("K", "truth")[:2]
+    dead, robot = swarm.where["K"][0], swarm.robot("F")
+    place = swarm.last("K", "truth")[:2]
     swarm.groups.remove(dead)
     swarm.names = ("F",)
-    agent.neighbours.mark_lost(0, swarm.t)
+    robot.neighbours.mark_lost(0, swarm.t)
     swarm.run(3.0)
-    agent.lifecycle.land("ordered to land")
+    robot.lifecycle.land("ordered to land")
     swarm.until(DONE)
-    assert dist(swarm.row("F", "truth")[:2], place) - CRAZYFLIE.radius - KHEPERA4.radius > NEAR
+    assert dist(swarm.last("F", "truth")[:2], place) - CRAZYFLIE.radius - KHEPERA4.radius > NEAR

@@ -1,6 +1,7 @@
 """Robots of all kinds that are told to go beyond a wall, the ceiling or the floor stop before it."""
 
-import numpy as np
+from math import inf, nan
+
 import pytest
 
 from agents.body.interface import Disturbance
@@ -8,7 +9,7 @@ from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Formation, Robot
 from tests.agents.few import pair
-from tests.agents.swarm import Group
+from tests.agents.swarm import Swarm
 
 HOVER = 0.8
 WALLS = [(kind, axis, side) for kind in KINDS for axis, side in ((0, 1.0), (1, -1.0))]
@@ -20,36 +21,38 @@ def farthest(kind: str, axis: int, side: float, latency_s: float = 0.0) -> float
     start = [0.1, 0.1]
     if axis < 2:
         start[axis] = side
-    robot = Robot(kind=kind, start=start, **({"hover": HOVER} if KINDS[kind].flies else {}))
+    member = Robot(kind=kind, start=start, **({"hover": HOVER} if KINDS[kind].flies else {}))
     disturbed = {"all": Disturbance(latency_s=latency_s)} if latency_s else {}
-    experiment = pair(
-        robots={"R": robot}, formation=Formation(), architecture="centralised", disturbance=disturbed, duration_s=30.0
-    )
-    group = Group(experiment, ["R"])
-    agent, limits = group.agent, group.assignment.limits
-    goal = np.array([[0.0, 0.0, HOVER]])
+    swarm = Swarm(
+        pair(
+            robots={"R": member}, formation=Formation(), architecture="centralised", disturbance=disturbed,
+            duration_s=30.0,
+        )
+    )  # fmt: skip
+    robot = swarm.robot("R")
+    limits = robot.assignment.limits
     wall = (limits.high if side > 0.0 else limits.low)[axis]
-    goal[0, axis] = wall + 0.9 * side
-    reached, dt = -np.inf, 1.0 / experiment.rates.body_hz
-    for tick in range(round(9.0 / dt)):
-        t = tick * dt
+    goal = [0.0, 0.0, HOVER]
+    goal[axis] = wall + 0.9 * side
+    reached = -inf
+    for tick in range(round(9.0 / swarm.dt)):
         if tick % 10 == 0:
-            agent.guidance.receive(np.array([0]), goal, np.array([np.nan]), np.array([t]))
-        group.step(t)
-        agent.lifecycle.takeoff(0)
-        if not np.isfinite(agent.lifecycle.start_at[0]):
-            agent.start(0, t + 0.1)
-        if agent.lifecycle.phase[0] == RUNNING:
-            reached = max(reached, side * (group.state.true_position[0, axis] - wall))
-    assert agent.lifecycle.phase[0] == RUNNING, agent.lifecycle.reason[0]
+            robot.guidance.receive(tuple(goal), nan, swarm.t)
+        swarm.step()
+        robot.lifecycle.takeoff()
+        if robot.lifecycle.start_at == inf:
+            robot.start(swarm.t + 0.1)
+        if swarm.phase("R") == RUNNING:
+            reached = max(reached, side * (swarm.last("R", "truth")[axis] - wall))
+    assert swarm.phase("R") == RUNNING, robot.lifecycle.reason
     return reached
 
 
 @pytest.mark.parametrize(("kind", "axis", "side"), WALLS)
-def test_nobody_gets_beyond_a_wall(kind, axis, side):
+def test_no_robot_gets_beyond_a_wall(kind, axis, side):
     assert -0.1 < farthest(kind, axis, side) < 0.001
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nor_where_commands_take_effect_late(kind):
+def test_late_commands_keep_before_walls(kind):
     assert -0.1 < farthest(kind, 0, 1.0, latency_s=0.15) < 0.001

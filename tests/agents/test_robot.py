@@ -1,0 +1,282 @@
+"""The decision of a robot: received poses, neighbours that go and come back, orders, formations, leaders and plans."""
+
+from math import dist, inf, nan
+
+import pytest
+
+from agents.decision.lifecycle import AIRBORNE, IDLE, READY, RUNNING
+from agents.network.messages import Order
+from agents.runtime.orders import carry_out
+from experiments.definition.experiment import Formation, Leg, Robot, Start
+from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
+from tests.agents.few import pair, triangle
+from tests.agents.swarm import Swarm
+
+HERE = (-0.4, 0.0, 0.0)
+
+# ---------------------------------------------------------------- received poses
+
+
+def alone(experiment=None):
+    """The decision of A; B is on link 0."""
+    return Bench(Plan(experiment or pair()).assignment("A"), HERE)
+
+
+def test_older_samples_are_left_out():
+    bench = alone()
+    (sender,) = bench.neighbours.all
+    for x, stamp in ((1.0, 2.0), (9.0, 1.0), (9.0, 2.0)):
+        bench.hear(0, (x, 0.0, 0.0), stamp=stamp)
+    assert (sender.position, sender.stamp) == ((1.0, 0.0, 0.0), 2.0)
+    bench.hear(0, (0.5, 0.0, 0.0), stamp=2.5)
+    assert (sender.position, sender.stamp) == ((0.5, 0.0, 0.0), 2.5)
+
+
+def test_nothing_is_known_of_unreceived_robots():
+    (sender,) = Swarm(pair(), [["A"]]).robot("A").neighbours.all
+    assert sender.position[0] != sender.position[0]
+    assert (sender.stamp, sender.arrival) == (-inf, -inf)
+
+
+def test_missing_neighbour_is_named():
+    bench = alone()
+    bench.step()
+    assert (bench.life.phase, bench.life.reason) == (IDLE, "never heard B")
+    assert bench.robot.missing_neighbours() == ["B"]
+    bench.position = (nan, 0.0, 0.0)
+    assert bench.step().life.reason == "no position of its own"
+    bench.position, bench.values["time"] = HERE, bench.t - 0.6
+    assert bench.step().life.reason == "no position of its own"  # too old
+    del bench.values["time"]
+    bench.hear(0, (0.4, 0.1, 0.0))
+    bench.step()
+    assert (bench.life.phase, bench.life.reason) == (READY, "")
+    assert bench.robot.missing_neighbours() == []
+    bench.neighbours.mark_lost(0, bench.t)
+    assert bench.robot.missing_neighbours() == ["B"]
+
+
+def test_patience_ends():
+    bench = alone(pair(start=Start(deadline_s=2.0, missing="go-on"))).step(2.0)
+    assert bench.life.phase == IDLE
+    assert bench.step(0.02).life.phase == READY
+
+
+def test_unknown_position_is_not_transmitted():
+    bench = alone()
+    bench.position = (nan, 0.0, 0.0)
+    bench.step()
+    bench.position = HERE
+    assert bench.step().said == []  # asked on every second tick
+    bench.step()
+    assert bench.said == [0.02]
+
+
+# ---------------------------------------------------------------- neighbours that go and come back
+
+
+def active(swarm, name="A"):
+    """Senders that enter the law of a robot."""
+    return [sender.name for sender in swarm.robot(name).neighbours.all if sender.active]
+
+
+def test_lost_neighbour_is_left_out_until_found():
+    swarm = Swarm(triangle()).running().run(0.5)
+    assert active(swarm) == ["B", "C"]
+    swarm.lose("B", "A")
+    swarm.run(1.0)
+    assert active(swarm) == ["B", "C"]
+    swarm.run(0.02)
+    assert active(swarm) == ["C"]
+    assert swarm.robot("A").missing_neighbours() == ["B"]
+    before = swarm.last("A", "goal")
+    assert swarm.run(0.1).last("A", "goal") != before  # it still follows C
+    swarm.find("B", "A")
+    swarm.step()
+    assert active(swarm) == ["B", "C"]
+
+
+def test_pose_does_not_bring_a_neighbour_back():
+    swarm = Swarm(triangle()).running().run(0.5)
+    swarm.lose("B", "A", since=5.0)
+    swarm.muted.clear()
+    swarm.run(0.04)
+    assert swarm.robot("A").neighbours.all[0].arrival > swarm.t - 0.03
+    assert active(swarm) == ["C"]
+
+
+def test_unreceived_neighbour_hides_no_lost_one():
+    bench = alone(triangle(start=Start(deadline_s=0.1, missing="go-on")))  # B is never received
+
+    def hear(bench):
+        bench.hear(1, (0.0, -0.5, 0.0))
+
+    bench.step(0.3, hear)
+    bench.running(hear)
+    assert [sender.active for sender in bench.neighbours.all] == [False, True]
+    bench.neighbours.mark_lost(1, bench.t)
+    bench.step(1.7)
+    assert not any(sender.active for sender in bench.neighbours.all)
+    assert bench.robot.goal == HERE  # alone: it holds
+
+
+def test_robot_alone_holds_its_place():
+    swarm = Swarm(pair()).running().run(0.5)
+    moving = swarm.last("A", "goal")
+    swarm.lose("B", "A")
+    held = swarm.run(1.2).last("A", "goal")
+    assert held != moving
+    assert swarm.run(1.0).last("A", "goal") == held
+    assert dist(swarm.last("A", "truth"), held) < 0.02
+    swarm.find("B", "A")
+    assert swarm.run(0.2).last("A", "goal") != held
+
+
+def test_robot_without_router_holds_and_goes_on():
+    swarm = Swarm(pair()).running().run(0.5)
+    health = swarm.robot("A").health
+    health.offline_since = swarm.t
+    busy = swarm.run(1.0).last("A", "goal")
+    held = swarm.run(0.2).last("A", "goal")
+    assert held != busy
+    assert swarm.run(0.5).last("A", "goal") == held
+    health.offline_since = inf
+    assert swarm.run(0.2).last("A", "goal") != held
+
+
+def test_swapped_robots_are_refused():
+    """Each stands where the other one begins: neither takes off, and each names the mistake."""
+    places = {"A": (0.15, 0.0, 0.0), "B": (-0.1, 0.0, 0.0)}
+    robots = {"A": Robot(kind="khepera4", start=[-0.1, 0.0]), "B": Robot(kind="khepera4", start=[0.15, 0.0])}
+    swarm = Swarm(pair(robots=robots))
+    for name, place in places.items():
+        swarm.spoil(name, lambda state, place=place: setattr(state, "position", place))
+    swarm.run(1.0)
+    for name, other in (("A", "B"), ("B", "A")):
+        life = swarm.robot(name).lifecycle
+        assert life.phase == IDLE
+        assert life.reason == f"it stands where {other} begins: addresses or markers are swapped"
+        assert life.takeoff()
+
+
+# ---------------------------------------------------------------- orders
+
+
+def test_hold_and_start_again():
+    swarm = Swarm(pair())
+    robot = swarm.robot("A")
+    swarm.step()
+    assert robot.hold() == "cannot hold while idle"
+    swarm.running().run(0.3)
+    assert robot.hold() == ""
+    held = swarm.run(0.2).last("A", "goal")
+    assert swarm.run(0.5).last("A", "goal") == held
+    assert swarm.phase("A") == RUNNING
+    assert robot.start(0.0) == ""
+    assert swarm.run(0.2).last("A", "goal") != held
+    assert robot.lifecycle.start_at == swarm.start_at
+
+
+def test_leader_goes_where_it_is_sent():
+    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.5})))
+    leader, order = swarm.robot("L"), Order("go", goal=(0.2, 0.1))
+    assert "cannot go anywhere while idle" in carry_out(leader, order, 0.0, 0.0)[0]
+    swarm.running()
+    for wrong, why in (
+        (Order("go", goal=(9.0, 0.0)), "outside the arena"),
+        (Order("go"), "needs a `goal`"),
+        (Order("go", goal=(nan, 0.0)), "needs a `goal`"),
+    ):
+        assert why in carry_out(leader, wrong, swarm.t, 0.0)[0]
+    assert "only a leader" in carry_out(swarm.robot("F"), order, swarm.t, 0.0)[0]
+    assert carry_out(leader, order, swarm.t, 0.0) == ("", None)
+    gone = dist(swarm.run(0.5).last("L", "goal"), (0.0, 0.0, 0.0))
+    assert 0.0 < gone < 0.5 * 0.5 * 0.28  # it goes at half its speed, not at once
+    assert dist(swarm.run(8.0).last("L", "truth"), (0.2, 0.1, 0.0)) < 0.01
+    carry_out(leader, Order("go", goal=(0.0, 0.1)), swarm.t, 0.0)
+    assert dist(swarm.run(8.0).last("L", "truth"), (0.0, 0.1, 0.0)) < 0.01
+
+
+# ---------------------------------------------------------------- formations, leaders, plans
+
+
+def test_pair_comes_to_its_distance():
+    swarm = Swarm(pair()).running().run(25.0)
+    apart = dist(swarm.last("A", "truth"), swarm.last("B", "truth"))
+    assert apart == pytest.approx(0.5, abs=0.012)  # both stand within 5 mm of their goals
+    assert swarm.last("A", "error") == pytest.approx(abs(apart - 0.5), abs=1e-9)
+    assert swarm.robot("A").decisions == 251  # at 0 and at 25 s
+
+
+def test_decisions_and_questions_keep_their_rates():
+    swarm = Swarm(pair()).running()
+    begin = swarm.tick
+    goals = swarm.run(2.0).column("A", "goal", begin - 1)
+    changes = [k for k in range(1, len(goals)) if goals[k] != goals[k - 1]]
+    assert all(k % 10 == 0 for k in changes)
+    assert len(changes) >= 15
+    asked = [tick - begin + 1 for tick, name in swarm.sent if tick >= begin and name == "A"]
+    assert asked == list(range(2, 201, 2))
+
+
+def test_steps_of_goals_are_clamped():
+    swarm = Swarm(pair(formation=Formation(links={"A - B": 0.5}, gain=50.0, clamp=0.07))).running().run(0.05)
+    goal, place = swarm.last("A", "goal"), swarm.log[-5]["A"]["position"]
+    assert goal[0] - place[0] == pytest.approx(0.07, abs=0.01)
+    assert max(abs(a - b) for a, b in zip(goal, place, strict=True)) < 0.075
+
+
+@pytest.mark.parametrize("kind", ["khepera4", "crazyflie", "tello"])
+def test_leader_follows_its_plan(kind):
+    hover = None if kind == "khepera4" else 0.6
+    robots = {"L": Robot(kind=kind, start=[0.0, 0.0], hover=hover), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
+    legs = [Leg(at_s=1.0, robot="L", plan=plan)]
+    swarm = Swarm(pair(robots=robots, formation=Formation(links={"L > F": 0.8}), timeline=legs)).running()
+    begin = swarm.last("L", "goal")
+    assert begin == pytest.approx((0.0, 0.0, hover or 0.0), abs=1e-9)
+    for seconds, way, slack in ((1.0, 0.0, 1e-9), (2.0, 0.2, 0.0101), (6.0, 0.3, 1e-9)):
+        goal = swarm.run(seconds).last("L", "goal")
+        assert goal == pytest.approx((begin[0] + way, *begin[1:]), abs=slack)
+    assert swarm.last("L", "truth") == pytest.approx((begin[0] + 0.3, *begin[1:]), abs=0.006)
+
+
+@pytest.mark.slow
+def test_follower_with_a_plan_is_pulled_by_both():
+    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0]), "F": Robot(kind="khepera4", start=[-0.5, 0.0])}
+    formation = Formation(links={"L > F": 0.5}, tracking_gain=3.0)
+    legs = [Leg(at_s=0.0, robot="F", plan={"kind": "hold", "at": [0.0, 0.5]})]
+    place = Swarm(pair(robots=robots, formation=formation, timeline=legs)).running().run(40.0).last("F", "truth")
+    assert dist(place, (0.0, 0.5, 0.0)) < 0.2  # the pull ends with the third power of what is left
+    assert dist(place, (0.0, 0.0, 0.0)) == pytest.approx(0.5, abs=0.02)
+
+
+def test_robot_without_links_and_plan_stays():
+    place = Swarm(triangle()).running().run(5.0).last("C", "truth")
+    assert place == pytest.approx((0.0, -0.5, 0.0), abs=1e-9)
+
+
+def test_late_robot_joins_its_plan():
+    plan = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.1}
+    robots = {"L": Robot(kind="khepera4", start=[0.0, 0.0])}
+    swarm = Swarm(pair(robots=robots, formation=Formation(), timeline=[Leg(at_s=1.0, robot="L", plan=plan)]))
+    swarm.run(0.05)
+    robot = swarm.robot("L")
+    robot.lifecycle.takeoff()
+    swarm.run(0.05)
+    assert swarm.phase("L") == AIRBORNE
+    assert robot.start(swarm.t - 3.0) == ""
+    swarm.step()
+    assert (swarm.phase("L"), robot.tick, robot.decisions) == (RUNNING, 301, 1)
+    assert swarm.last("L", "goal") == pytest.approx((0.2, 0.0, 0.0), abs=1e-9)
+
+
+def test_skipped_ticks_skip_no_decision():
+    swarm = Swarm(pair()).running().run(0.45)
+    robot = swarm.robot("A")
+    before = robot.decisions
+    robot.skip_ticks(12)
+    swarm.step()
+    assert robot.decisions == before + 1
