@@ -169,7 +169,7 @@ class Potential(Avoidance, frozen=True):
 
     reach: Annotated[Positive, Meta(description="d0, from surface to surface [m]")] = 0.30
     strength: Annotated[Positive, Meta(description="η [N m³], of all forces alike")] = 1.5e-4
-    velocity: Annotated[Positive, Meta(description="v [m/s]; inf: the robot's limit of speed")] = inf
+    velocity: Annotated[Positive, Meta(description="v [m/s]; left out: the robot's limit of speed")] = inf
     period_s: Annotated[NotNegative, Meta(description="h [s]; 0: 1/response of the robot's kind")] = 0.0
 
     def push(self, gap: float) -> float:

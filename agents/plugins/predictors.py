@@ -56,7 +56,9 @@ class ConstantVelocity(Predictor, frozen=True):
     last message was lost runs away until its next message.
     """
 
-    horizon_s: Annotated[Positive, Meta(description="the last velocity is used for this long [s]; inf: for ever")] = inf
+    horizon_s: Annotated[
+        Positive, Meta(description="the last velocity is used for this long [s]; left out: for ever")
+    ] = inf
 
     def position(self, pose: Sent, age: float) -> Vector:
         seconds = min(max(age, 0.0), self.horizon_s)

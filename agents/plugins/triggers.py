@@ -79,9 +79,9 @@ class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     MEMORY: ClassVar[Mapping[str, float]] = {}  # what it remembers from question to question, with its first values
 
     minimum_interval_s: Annotated[NotNegative, Meta(description="shortest time between two events [s]")] = 0.0
-    maximum_silence_s: Annotated[Positive, Meta(description="longest time between two events [s]; inf: unlimited")] = (
-        inf
-    )
+    maximum_silence_s: Annotated[
+        Positive, Meta(description="longest time between two events [s]; left out: unlimited")
+    ] = inf
     evaluate_every_s: Annotated[
         NotNegative, Meta(description="period of the condition's evaluation [s]; 0: at every question")
     ] = 0.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import combinations
+from math import inf
 from pathlib import Path as File
 from typing import Any, Final
 
@@ -143,8 +144,10 @@ def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _draft7(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Tuples as draft 7 writes them."""
+    """Tuples as draft 7 writes them; an infinite default, which no file can have, is none."""
     result = _map_children(node, _draft7)
+    if result.get("default") == inf:
+        del result["default"]
     if "prefixItems" in result:
         result["items"], result["additionalItems"] = result.pop("prefixItems"), False
     return result

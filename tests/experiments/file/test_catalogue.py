@@ -13,8 +13,8 @@ import pytest
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.catalogue import index
-from experiments.definition.rigidity import rigidity
 from experiments.definition.graph import edges, links
+from experiments.definition.rigidity import rigidity
 from experiments.file import catalogue as entries
 from experiments.file import json_schema
 from experiments.file.document import DocumentError, read
@@ -156,6 +156,19 @@ def test_schema_takes_what_the_parser_takes(old, new, taken, tmp_path):
     else:
         assert taken
     assert jsonschema.Draft7Validator(json_schema.schema()).is_valid(tomllib.loads(text)) == taken
+
+
+def test_unlimited_numbers_have_no_default_in_the_schema():
+    def numbers(node):
+        if isinstance(node, dict):
+            yield from [node] if node.get("type") == "number" else []
+            node = list(node.values())
+        for each in node if isinstance(node, list) else ():
+            yield from numbers(each)
+
+    found = list(numbers(json_schema.schema()))
+    assert len(found) > 100
+    assert not [each for each in found if each.get("default", 0.0) is None]
 
 
 class Undescribed(msgspec.Struct, frozen=True):
