@@ -1,4 +1,4 @@
 """Zenoh: keys, messages, their validation, sessions, publishers and subscribers, access control, the modelled channel.
 
-May import: agents.arrays, agents.vectors, agents.clock, agents.errors.
+May import: agents.vectors, agents.clock, agents.errors.
 """

@@ -7,12 +7,8 @@ number lies inside. All `check_` functions raise `Malformed`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
-
-from agents.arrays import Array
 from agents.network.messages import STILL, Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
 
 FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
@@ -24,10 +20,10 @@ REACH_M: Final = 1.0  # a position farther outside the arena is refused
 MAX_YAW: Final = 1e3  # [rad]; ours is within ±π, other programs may count on over full turns
 
 
-def reach_of(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Vector:
+def reach_of(low: Vector, high: Vector) -> Vector:
     """Largest |x|, |y|, |z| [m] of a valid position or goal in the arena from `low` to `high`, x, y, z [m]."""
-    x, y, z = np.maximum(np.abs(low), np.abs(high)) + REACH_M
-    return float(x), float(y), float(z)
+    x, y, z = (max(abs(least), abs(most)) + REACH_M for least, most in zip(low, high, strict=True))
+    return x, y, z
 
 
 def taken(stamp: float, now: float) -> float:

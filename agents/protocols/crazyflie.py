@@ -10,10 +10,10 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from agents.arrays import NotNegative, Positive
 from agents.body.device_locks import numeric
 from agents.body.interface import BodyError, settings
 from agents.protocols.crazyradio import software
+from agents.vectors import NotNegative, Positive
 
 Rate = Annotated[float, Meta(ge=1, le=100)]
 LogRate = Annotated[float, Meta(ge=5, le=100)]

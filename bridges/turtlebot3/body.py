@@ -24,7 +24,7 @@ from agents.network.messages import Inspection, number
 from agents.network.shutdown import leave
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2_node import Participant
-from agents.vectors import Setpoint, Vector
+from agents.vectors import UNKNOWN, Setpoint, Vector
 from bridges.turtlebot3.robot import REPEAT_S, SILENCE_S, Robot
 
 OPEN_S: Final = 4.5  # from the first attempt to reach the router to odometry of every robot
@@ -139,7 +139,7 @@ class TurtleBot3:
         (x, y, yaw), odometry = robot.pose, robot.time
         state = BodyState(
             odometry,
-            (x, y, 0.0 * x),
+            (x, y, 0.0) if isfinite(x) else UNKNOWN,
             yaw=yaw,
             battery=robot.battery,
             heard=t - now + robot.odometry_received,
