@@ -51,7 +51,7 @@ class View:
     t: float  # now [s]
     position: Vector  # own [m]; for communication the pose to transmit, smoothed if asked for
     velocity: Vector  # own [m/s]
-    deviation: float  # ‖ε‖: distance of the held value from the true one [m]; infinite before the first event
+    deviation: float  # ‖ε‖: distance of the held value from the true one [m]; infinite before the first transmission
     since_event: float  # t − t_k: time since the last event [s], infinite before the first
     since_start: float  # time since the robot's start in the experiment [s], 0 before
     error: float  # Σ|e| of its links, as the robot itself knows them [m]
