@@ -1,0 +1,150 @@
+"""Every registered plug-in, a user's too: a robot decides the same alone and in company, and bears losses."""
+
+from dataclasses import replace
+from math import cos, isfinite, nan, sin
+
+import msgspec
+import pytest
+
+from agents.body.interface import RangeScan
+from agents.decision.lifecycle import RUNNING
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.plugins import registry
+from agents.plugins.planners import Leg
+from agents.plugins.registry import AVOIDANCES, LAWS, PLANNERS, PREDICTORS, TRIGGERS
+from agents.vectors import UNKNOWN
+from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
+from tests.agents.few import triangle
+
+GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
+EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
+PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
+WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+SAMPLES = {float: 0.3, int: 1, bool: False, str: "a", list: [[0.3, 0.2], [-0.2, 0.4]]}
+
+
+def made(group, name):
+    """A plug-in with its defaults; numbers and places stand for parameters without one."""
+    kind = registry.struct(group, name)
+    for sample in ({}, SAMPLES[float], [0.3, 0.2], SAMPLES[list]):
+        for other in (SAMPLES[float], [0.3, 0.2], SAMPLES[list]):
+            needed = [field.encode_name for field in msgspec.structs.fields(kind) if field.required]
+            values = dict.fromkeys(needed, other)
+            if needed:
+                values[needed[0]] = sample
+            try:
+                return registry.build(group, {"kind": name, **values})
+            except (msgspec.ValidationError, ValueError):
+                continue
+    pytest.skip(f"no sample fits the parameters of {name}")
+
+
+def assignment(group, name):
+    """A of three ground robots with this plug-in at work."""
+    plan = Plan(triangle(avoidance={"kind": "potential", "hears": "all"}, prediction="constant-velocity"))
+    given, plugin = plan.assignment("A"), made(group, name)
+    if group == LAWS:
+        wants = WANTS[plugin.NEEDS]
+        links = tuple(
+            msgspec.structs.replace(link, relative=(0.3, 0.2, 0.0), bearing=(0.6, 0.8, nan), wants=wants)
+            for link in given.neighbours
+        )
+        return replace(given, law=plugin, neighbours=links)
+    if group == TRIGGERS:
+        places = plugin.PLACES
+        given = replace(given, trigger=plugin) if "communication" in places else given
+        return replace(given, update=plugin) if "control" in places else given
+    if group == PLANNERS:
+        return replace(given, legs=(Leg(0.5, plugin),))
+    return replace(given, **{"predictor" if group == PREDICTORS else "avoidance": plugin})
+
+
+def hear(bench):
+    """Neighbours that wander, each on its own period."""
+    for link, sender in enumerate(bench.neighbours.all):
+        if round(bench.t / 0.01) % (7 + 3 * link) == 0:
+            x, y, z = PLACES[sender.name]
+            swing = 0.2 * ((bench.t * (1 + link)) % 1.0 - 0.5)
+            bench.hear(link, (x + swing, y - swing, z), velocity=(0.2 * (1 + link), -0.2, 0.0))
+
+
+def drive(bench):
+    """Follow the last setpoint, as wheels do, and see a wall."""
+    v, omega, *_ = bench.robot.setpoint
+    x, y, z = bench.position
+    if isfinite(v + x + bench.yaw):
+        bench.position = (x + 0.01 * v * cos(bench.yaw), y + 0.01 * v * sin(bench.yaw), z)
+        bench.yaw += 0.01 * omega
+    if round(bench.t / 0.01) % 10 == 0:
+        bench.values["scan"] = RangeScan(bench.t, (0.0, 1.0), (0.0, 0.0), (0.35, 0.5))
+
+
+def tick(bench):
+    hear(bench)
+    drive(bench)
+
+
+def recorded(bench, trace):
+    tick(bench)
+    trace.append(repr((bench.robot.goal, bench.robot.setpoint, bench.robot.error, bench.said[-1:])))
+
+
+def lives(given, company):
+    """Traces of a robot over 3 s, while `company` robots of the same plug-ins are asked in between."""
+    first, trace = Bench(given, PLACES["A"]), []
+    others = [Bench(given, (0.1 * k, -0.1 * k, 0.0)) for k in range(company)]
+    first.step(0.05, lambda bench: recorded(bench, trace))
+    for other in others:
+        other.life.phase, other.life.start_at = RUNNING, 0.0
+    assert first.life.takeoff() == "", first.life.reason
+    first.step(0.02, lambda bench: recorded(bench, trace))
+    assert first.robot.start(first.t) == ""
+    for _ in range(300):
+        first.step(0.01, lambda bench: recorded(bench, trace))
+        for other in others:
+            other.step(0.01, tick)
+    assert first.life.phase == RUNNING, first.life.reason
+    return trace
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY)
+def test_same_alone_and_in_company(group, name):
+    given = replace(assignment(group, name), start=None, starts=())
+    assert lives(given, 0) == lives(given, 3)
+
+
+@pytest.mark.parametrize(("group", "name"), EVERY)
+def test_losses_restarts_and_unknown_positions(group, name):
+    bench = Bench(replace(assignment(group, name), start=None, starts=()), PLACES["A"])
+    setpoints = []
+
+    def watched(bench):
+        tick(bench)
+        setpoints.append(bench.robot.setpoint)
+
+    bench.running(watched).step(0.5, watched)
+    bench.neighbours.mark_lost(0, bench.t)
+    bench.step(1.5, watched)
+    bench.neighbours.mark_alive(0)
+    bench.step(0.3, watched)
+    bench.neighbours.discard_pose(1)  # a new process, without a pose at first
+    bench.step(0.3, drive)
+    bench.step(0.3, watched)
+    place = bench.position
+    for unknown in (UNKNOWN, (nan, 0.0, 0.0)):
+        bench.position = unknown
+        bench.step(0.2, watched)
+        assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
+        bench.position = place
+        bench.step(0.2, watched)
+    for velocity in (UNKNOWN, (1e9, -1e9, 0.0)):
+        bench.velocity = velocity
+        bench.step(0.2, watched)
+    bench.velocity, bench.yaw = (0.0, 0.0, 0.0), nan
+    bench.step(0.2, watched)
+    for link in range(len(bench.neighbours.all)):
+        bench.hear(link, place)  # in its own place
+    bench.step(0.3, watched)
+    assert len(setpoints) > 300
+    assert all(isfinite(number) for setpoint in setpoints[1:] for number in setpoint)

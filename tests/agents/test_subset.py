@@ -1,0 +1,138 @@
+"""Quiet functions stay within the subset of Python that sweeps compile; plug-ins of others may leave it."""
+
+import ast
+import inspect
+import warnings
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+from agents.plugins import registry
+from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
+
+ROOT = Path(__file__).parents[2]
+# functions of quiet modules that are not quiet themselves, each with the reason
+RARE = {
+    "agents/plugins/avoidance.py": {"Nearby.add"},  # grows its list of things, which a compiler gets ready-made
+    "agents/decision/transmission.py": {"Transmitter.replace_trigger"},  # an order
+    "agents/decision/control_updates.py": set(),
+    "agents/decision/position_control.py": set(),
+    "agents/plugins/barrier.py": set(),
+    "agents/plugins/laws.py": set(),
+    "agents/plugins/predictors.py": set(),
+    "agents/plugins/trigger_families.py": set(),
+    "agents/plugins/triggers.py": set(),
+    "agents/safety/obedience.py": set(),
+    "agents/safety/positions.py": set(),
+    "agents/safety/setpoint_filter.py": set(),
+    "agents/vectors.py": set(),
+    **{str(path.relative_to(ROOT)): set() for path in sorted((ROOT / "twins" / "models").glob("*.py"))},
+    "twins/models/noise.py": {"stream", "refill"},  # random numbers are drawn in blocks, outside of ticks
+}
+BANNED = {
+    ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.ListComp: "a comprehension",
+    ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.GeneratorExp: "a generator",
+    ast.Lambda: "a lambda", ast.Try: "try", ast.With: "with", ast.Yield: "yield", ast.YieldFrom: "yield",
+    ast.Await: "await", ast.Raise: "raise", ast.Assert: "assert", ast.Starred: "*args", ast.Delete: "del",
+    ast.Global: "global", ast.Nonlocal: "nonlocal", ast.Import: "an import", ast.ImportFrom: "an import",
+}  # fmt: skip
+CALLS = {"isinstance", "getattr", "setattr", "hasattr", "str", "repr", "print", "sum", "any", "all", "map", "zip",
+         "sorted", "enumerate", "dict", "set", "list", "type"}  # fmt: skip
+
+
+def faults(function: ast.FunctionDef):
+    """What a function has that is outside of the subset, each with its line."""
+    body = [each for each in function.body if not is_text(each)]
+    if len(body) == 1 and isinstance(body[0], ast.Raise):
+        return  # a method that must be defined
+    if function.args.vararg or function.args.kwarg:
+        yield function.lineno, "*args"
+    for statement in body:
+        for node in ast.walk(statement):
+            if type(node) in BANNED:
+                yield node.lineno, BANNED[type(node)]
+            elif isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, str)):
+                yield node.lineno, "None" if node.value is None else f"the text {node.value[:20]!r}"
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CALLS:
+                yield node.lineno, f"a call of {node.func.id}"
+
+
+def is_text(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+def functions(tree: ast.AST, prefix=""):
+    """Functions of a module or class with their names; constructors, properties and class methods are not quiet."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.ClassDef):
+            yield from functions(node, f"{node.name}.")
+        elif isinstance(node, ast.FunctionDef) and node.name != "__init__" and not node.decorator_list:
+            yield prefix + node.name, node
+
+
+def outside(source: str, rare=frozenset(), first=1):
+    return [
+        (line + first - 1, name, fault)
+        for name, function in functions(ast.parse(source))
+        if name not in rare
+        for line, fault in faults(function)
+    ]
+
+
+@pytest.mark.parametrize("file", RARE)
+def test_quiet_functions_stay_in_the_subset(file):
+    found = outside((ROOT / file).read_text(encoding="utf-8"), RARE[file])
+    assert not found, "\n".join(f"{file}:{line}: {name} uses {fault}" for line, name, fault in found)
+
+
+@pytest.mark.parametrize("file", RARE)
+def test_rare_functions_exist(file):
+    named = {name for name, _ in functions(ast.parse((ROOT / file).read_text(encoding="utf-8")))}
+    assert RARE[file] <= named
+
+
+def plugin_faults(kind):
+    """Faults of a registered class, with the file and the lines of its source."""
+    source, first = inspect.getsourcelines(kind)
+    file = inspect.getsourcefile(kind)
+    return [(f"{file}:{line}", name, fault) for line, name, fault in outside(dedent("".join(source)), first=first)]
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [(group, name) for group in (LAWS, TRIGGERS, PREDICTORS, AVOIDANCES) for name in registry.names(group)],
+)
+def test_registered_plug_ins_and_the_subset(group, name):
+    """Ours stay within it; one of others may leave it, and is told: it runs, as plain Python."""
+    kind = registry.struct(group, name)
+    found = [f"{place}: {method} uses {fault}" for place, method, fault in plugin_faults(kind)]
+    if kind.__module__.startswith("agents."):
+        assert not found, "\n".join(found)
+    elif found:
+        warnings.warn(f"{name} runs uncompiled: " + "; ".join(found), stacklevel=1)
+
+
+SAMPLE = '''
+class Odd:
+    def fires(self, view):
+        """Text is allowed here."""
+        try:
+            return any(x > 1 for x in view.places) or view.last is None
+        except ValueError:
+            return f"{view}"
+
+    def position(self, *poses):
+        return {"x": 0.0}
+
+    def must(self):
+        raise TypeError("must define `must`")
+'''
+
+
+def test_faults_are_found_with_their_lines():
+    found = {(line, fault) for line, _, fault in outside(SAMPLE)}
+    assert found == {
+        (5, "try"), (6, "a call of any"), (6, "a generator"), (6, "None"), (8, "an f-string"), (10, "*args"),
+        (11, "a dictionary"), (11, "the text 'x'"),
+    }  # fmt: skip
