@@ -62,10 +62,11 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
     experiment = written(tmp_path, "hemisphere", "40").experiment
     names = tuple(experiment.robots)
     for seed in range(5):
-        place, _ = bodies.scattered_poses(experiment, names, seed)
+        scattered, _ = bodies.scattered_poses(experiment, names, seed)
+        place = np.array(scattered)
         apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
         assert apart.min() > 2 * 0.065
-        assert np.abs(place - bodies.start_poses(experiment, names)[0]).max() > 0.1
+        assert np.abs(place - np.array(bodies.start_poses(experiment, names)[0])).max() > 0.1
 
 
 @pytest.mark.slow

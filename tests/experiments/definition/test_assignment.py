@@ -13,7 +13,7 @@ from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from experiments.definition import bodies
-from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Start
+from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Shadow, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from twins.scene import Obstacle
@@ -90,15 +90,31 @@ def test_repetitions_stand_side_by_side(park):
         Plan(park).assignment(NAMES[1:], copies=2)
 
 
-def test_bodies_of_repetitions_differ_in_their_seeds_only(park):
-    made = bodies.body_request(park, NAMES, [5, 6])
-    assert made.names == NAMES * 2
-    assert made.seeds == (5,) * 7 + (6,) * 7
-    assert made.addresses == ("twin",) * 14
+def test_requests_differ_in_seeds_only(park):
+    made, other = (bodies.body_request(park, NAMES, seed) for seed in (5, 6))
+    assert made.names == NAMES
+    assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
+    assert made.addresses == ("twin",) * 7
     assert made.rate_hz == 100.0
-    np.testing.assert_array_equal(made.start[:7], made.start[7:])
-    np.testing.assert_array_equal(made.start[[0, 4]], [[-0.6, 0.8, 0.0], [-0.2, 0.4, 0.0]])
-    assert made.disturbance[:7] == made.disturbance[7:]
+    assert made.start == other.start
+    assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
+    assert made.disturbance == other.disturbance
+
+
+def test_quiet_request_keeps_latencies():
+    noisy = Disturbance(position_sigma=0.1, latency_s=0.2)
+    given = experiment(disturbance={"all": noisy})
+    assert bodies.body_request(given, ("A",), 1).disturbance == (noisy,)
+    assert bodies.body_request(given, ("A",), 1, quiet=True).disturbance == (Disturbance(latency_s=0.2),)
+
+
+def test_shadow_periods_are_infinite_for_once():
+    given = experiment()
+    given.robots["A"] = msgspec.structs.replace(given.robots["A"], shadow=Shadow())
+    given.robots["B"] = msgspec.structs.replace(given.robots["B"], shadow=Shadow(restart_s=None))
+    every, once, none = bodies.shadow_periods(given, ("A", "B", "C"))
+    assert (every, once) == (Shadow().restart_s, math.inf)
+    assert math.isnan(none)
 
 
 def experiment(**parts):
@@ -111,9 +127,9 @@ def experiment(**parts):
 
 
 def test_starts_are_on_the_floor_with_a_yaw():
-    position, yaw = bodies.start_poses(experiment(), ("B", "A"))
-    np.testing.assert_array_equal(position, [[0.0, 0.25, 0.0], [0.5, -0.5, 0.0]])
-    np.testing.assert_array_equal(yaw, [0.0, 1.5])
+    positions, yaws = bodies.start_poses(experiment(), ("B", "A"))
+    assert positions == [(0.0, 0.25, 0.0), (0.5, -0.5, 0.0)]
+    assert yaws == [0.0, 1.5]
 
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
@@ -177,7 +193,7 @@ def test_robots_are_not_scattered_into_obstacles():
     given = Experiment(
         title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
     )
-    place = np.array([bodies.scattered_poses(given, ("A", "B"), seed)[0][:, :2] for seed in range(100)])
+    place = np.array([bodies.scattered_poses(given, ("A", "B"), seed)[0] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
     assert gap.min() > bodies.CLEAR
     assert gap.min() < 0.1  # it is near enough to be in the way
