@@ -510,7 +510,8 @@ class Runtime:
         try:
             running = self._decide(t, states)
         except FAILURES as error:
-            raise explain(error, self.robots[0].assignment.plugins) from error
+            plugins = (plugin for robot in self.robots for plugin in robot.assignment.plugins)
+            raise explain(error, plugins) from error
         if self._retired or not running:
             self._retire(t)
         self._counts.ticks += 1

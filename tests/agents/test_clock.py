@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.body.kinds import KHEPERA4
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
-from agents.decision.neighbours import NeighbourStates
+from agents.decision.neighbours import Incoming, Neighbours
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
-from experiments.definition.graph import links
 from experiments.real_time.hosts.launcher import Launcher
-from tests.agents.things import poses
 
 AHEAD_S = 0.2
 SPEED = 0.3  # [m/s] of a neighbour along x
@@ -28,11 +27,10 @@ def misbelieved(stamp: float, predictor: Predictor) -> float:
 
 def believed(stamp: float, predictor: Predictor) -> float:
     """Where along x the listener believes the neighbour to be [m]."""
-    hearing = NeighbourStates(links([(0, 1)], [0.5], [1.0]), None, 1.0)
-    where = np.array([[SPEED * T, 0.0, 0.0]])
-    at = np.array([0])
-    hearing.receive(poses(at, where, np.array([[SPEED, 0.0, 0.0]]), np.array([stamp]), np.array([T])))
-    return float(hearing.poses.extrapolate_position(predictor, T + LATER, at)[0, 0])
+    neighbours = Neighbours([Incoming(0, "B", KHEPERA4, 0.5)], 1.0)
+    neighbours.mark_alive(0)
+    neighbours.receive(0, (SPEED * T, 0.0, 0.0), (SPEED, 0.0, 0.0), stamp, T)
+    return neighbours.all[0].place(predictor, T + LATER)[0]
 
 
 def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
+from math import isnan
 from pathlib import Path
 from threading import Event
 
@@ -18,6 +19,7 @@ from agents.body.kinds import KINDS
 from agents.network import messages as wire
 from agents.network.name_ownership import OwnershipCheck
 from agents.runtime.loop import Runtime, Setup
+from agents.vectors import Setpoint, is_finite
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -60,19 +62,19 @@ def robot() -> Iterator[Target]:
 
     def make():
         net.forget()
-        body = assemble(bodies.body_request(experiment, ["KH01"], [1], ["tcp/127.0.0.1:1"]))
+        body = assemble(bodies.body_request(experiment, ["KH01"], 1, ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
-        runtime = Runtime(Plan(experiment).assignment(["KH01"]), body, setup)
+        runtime = Runtime([Plan(experiment).assignment("KH01")], body, setup)
         body.open()
         runtime._subscribe_to_stops(net.session)
         runtime._join(net.session)
         runtime._utc = runtime._telemetry.utc = time.time()
         command = body.command
 
-        def told(setpoint: np.ndarray) -> None:
-            assert not np.isinf(setpoint).any()
-            assert (np.nan_to_num(np.abs(setpoint)) < 10.0).all(), setpoint
-            command(setpoint)
+        def told(setpoints: Sequence[Setpoint]) -> None:
+            for setpoint in setpoints:
+                assert all(isnan(number) or abs(number) < 10.0 for number in setpoint), setpoint
+            command(setpoints)
 
         body.command = told  # type: ignore[method-assign]
         t = 0.0
@@ -213,7 +215,7 @@ def request(kind: str, address: str, count: int = 1) -> BodyRequest:
     """Robots of one kind."""
     return BodyRequest(
         names=tuple(f"KH{row + 1:02}" for row in range(count)), kinds=(KINDS[kind],) * count,
-        addresses=(address,) * count, start=np.zeros((count, 3)), yaw=np.zeros(count), rate_hz=100.0,
+        addresses=(address,) * count, start=((0.0, 0.0, 0.0),) * count, yaw=(0.0,) * count, rate_hz=100.0,
         seeds=(1,) * count, disturbance=(Disturbance(),) * count, external=(False,) * count, device=({},) * count,
         endpoints=("tcp/127.0.0.1:1",), keys=KEYS,
     )  # fmt: skip
@@ -237,9 +239,8 @@ def external_body() -> Iterator[Target]:
             nonlocal t
             t += 0.01
             net.deliver(data)
-            state = body.read(t)
-            assert np.isfinite(state.position).all()
-            body.command(np.zeros((2, 4)))
+            assert all(is_finite(state.position) for state in body.read(t))
+            body.command([(0.0, 0.0, 0.0, 0.0)] * 2)
 
         return take
 

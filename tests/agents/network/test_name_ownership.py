@@ -238,7 +238,7 @@ def test_a_process_without_its_name_touches_no_body(reply, error, monkeypatch):
     body = Airborne()
     with Net().worn() as net:
         net.replies = [reply]
-        robot = Runtime(Plan(experiment).assignment(("F",)), body, setup)
+        robot = Runtime([Plan(experiment).assignment("F")], body, setup)
         with pytest.raises(error):
             robot.run()
     assert body.calls == []
@@ -265,7 +265,7 @@ def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkey
     now = [0.0]
     monkeypatch.setattr(name_ownership, "uptime", lambda: now[0])
     with Net().worn() as net:
-        robot = Runtime(Plan(experiment).assignment(("F",)), body, setup)
+        robot = Runtime([Plan(experiment).assignment("F")], body, setup)
 
         def looks() -> None:
             if not told:
@@ -304,7 +304,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
-        robot = Runtime(Plan(pair()).assignment(("A", "B")), Airborne(), setup)
+        robot = Runtime([Plan(pair()).assignment(name) for name in "AB"], Airborne(), setup)
         robot._subscribe_to_stops(net.session)
         robot._join(net.session)
         robot._joined = True
@@ -321,7 +321,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
         robot._recover("it hung")
         assert CountedToken.live == shown
         robot._leaving.add(0)
-        robot.agent.lifecycle.land(0, "ordered to leave")
+        robot.robots[0].lifecycle.land("ordered to leave")
         robot._watchdog.tripped = "it hangs"
         robot._call_for_help("it hangs")
         robot._retire(0.0)  # of a row whose token the alarm has taken back

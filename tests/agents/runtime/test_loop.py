@@ -24,7 +24,7 @@ HZ = 100.0
 @pytest.mark.parametrize(
     ("stands_s", "missed", "holds"), [(0.005, 0, False), (0.075, 6, False), (0.605, 59, True), (8.005, 799, True)]
 )
-def test_a_loop_that_stood_still_skips_ticks_and_holds_after_a_suspension(stands_s, missed, holds, monkeypatch, capsys):
+def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, capsys):
     now, times = [1000.0], []
 
     def sleep(seconds):
@@ -34,9 +34,9 @@ def test_a_loop_that_stood_still_skips_ticks_and_holds_after_a_suspension(stands
     monkeypatch.setattr(loop, "uptime", lambda: now[0])  # it alone goes on while the machine sleeps
     experiment = pair()
     with Net().worn() as net:
-        body = assemble(bodies.body_request(experiment, ("A",), [1]))
+        body = assemble(bodies.body_request(experiment, ("A",), 1))
         runtime = Runtime(
-            Plan(experiment).assignment(("A",)),
+            [Plan(experiment).assignment("A")],
             body,
             Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
         )
@@ -55,15 +55,15 @@ def test_a_loop_that_stood_still_skips_ticks_and_holds_after_a_suspension(stands
         def stopping():
             if len(times) < 12:
                 return None
-            runtime.agent.lifecycle.phase[:] = loop.Phase.DONE
+            runtime.robots[0].lifecycle.phase = loop.Phase.DONE
             return "enough"
 
         runtime._run_ticks(stopping)
     assert times == pytest.approx([(k if k < 5 else k + missed) / HZ for k in range(12)])
     assert runtime._counts.missed == missed
-    assert runtime.agent.tick == 12 + missed
+    assert runtime.robots[0].tick == 12 + missed
     assert (f"stood still for {stands_s:.1f} s; holding" in capsys.readouterr().out) == holds
-    assert (runtime.agent.health.resumed_at == pytest.approx((5 + missed) / HZ)) == holds
+    assert (runtime.health.resumed_at == pytest.approx((5 + missed) / HZ)) == holds
 
 
 class Stage:
@@ -76,9 +76,9 @@ class Stage:
         monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=self.sleep))
         for module in (loop, name_ownership):
             monkeypatch.setattr(module, "uptime", lambda: self.now)
-        self.body = assemble(bodies.body_request(experiment, ("F",), [1]))
+        self.body = assemble(bodies.body_request(experiment, ("F",), 1))
         self.runtime = Runtime(
-            Plan(experiment).assignment(("F",)),
+            [Plan(experiment).assignment("F")],
             self.body,
             Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False]),
         )
@@ -106,8 +106,9 @@ class Stage:
         over = []
 
         def stopping():
-            over.append(visit(Phase(self.runtime.agent.lifecycle.phase[0])))
-            self.runtime.agent.lifecycle.phase[:] = Phase.DONE if over[-1] else self.runtime.agent.lifecycle.phase
+            life = self.runtime.robots[0].lifecycle
+            over.append(visit(Phase(life.phase)))
+            life.phase = int(Phase.DONE) if over[-1] else life.phase
             return "enough" if over[-1] else None
 
         self.runtime._run_ticks(stopping)
@@ -118,16 +119,16 @@ def test_standstill_without_router_halts_then_lands(kind, after_s, monkeypatch):
     stage, woke = Stage(monkeypatch, kind), []
 
     def visit(phase):
-        life = stage.runtime.agent.lifecycle
+        life = stage.runtime.robots[0].lifecycle
         if phase == Phase.READY:
-            life.takeoff(0)
+            life.takeoff()
         elif phase == Phase.AIRBORNE and not woke:
             stage.now += 0.8
             woke.append(stage.now)
             stage.orders.clear()
             stage.commands = 0
             monkeypatch.setattr(network, "connected", lambda _session: False)
-            stage.runtime.agent.hazards.incidents.clear()
+            stage.runtime.robots[0].hazards.incidents.clear()
         elif woke and phase == Phase.AIRBORNE:
             raise AssertionError("it went on")
         return phase == Phase.DONE
@@ -138,7 +139,7 @@ def test_standstill_without_router_halts_then_lands(kind, after_s, monkeypatch):
     stage.runtime._ownership.end()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
     assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
-    assert "no router tells who owns its name" in stage.runtime.agent.lifecycle.reason[0]
+    assert "no router tells who owns its name" in stage.runtime.robots[0].lifecycle.reason
 
 
 @pytest.mark.parametrize("phase", [Phase.READY, Phase.AIRBORNE])
@@ -146,14 +147,14 @@ def test_stop_during_command_has_last_word(phase, monkeypatch):
     stage, stops = Stage(monkeypatch, "crazyflie"), []
 
     def stop():
-        if not stops and stage.runtime.agent.lifecycle.phase[0] == phase:
+        if not stops and stage.runtime.robots[0].lifecycle.phase == phase:
             stops.append(stage.now)
             stage.runtime._estop._receive(Sample("park/estop", messages.JSON, b"{}"))
 
     def visit(now):
         if now == Phase.READY:
             stage.in_between = stop
-            stage.runtime.agent.lifecycle.takeoff(0)
+            stage.runtime.robots[0].lifecycle.takeoff()
         return now == Phase.DONE
 
     with Net().worn() as net:
@@ -161,14 +162,14 @@ def test_stop_during_command_has_last_word(phase, monkeypatch):
         stage.run(visit)
     assert len(stops) == 1
     assert [order for at, order in stage.orders if at >= stops[0]][-2:] == ["stop", "stop"]
-    assert not stage.body.read(stage.runtime._ticks.t + 0.01).flying[0]
+    assert not stage.body.read(stage.runtime._ticks.t + 0.01)[0].flying
 
 
 def test_stop_while_body_opens_keeps_it_down(monkeypatch):
     stage = Stage(monkeypatch, "crazyflie")
 
     def visit(phase):
-        assert stage.runtime.agent.lifecycle.takeoff(0) != ""
+        assert stage.runtime.robots[0].lifecycle.takeoff() != ""
         return phase == Phase.DONE
 
     with Net().worn() as net:
@@ -179,20 +180,20 @@ def test_stop_while_body_opens_keeps_it_down(monkeypatch):
         stage.runtime._join(net.session)
         stage.run(visit)
     assert [order for _, order in stage.orders] == ["stop"]
-    assert stage.runtime.agent.lifecycle.reason[0].startswith(messages.EMERGENCY)
+    assert stage.runtime.robots[0].lifecycle.reason.startswith(messages.EMERGENCY)
 
 
 def test_standstill_before_takeoff_keeps_it_down(monkeypatch):
     stage = Stage(monkeypatch, "crazyflie")
     act = stage.runtime._act
 
-    def late(actions):
-        stage.now += 0.8 if actions.commands is not None and len(actions.commands.takeoff) else 0.0
-        act(actions)
+    def late():
+        stage.now += 0.8 if stage.runtime.robots[0].takes_off else 0.0
+        act()
 
     def visit(phase):
         if phase == Phase.READY:
-            stage.runtime.agent.lifecycle.takeoff(0)
+            stage.runtime.robots[0].lifecycle.takeoff()
         return phase == Phase.DONE
 
     with Net().worn() as net:

@@ -7,15 +7,14 @@ import time
 from collections.abc import Callable
 
 import msgspec
-import numpy as np
 import pytest
 
-from agents.body.interface import RangeScan, Rays
+from agents.body.interface import BodyState, RangeScan
 from agents.network import messages, validation
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
-from agents.runtime.range_inbox import RangeInbox, replace_rows
+from agents.runtime.range_inbox import RangeInbox
 from tests.conftest import RouterProcess
 
 KEYS = Keys()
@@ -24,11 +23,11 @@ GOOD = messages.Ranges("KH01", 1000.0, [0.0, 1.5], [0.0, 0.0], [0.25, None])
 
 def scan(t: float, *distance: float) -> RangeScan:
     count = len(distance)
-    return RangeScan(t, np.linspace(0.0, 1.0, count), np.zeros(count), np.array(distance))
+    return RangeScan(t, tuple(k / max(count - 1, 1) for k in range(count)), (0.0,) * count, distance)
 
 
-def test_a_sweep_as_a_message() -> None:
-    said = range_inbox.message("KH01", 1000.0, scan(2.5, 0.12345678, np.nan, 1.0))
+def test_sweep_as_a_message() -> None:
+    said = range_inbox.message("KH01", 1000.0, scan(2.5, 0.12345678, math.nan, 1.0))
     assert said == messages.Ranges("KH01", 1002.5, [0.0, 0.5, 1.0], [0.0, 0.0, 0.0], [0.123457, None, 1.0])
     validation.check_ranges(said, now=1002.5)
 
@@ -48,32 +47,24 @@ def test_a_sweep_as_a_message() -> None:
         ("elevation", [0.0, 0.0, 0.0], "differ in number"),
     ],
 )
-def test_what_no_sensor_sees_is_refused(field: str, value: object, why: str) -> None:
+def test_impossible_readings_are_refused(field: str, value: object, why: str) -> None:
     validation.check_ranges(GOOD, now=1000.0)
     with pytest.raises(messages.Malformed, match=why):
         validation.check_ranges(msgspec.structs.replace(GOOD, **{field: value}), now=1000.0)
 
 
-def test_what_is_heard_takes_the_place_of_what_is_seen() -> None:
-    own = Rays.gather([scan(1.0, 0.1, 0.2), scan(1.0, 0.3), scan(1.0, 0.4)])
-    heard = Rays.gather([None, scan(2.0, 0.5, 0.6)])
-    rays = replace_rows(own, heard, np.array([1, 2]))
-    assert rays is not None
-    assert rays.row.tolist() == [0, 0, 1, 1]
-    assert rays.distance.tolist() == [0.1, 0.2, 0.5, 0.6]
-    assert rays.time.tolist() == [1.0, 1.0, 2.0, 2.0]
-    assert replace_rows(None, heard, np.array([1])) is heard
-    assert replace_rows(own, None, np.arange(3)) is None
-
-
 @pytest.mark.system
-def test_the_newest_sweep_of_each_row_is_known_until_it_is_old(
+def test_newest_sweep_is_known_until_old(
     router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
 ) -> None:
     with network.open_session([router.endpoint], name="test") as session:
         listener = RangeInbox(session, KEYS, ("CF01", "KH01"), [1])
         utc = time.time() - 10.0
-        assert listener.read(utc, 10.0) is None
+
+        def known(at: float) -> RangeScan | None:
+            return listener.read(utc, at)[1]
+
+        assert known(10.0) is None
 
         def say(*distance: float | None, at: float, robot: str = "KH01") -> None:
             angles = [0.0] * len(distance)
@@ -81,17 +72,19 @@ def test_the_newest_sweep_of_each_row_is_known_until_it_is_old(
             session.put(KEYS.ranges("KH01"), messages.encode(message), encoding=messages.JSON)
 
         say(0.5, None, at=10.0)
-        eventually(lambda: listener.read(utc, 10.0) is not None)
-        rays = listener.read(utc, 10.0)
-        assert rays is not None
-        assert rays.row.tolist() == [1, 1]
-        np.testing.assert_array_equal(rays.distance, [0.5, np.nan])
-        assert rays.time.tolist() == pytest.approx([10.0, 10.0], abs=1e-6)
-        assert listener.read(utc, 10.5) is rays, "nothing new costs nothing"
+        eventually(lambda: known(10.0) is not None)
+        first = known(10.0)
+        assert first is not None
+        assert first.distance == pytest.approx((0.5, math.nan), nan_ok=True)
+        assert first.time == pytest.approx(10.0, abs=1e-6)
+        assert known(10.5) is first, "nothing new costs nothing"
+        states = [BodyState(), BodyState()]
+        listener.replace_scans(states, utc, 10.5)
+        assert [state.scan for state in states] == [None, first]
         say(0.7, 0.8, at=9.5)  # overtaken
         say(0.7, 0.8, at=10.2, robot="CF01")
         say(0.9, at=10.2)
-        eventually(lambda: len((listener.read(utc, 10.2) or rays).row) == 1)
+        eventually(lambda: len((known(10.2) or first).distance) == 1)
         assert listener.malformed == 1
         assert listener.trouble == "ranges of 'CF01' on the key of 'KH01'"
-        assert listener.read(utc, 11.3) is None, "a second later it says nothing of where things are"
+        assert known(11.3) is None, "a second later it says nothing of where things are"

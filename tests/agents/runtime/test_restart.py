@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 
-from agents.agent import Agent
-from agents.body.interface import BodyState
 from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
@@ -17,9 +14,9 @@ from agents.runtime.loop import Runtime, Setup
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, Leg, Robot
 from experiments.definition.plan import Plan
+from tests.agents.bench import Bench
 from tests.agents.few import pair
 from tests.agents.runtime.test_shutdown import Airborne
-from tests.agents.things import poses
 from tests.fuzz.loopnet import Net
 from tests.fuzz.messages import sent
 
@@ -41,77 +38,66 @@ class Life:
     """A process of A, at a place, `late_s` after the common start."""
 
     def __init__(self, place, late_s: float, origin: messages.Setpoint | None = None, *, listens: bool = False) -> None:
-        self.agent = Agent(Plan(leader(listens=listens)).assignment(("A",)))
-        links = np.arange(len(self.agent.assignment.links))
-        self.agent.neighbours.mark_alive(links)
-        self.t, self.place = 0.0, np.array([[*place, 0.0]])
-        if len(links):
-            self.agent.neighbours.receive(
-                poses(links, np.array([[0.6, 0.6, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
-            )
+        self.bench = Bench(Plan(leader(listens=listens)).assignment("A"), (*place, 0.0))
+        self.robot = self.bench.robot
+        for link in range(len(self.bench.neighbours.all)):
+            self.bench.hear(link, (0.6, 0.6, 0.0))
         self.step(READY)
         assert self.order(messages.Order("takeoff")) == ""
         self.step(AIRBORNE)
-        self.start = messages.Order("start", at=UTC + self.t - late_s, origin=origin)
+        self.start = messages.Order("start", at=UTC + self.bench.t - late_s, origin=origin)
         assert self.order(self.start) == ""
-        self.step(RUNNING)
-        for _ in range(20):
+        for _ in range(21):
             self.step(RUNNING)
 
     def order(self, order: messages.Order) -> str:
-        return carry_out(self.agent, 0, order, self.t, UTC)[0]
+        return carry_out(self.robot, order, self.bench.t, UTC)[0]
 
     def step(self, phase: int) -> None:
-        for _ in range(3):
-            still, one = np.zeros((1, 3)), np.zeros(1)
-            state = BodyState(
-                np.full(1, self.t), self.place, still, one, self.place, one, np.ones(1), np.zeros(1, dtype=bool)
-            )
-            self.agent.step(self.t, state)
-            self.t += 0.01
-        assert self.agent.lifecycle.phase[0] == phase
+        self.bench.step(0.03)
+        assert self.robot.lifecycle.phase == phase
 
 
-def test_a_leader_that_is_restarted_where_it_stands_does_not_drive_its_plan_a_second_time():
+def test_restarted_leader_does_not_repeat_its_plan():
     first = Life(START, 0.0)
-    origin = first.agent.origin(0)
+    origin = first.robot.origin
     assert origin == (*START, 0.0, 0.0)
     there = (START[0] + WAY, START[1])
     second = Life(there, 30.0, origin)
-    np.testing.assert_allclose(second.agent.goal[0, :2], there)
-    assert second.agent.origin(0) == origin  # for the next one of its name
-    assert Life(there, 30.0).agent.goal[0, 0] == pytest.approx(there[0] + WAY)  # without the origin
+    assert second.robot.goal[:2] == pytest.approx(there)
+    assert second.robot.origin == origin  # for the next one of its name
+    assert Life(there, 30.0).robot.goal[0] == pytest.approx(there[0] + WAY)  # without the origin
     anew = Life(START, 30.0, origin)  # a twin of its own stands at its start again
-    np.testing.assert_allclose(anew.agent.goal[0, :2], there)
+    assert anew.robot.goal[:2] == pytest.approx(there)
 
 
-def test_a_leg_that_was_under_way_goes_on_from_where_it_began():
+def test_leg_under_way_goes_on():
     origin = (*START, 0.0, 0.0)
     half = Life((0.0, 0.0), BEGINS_S + 2.0, origin)
-    gone = SPEED * (half.t - half.start.at + UTC - BEGINS_S)
-    assert half.agent.goal[0, 0] == pytest.approx(START[0] + gone, abs=0.02)
+    gone = SPEED * (half.bench.t - half.start.at + UTC - BEGINS_S)
+    assert half.robot.goal[0] == pytest.approx(START[0] + gone, abs=0.02)
 
 
-def test_the_plan_of_a_robot_that_listens_begins_where_its_first_leg_did():
+def test_plan_of_a_follower_keeps_its_origin():
     before = Life(START, 0.0, listens=True)
-    assert before.agent.origin(0) is None  # its leg is yet to come
+    assert before.robot.origin is None  # its leg is yet to come
     first = Life(START, BEGINS_S, listens=True)
-    assert first.agent.origin(0)[:2] == START
-    second = Life((START[0] + WAY, START[1]), 30.0, first.agent.origin(0), listens=True)
-    assert second.agent.origin(0)[:2] == START
+    assert first.robot.origin[:2] == START
+    second = Life((START[0] + WAY, START[1]), 30.0, first.robot.origin, listens=True)
+    assert second.robot.origin[:2] == START
 
 
-def test_a_start_with_an_origin_that_is_not_known_is_refused():
+def test_start_with_unknown_origin_is_refused():
     life = Life(START, 0.0)
-    life.agent.lifecycle.phase[0] = AIRBORNE
-    start = messages.Order("start", at=UTC + life.t, origin=(0.0, math.nan, 0.0, 0.0))
+    life.robot.lifecycle.phase = AIRBORNE
+    start = messages.Order("start", at=UTC + life.bench.t, origin=(0.0, math.nan, 0.0, 0.0))
     assert "origin" in life.order(start)
 
 
-def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs():
+def test_repeated_start_keeps_the_ticks():
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
     with Net().worn() as net:
-        robot = Runtime(Plan(pair()).assignment(("A",)), Airborne(), setup)
+        robot = Runtime([Plan(pair()).assignment("A")], Airborne(), setup)
         robot._subscribe_to_stops(net.session)
         robot._join(net.session)
         robot._utc, robot._ticks.t, robot._ticks.next = UTC, 7.0, 7.01
@@ -121,9 +107,9 @@ def test_a_start_that_is_repeated_does_not_move_the_ticks_of_a_robot_that_runs()
             for query, order in robot._orders[0].read():
                 robot._obey(0, query, order, robot._ticks.t)
 
-        robot.agent.lifecycle.phase[0] = AIRBORNE
+        robot.robots[0].lifecycle.phase = AIRBORNE
         start(7.504)
         assert robot._ticks.next == pytest.approx(7.004)
-        robot.agent.lifecycle.phase[0] = RUNNING
+        robot.robots[0].lifecycle.phase = RUNNING
         start(7.508)
         assert robot._ticks.next == pytest.approx(7.004)

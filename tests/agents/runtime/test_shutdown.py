@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
+from math import inf
 
-import numpy as np
 import pytest
 
 from agents.body.interface import BodyState, call_all
@@ -34,29 +35,27 @@ class Airborne:
     def open(self) -> None:
         self.calls.append("open")
 
-    def read(self, t: float) -> BodyState:
+    def read(self, t: float) -> list[BodyState]:
         self.reads += 1
         if self.reads > TICKS:
             self.looks()
             self.fail("read")
         self.steps -= self.landing
-        nothing, nowhere = np.full(1, np.nan), np.full((1, 3), np.nan)
-        flying = np.array([self.steps > 0 and not self.stopped])
-        return BodyState(np.full(1, t), nowhere, nowhere, nothing, nowhere, nothing, nothing, flying)
+        return [BodyState(t, flying=self.steps > 0 and not self.stopped)]
 
-    def command(self, setpoint: np.ndarray) -> None:
+    def command(self, setpoints: Sequence[object]) -> None:
         if self.reads == TICKS:
             raise OSError("the loop breaks")
 
-    def takeoff(self, rows: np.ndarray, height: np.ndarray) -> None: ...
+    def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None: ...
 
     def locate(self, *_: object) -> None: ...
 
-    def land(self, rows: np.ndarray) -> None:
+    def land(self, rows: Sequence[int]) -> None:
         self.landing = True
         self.tell("land")
 
-    def stop(self, rows: np.ndarray) -> None:
+    def stop(self, rows: Sequence[int]) -> None:
         self.stopped = True
         self.tell("stop")
 
@@ -83,7 +82,7 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
     with Net().worn() as net:
         body.net = net
         setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_silence_s=silence_s)
-        Runtime(Plan(experiment).assignment(("F",)), body, setup).run()
+        Runtime([Plan(experiment).assignment("F")], body, setup).run()
     return net
 
 
@@ -91,11 +90,11 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
 def short_waits(monkeypatch):
     monkeypatch.setattr(loop, "FAREWELL_S", 0.3)
     monkeypatch.setattr(loop, "STOPPED_S", 0.1)
-    monkeypatch.setattr(loop, "SLOWEST", np.inf)
+    monkeypatch.setattr(loop, "SLOWEST", inf)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
-def test_everything_is_tried_on_the_way_out_and_the_error_is_said(broken):
+def test_shutdown_tries_everything_and_raises(broken):
     body = Airborne(*broken)
     with pytest.raises(OSError, match="fails" if broken else "the loop breaks") as error:
         run(body)
@@ -106,7 +105,7 @@ def test_everything_is_tried_on_the_way_out_and_the_error_is_said(broken):
     assert "the loop breaks" in chain
 
 
-def test_a_robot_is_stopped_when_it_is_down_and_not_before(monkeypatch):
+def test_robot_is_stopped_once_it_is_down(monkeypatch):
     monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
     body = Airborne(steps=10)
     with pytest.raises(OSError, match="the loop breaks"):
@@ -115,7 +114,7 @@ def test_a_robot_is_stopped_when_it_is_down_and_not_before(monkeypatch):
     assert body.calls == ["open", "land", "stop", "close"]
 
 
-def test_a_drone_at_the_ceiling_that_descends_slowly_is_not_stopped_in_the_air(monkeypatch):
+def test_slow_descent_is_not_stopped_in_flight(monkeypatch):
     monkeypatch.setattr(loop, "FAREWELL_S", 0.05)
     monkeypatch.setattr(loop, "SLOWEST", 2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
     body = Airborne(steps=100)  # a second
@@ -125,17 +124,17 @@ def test_a_drone_at_the_ceiling_that_descends_slowly_is_not_stopped_in_the_air(m
 
 
 @pytest.mark.parametrize(("height", "down_s"), [(1.0, 10.0), (6.0, 30.0)])
-def test_the_watchdog_gives_a_drone_the_time_of_a_descent_from_the_ceiling(monkeypatch, height, down_s):
+def test_watchdog_waits_for_a_whole_descent(monkeypatch, height, down_s):
     monkeypatch.undo()
     robots = {"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5), "B": Robot(kind="khepera4", start=[0.5, 0.2])}
     plan = Plan(pair(robots=robots, formation=Formation(), arena=Arena(size=(4.0, 4.0, height))))
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
-    flying, driving = (Runtime(plan.assignment((name,)), Airborne(), setup)._watchdog for name in "FB")
+    flying, driving = (Runtime([plan.assignment(name)], Airborne(), setup)._watchdog for name in "FB")
     assert flying._down_s == pytest.approx(down_s)
     assert driving._down_s == 10.0
 
 
-def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypatch):
+def test_unreadable_body_gets_time_to_land(monkeypatch):
     monkeypatch.setattr(loop, "AGAIN_S", 0.02)
     body = Airborne("read")
     with pytest.raises(OSError, match="read fails"):
@@ -144,7 +143,7 @@ def test_a_body_that_does_not_say_how_it_is_gets_the_time_of_a_landing(monkeypat
     assert body.calls.count("stop") > 1
 
 
-def test_what_does_not_stop_is_told_again(monkeypatch):
+def test_failed_stop_is_repeated(monkeypatch):
     monkeypatch.setattr(loop, "AGAIN_S", 0.02)
     body = Airborne("stop", steps=0)
     with pytest.raises(OSError, match="stop fails"):
@@ -153,7 +152,7 @@ def test_what_does_not_stop_is_told_again(monkeypatch):
     assert body.calls.count("stop") > 1
 
 
-def test_an_emergency_stop_is_obeyed_while_a_robot_comes_down(monkeypatch):
+def test_emergency_stop_during_a_descent(monkeypatch):
     monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
     body = Airborne(steps=10**9)
 
@@ -167,11 +166,11 @@ def test_an_emergency_stop_is_obeyed_while_a_robot_comes_down(monkeypatch):
     assert body.order == ["open", "land", "stop", "close"]
 
 
-def test_a_read_that_hangs_on_the_way_out_is_landed_by_the_watchdog():
+def test_hanging_read_is_landed_by_the_watchdog():
     body, landed = Airborne(), threading.Event()
     land = body.land
 
-    def told(rows: np.ndarray) -> None:
+    def told(rows: Sequence[int]) -> None:
         land(rows)
         landed.set()
 
@@ -182,7 +181,7 @@ def test_a_read_that_hangs_on_the_way_out_is_landed_by_the_watchdog():
     assert body.order == ["open", "land", "stop", "close"]
 
 
-def test_all_calls_are_made_and_the_last_error_is_raised():
+def test_call_all_raises_the_last_error():
     made = []
 
     def call(what: str, *, fails: bool = False) -> None:
@@ -198,7 +197,7 @@ def test_all_calls_are_made_and_the_last_error_is_raised():
     assert str(error.value.__context__) == "one"
 
 
-def test_after_a_stop_that_comes_between_two_ticks_the_next_one_leaves_the_processor_to_others(monkeypatch):
+def test_stop_between_ticks_yields_the_processor(monkeypatch):
     body = Airborne()
     done: list[float] = []  # ticks when the stop came; sleeps and ticks since
     sleep = loop.time.sleep
@@ -211,7 +210,7 @@ def test_after_a_stop_that_comes_between_two_ticks_the_next_one_leaves_the_proce
             done.extend((seconds, body.reads))
         sleep(seconds)
 
-    def command(_setpoint: np.ndarray) -> None:
+    def command(_setpoints: Sequence[object]) -> None:
         if len(done) > 1 or body.reads > 1000:
             raise OSError("the loop breaks")
 

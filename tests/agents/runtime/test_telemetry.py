@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from copy import copy
+from math import pi
+
 import pytest
 
-from agents.agent import Agent
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
+from agents.robot import Robot as Decision
 from agents.runtime.pose_inbox import NEWS, PoseInbox
 from agents.runtime.telemetry import Counts, Telemetry
+from agents.vectors import UNKNOWN
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
 from tests.agents.few import pair
@@ -43,14 +46,14 @@ class Robot:
         for name in ("publisher", "pose_publisher", "pose_subscriber", "AliveWatch"):
             monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
-        self.agent = Agent(Plan(experiment).assignment(("A",)))
-        self.body = TwinBody(bodies.body_request(experiment, ("A",), [1]))
+        self.decision = Decision(Plan(experiment).assignment("A"))
+        self.body = TwinBody(bodies.body_request(experiment, ("A",), 1))
         self.body.open()
         nowhere = None
-        self.neighbours = PoseInbox(nowhere, Keys(), self.agent, reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
+        self.neighbours = PoseInbox(nowhere, Keys(), [self.decision], reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]
         self.telemetry = Telemetry(
             nowhere, Keys(), "json",  # type: ignore[arg-type]
-            agent=self.agent, neighbours=self.neighbours, counts=Counts(1), malformed=lambda: 0, ranged=[True],
+            robots=[self.decision], neighbours=self.neighbours, counts=Counts(1), malformed=lambda: 0, ranged=[True],
         )  # fmt: skip
         self.telemetry.utc = UTC
 
@@ -62,15 +65,16 @@ class Robot:
                 )
             )
 
-    def tell(self, t: float, **changed: float) -> list[messages.State]:
-        """One sample of telemetry, some columns of the body's state `changed`."""
-        state = self.body.read(t)
+    def tell(self, t: float, **changed: object) -> list[messages.State]:
+        """One sample of telemetry, some values of the body's state `changed`."""
+        state = copy(self.body.read(t)[0])
         for name, value in changed.items():
-            getattr(state, name)[:] = value
-        actions = self.agent.act(t, state, self.agent.transmit(t, state))
+            setattr(state, name, value)
+        self.decision.transmit(t, state)
+        self.decision.act(t)
         (publisher,) = self.telemetry._states
         publisher.states.clear()
-        self.telemetry.send_states(state, actions, t)
+        self.telemetry.send_states(t)
         return publisher.states
 
 
@@ -79,9 +83,9 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     return Robot(monkeypatch)
 
 
-def test_who_does_not_know_where_it_is_tells_what_it_heard(robot: Robot) -> None:
+def test_blind_robot_reports_received_poses(robot: Robot) -> None:
     robot.hear(100)
-    (said,) = robot.tell(0.02, position=np.nan)
+    (said,) = robot.tell(0.02, position=UNKNOWN)
     assert (said.position, len(said.received)) == (None, 100)
     assert not robot.neighbours.news[0]
     (said,) = robot.tell(0.04)
@@ -89,7 +93,7 @@ def test_who_does_not_know_where_it_is_tells_what_it_heard(robot: Robot) -> None
     assert said.received == []
 
 
-def test_what_waits_for_telemetry_is_bounded(robot: Robot) -> None:
+def test_waiting_receipts_are_bounded(robot: Robot) -> None:
     robot.hear(NEWS + 500)
     assert len(robot.neighbours.news[0]) == NEWS
     states = robot.tell(0.02)
@@ -98,13 +102,13 @@ def test_what_waits_for_telemetry_is_bounded(robot: Robot) -> None:
     assert {state.seq for state in states} == {1}
 
 
-def test_a_body_that_knows_no_velocity_has_telemetry(robot: Robot) -> None:
-    (said,) = robot.tell(0.02, velocity=np.nan)
+def test_unknown_velocity_is_reported_as_none(robot: Robot) -> None:
+    (said,) = robot.tell(0.02, velocity=UNKNOWN)
     assert said.velocity is None
     assert said.position is not None
 
 
-def test_a_robot_that_has_turned_often_looks_where_it_looks(robot: Robot) -> None:
-    (said,) = robot.tell(0.02, yaw=2000.0 * np.pi + 0.5, true_yaw=-2000.0 * np.pi + 0.5)
+def test_reported_yaw_is_wrapped(robot: Robot) -> None:
+    (said,) = robot.tell(0.02, yaw=2000.0 * pi + 0.5, true_yaw=-2000.0 * pi + 0.5)
     assert said.yaw == pytest.approx(0.5, abs=1e-9)
     assert said.true_yaw == pytest.approx(0.5, abs=1e-9)
