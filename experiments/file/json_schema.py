@@ -5,6 +5,7 @@ Draft 7, because Taplo (the TOML extension of most editors) misreads the tuples 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import combinations
 from math import inf
@@ -41,7 +42,7 @@ def schema() -> dict[str, Any]:
     """
     whole = described()
     _exclude(whole["definitions"])
-    return _bounded(whole)
+    return dict(msgspec.json.decode(msgspec.json.encode(_bounded(whole))))  # plain lists and tables
 
 
 def described() -> dict[str, Any]:
@@ -67,7 +68,7 @@ def described() -> dict[str, Any]:
         "Experiment"
     )  # in full: a reference at the top would hide its neighbours from draft-7 readers
     whole = {"$schema": "http://json-schema.org/draft-07/schema#", **top, "definitions": definitions | partial}
-    return dict(msgspec.json.decode(msgspec.json.encode(whole)))  # plain lists and tables, defaults included
+    return dict(msgspec.to_builtins(whole))
 
 
 def _exclude(definitions: dict[str, Any]) -> None:
@@ -88,8 +89,13 @@ def _exclude(definitions: dict[str, Any]) -> None:
 
 
 def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with bounds of all numbers, and with names that do not end with a line end."""
+    """The same with bounds of all numbers, and with names that do not end with a line end.
+
+    Infinite defaults are left out: JSON has no infinity.
+    """
     result = _map_children(node, _bounded)
+    if result.get("default") == math.inf:
+        del result["default"]
     largest = {"number": LARGEST, "integer": WORD - 1}.get(str(node.get("type")))
     if largest is not None:
         if not {"minimum", "exclusiveMinimum"} & node.keys():

@@ -7,6 +7,7 @@ reference pages print the same entries.
 from __future__ import annotations
 
 import difflib
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -298,7 +299,7 @@ def written(value: object) -> str:
         )
     if isinstance(value, list | tuple):
         return "[" + ", ".join(written(each) for each in value) + "]"
-    return f"{value:g}" if isinstance(value, float) and value != int(value) else str(value)
+    return f"{value:g}" if isinstance(value, float) and not value.is_integer() else str(value)
 
 
 def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any], needed: Mapping[str, object]) -> str:
@@ -307,7 +308,7 @@ def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any],
     if found := [lines for document in _documents() for lines in _occurrences(document, parts, ())]:
         return min(found, key=len)
     value = field.get("default")
-    made = _made(field, definitions) if value in (None, {}, []) else value
+    made = _made(field, definitions) if value in (None, {}, [], math.inf) else value
     names = dict(_NAMES.values())
     return _lines(
         [(names.get(part, "A"), None) if part.isupper() else (part, part in _LISTS) for part in parts], made, needed
