@@ -18,6 +18,7 @@ import zenoh
 from msgspec import Meta
 from zenoh.handlers import Callback, FifoChannel
 
+from agents.clock import Clock
 from agents.errors import ExplainedError
 from agents.network import lab, messages
 from agents.network.access_control import Rights
@@ -142,6 +143,7 @@ class Guard:
     def __init__(self, session: zenoh.Session, known: lab.Register, realm: str) -> None:
         self._session, self._known, self._keys = session, known, Keys(realm)
         self._told: set[str] = set()
+        self._clock = Clock()
         self._hazards: deque[str] = deque()  # not published yet
         self._banned: set[str] = set()  # ids of sessions, which a client keeps when it connects again
         # in the receiving thread: each moment that a thief stays is one in which the robot is refused
@@ -163,7 +165,7 @@ class Guard:
             if count > MOST_TOKENS:
                 self._ban(links[zid], f"holds more than {MOST_TOKENS} liveliness tokens")
         while self._hazards:
-            event = messages.Event(time.time(), "hazard", "router", self._hazards.popleft())
+            event = messages.Event(self._clock.utc(), "hazard", "router", self._hazards.popleft())
             self._session.put(self._keys.event, messages.encode(event), encoding=messages.JSON)
 
     def _check(self, event: zenoh.LinkEvent) -> None:

@@ -33,7 +33,7 @@ def believed(stamp: float, predictor: Predictor) -> float:
     return neighbours.all[0].place(predictor, T + LATER)[0]
 
 
-def test_a_wrong_clock_moves_the_neighbours_of_those_who_predict():
+def test_wrong_clock_moves_predicted_neighbours():
     assert misbelieved(T + AHEAD_S, HOLD) == 0.0, "who holds the last pose does not look at its age"
     assert misbelieved(T + AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
     assert misbelieved(T - AHEAD_S, ConstantVelocity()) == pytest.approx(SPEED * AHEAD_S)
@@ -48,7 +48,7 @@ def test_corrected_where_stamps_are_made_it_moves_nobody(monkeypatch):
     assert misbelieved(T + clock.utc() - now, ConstantVelocity()) < 1e-6
 
 
-def test_a_step_of_the_wall_clock_moves_no_clock_that_was_read_before(monkeypatch):
+def test_step_of_the_wall_clock_moves_nothing(monkeypatch):
     wall, steady = 1000.0, 5.0
     monkeypatch.setattr(time, "time", lambda: wall)
     monkeypatch.setattr(time, "clock_gettime", lambda _clock: steady)
@@ -79,7 +79,7 @@ DATES = {
 }
 
 
-def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():
+def test_no_process_reads_the_wall_clock_itself():
     root = Path(__file__).resolve().parents[2]
     readers = {
         file: [line.strip() for line in file.read_text().splitlines() if "time.time" in line]
@@ -91,7 +91,7 @@ def test_no_process_of_a_run_reads_the_wall_clock_but_by_its_clock():
     assert once == []
 
 
-def test_a_process_that_is_started_after_a_step_of_the_wall_clock_reads_the_clock_of_the_others(tmp_path, monkeypatch):
+def test_later_process_reads_the_same_clock(tmp_path, monkeypatch):
     launcher = Launcher(tmp_path)
     launcher.clock = first = Clock()
     environments = []
@@ -107,7 +107,7 @@ def test_a_process_that_is_started_after_a_step_of_the_wall_clock_reads_the_cloc
     assert Clock(-0.2).at(now) == pytest.approx(first.at(now) - 0.2, abs=1e-6)
 
 
-def test_a_clock_follows_what_it_is_told_smoothly_and_never_back():
+def test_clock_follows_smoothly_and_never_back():
     clock, now, stamps = Clock(-0.2), 0.0, []
     clock.follow(correction_line(-0.23).strip())
     for _ in range(1000):
@@ -133,7 +133,7 @@ def test_nonsense_and_jumps_are_not_followed(line, capsys):
 
 
 @given(st.binary(max_size=60) | st.floats().map(lambda number: b"clock %r" % number))
-def test_whatever_is_told_moves_it_no_farther_than_drift_does(line):
+def test_slew_is_bounded_by_drift(line):
     clock = Clock(0.1)
     clock.follow(line)
     assert abs(clock.slew(1.0)) <= SLEW

@@ -131,8 +131,9 @@ def world() -> Iterator[Target]:
             process._tick(t)
             if process._pace.update(t, 0.01):
                 process._report(t)
-            state = process._population.state
-            assert np.isfinite(state.position[process._population.carried]).all()
+            population = process._population
+            for carried, state in zip(population.carried, population.states, strict=True):
+                assert not carried or is_finite(state.position)
 
         return take
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from agents.network.keys import Keys
 from agents.protocols import ros2
+from agents.vectors import is_finite
 from tests.fuzz.loopnet import Net, Sample
 from tests.fuzz.target import Place, Renewed, Target
 from tests.fuzz.targets_network import request
@@ -101,9 +102,9 @@ def turtlebot_bridge() -> Iterator[Target]:
             nonlocal t
             t += 0.01
             net.deliver(data, gone=len(data) % 16 == 0)
-            state = body.read(t)
-            assert np.isfinite(state.position).all()
-            body.command(np.array([[0.1, 0.2, 0.0, 0.0]]))
+            (state,) = body.read(t)
+            assert is_finite(state.position)
+            body.command([(0.1, 0.2, 0.0, 0.0)])
 
         return take
 
