@@ -26,7 +26,7 @@ BESIDE_M: Final = 0.1  # [m] unless there is more than this between the two, see
 class Preflight:
     """Checks of a robot, and the duration of their failure."""
 
-    __slots__ = ("_assignment", "_covered", "_limits", "_other_starts", "_since")
+    __slots__ = ("_assignment", "_covered", "_limits", "_nearest_start", "_other_starts", "_since")
 
     def __init__(self, assignment: Assignment) -> None:
         self._assignment, self._limits = assignment, assignment.limits
@@ -35,6 +35,7 @@ class Preflight:
         self._other_starts = [
             each for each in assignment.starts if hypot(each[1] - x, each[2] - y) > assignment.kind.radius + each[3]
         ]
+        self._nearest_start = min((hypot(each[1] - x, each[2] - y) for each in self._other_starts), default=inf)
 
     def check(self, now: Situation, missing: Sequence[str], neighbours: Neighbours, health: ProcessHealth) -> str:
         """First reason why the robot must not take off, empty if there is none.
@@ -89,6 +90,8 @@ class Preflight:
         away = hypot(x - start[0], y - start[1])
         if away > limit:
             yield f"it is {away:.2f} m from its start ({start[0]:g}, {start[1]:g}), more than {limit:g} m"
+        if 2.0 * away < self._nearest_start:  # nearer to its own than to any: none of a thousand need be asked
+            return
         places = [(hypot(x - other_x, y - other_y), name) for name, other_x, other_y, _ in self._other_starts]
         if places and min(places)[0] < away:
             yield f"it stands where {min(places)[1]} begins: addresses or markers are swapped"

@@ -10,7 +10,9 @@ import numpy as np
 
 from agents.arrays import Array, PoseTable, norm
 from agents.network.messages import Event
+from agents.plugins.laws import Distance
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.formation import law_offsets
 from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.recording.trace import Trace
@@ -202,9 +204,8 @@ def simulate(what: Experiment, start: Array, case: str, threshold: float, *, see
         for i in np.flatnonzero(speaks & (k < count - 1)):
             sent[names[i]].append(t)
         if k % 5 == 0:
-            away = seen[net.receiver] - held[net.sender]
-            pull = 0.5 * net.gain * (net.distance**2 - norm(away) ** 2)
-            step = np.clip(net.sum_by_receiver(pull[:, None] * away, rows), -0.1, 0.1) * [1.0, 1.0, 0.0]
+            offset = law_offsets(Distance(), seen, held[net.sender], net)
+            step = np.clip(offset, -0.1, 0.1) * [1.0, 1.0, 0.0]
             goal = np.where(moves[:, None], seen + step, place)
         place = place + STEP * 1.5 * (goal - seen) * moves[:, None]
         if what.timeline and what.timeline[0].at_s <= t < what.timeline[0].at_s + 5.0:

@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.arrays import norm
 from agents.decision.position_control import REACHED
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
+from agents.vectors import UNKNOWN, ZERO, norm
 from experiments.check.analysis import analyse
 from experiments.check.check import check, examine, figures
 from experiments.check.findings import Figures
@@ -111,19 +112,18 @@ def test_gains(gain, code):
         assert "below 6.8" in found[code][2]
 
 
-class Steep(msgspec.Struct, frozen=True):
+class Steep(Gradient, frozen=True):
     """A law with a gain of its own."""
 
     largest: float = 30.0
 
-    def offset(self, position, sender_position, links):
-        way = position[links.receiver] - sender_position
-        length = np.maximum(norm(way), 1e-6)
-        pull = self.largest * (links.distance - length) / length
-        return links.sum_by_receiver(pull[:, None] * way, len(position))
+    def pull(self, apart, link):
+        length = max(norm(apart), 1e-6)
+        share = self.largest * (link.distance - length) / length
+        return share * apart[0], share * apart[1], share * apart[2]
 
-    def error(self, position, sender_position, links):
-        return np.abs(links.distance - norm(position[links.receiver] - sender_position))
+    def error(self, apart, link):
+        return abs(link.distance - norm(apart))
 
 
 class Weak(Steep, frozen=True):
@@ -133,13 +133,10 @@ class Weak(Steep, frozen=True):
 
 
 class Undefined(Steep, frozen=True):
-    """A law that divides by the error, which is 0 where the formation is met."""
+    """A law that gives no number where the formation is met."""
 
-    def offset(self, position, sender_position, links):
-        off = links.distance - norm(position[links.receiver] - sender_position)
-        return (
-            super().offset(position, sender_position, links) * links.sum_by_receiver(0.0 / off, len(position))[:, None]
-        )
+    def pull(self, apart, link):
+        return ZERO if self.error(apart, link) > 1e-3 else UNKNOWN
 
 
 @pytest.mark.parametrize(

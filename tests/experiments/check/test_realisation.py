@@ -125,7 +125,7 @@ def test_robots_on_the_wrong_side_are_named():
     way = shape[1, :2] - shape[0, :2]
     across = np.array([-way[1], way[0]]) / np.linalg.norm(way)
     turned[4, :2] -= 2.0 * ((turned[4] - turned[0])[:2] @ across) * across
-    end = fitted_shape(wanted, None, turned, held)
+    end = fitted_shape(wanted, (), turned, held)
     assert end.worst > 0.05  # a local minimum
     (found,) = mirrored_robots(wanted, end.position, moves)
     assert found.row == 4

@@ -6,12 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.formation.anchors import Anchors
+from agents.formation.anchors import Anchor
+from agents.formation.link import BY_RELATIVE
 from agents.plugins.laws import Displacement, Distance
 from experiments.authoring import layouts
 from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
-from experiments.definition.graph import BY_RELATIVE, Links, links
+from experiments.definition.formation import anchor_offsets, law_offsets
+from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from experiments.file import document
 
@@ -29,10 +31,10 @@ def both_ways(made, gain):
     return links(pairs, distance, [gain] * len(pairs))
 
 
-def by_hand(law, net, position, share, anchors=None):
+def by_hand(law, net, position, share, anchors=()):
     """Eigenvalues by moving one coordinate of one robot at a time, with everybody hearing of it."""
     step, rows = 1e-4, len(position)
-    listeners = np.unique(np.concatenate([net.receiver, [] if anchors is None else anchors.row])).astype(int)
+    listeners = np.unique(np.concatenate([net.receiver, [row for row, _ in anchors]])).astype(int)
     columns = []
     for row in listeners:
         for axis in (0, 1):
@@ -40,8 +42,7 @@ def by_hand(law, net, position, share, anchors=None):
             for sign in (1.0, -1.0):
                 moved = position.copy()
                 moved[row, axis] += sign * step
-                offset = law.offset(moved, moved[net.sender], net)
-                offset = offset if anchors is None else offset + anchors.offset(moved)
+                offset = law_offsets(law, moved, moved[net.sender], net) + anchor_offsets(anchors, moved)
                 answers.append(offset[listeners, :2].ravel())
             columns.append((answers[0] - answers[1]) / (2.0 * step))
     taken = -np.repeat(share[listeners], 2)[:, None] * np.stack(columns, axis=1)
@@ -108,17 +109,16 @@ def test_modes_that_are_slower_than_the_run_are_free():
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 8), st.booleans())
-def test_one_link_of_every_robot_at_once_tells_as_much_as_one_robot_at_a_time(seed, rows, anchored):
+def test_derivative_by_links_is_that_by_robots(seed, rows, anchored):
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1.0, 1.0, (rows, 3))
     pairs = [(i, j) for i in range(rows) for j in range(rows) if i != j and rng.random() < 0.6] or [(1, 0)]
     distance = [float(np.linalg.norm(position[i] - position[j])) for i, j in pairs]
     net = links(pairs, distance, rng.uniform(0.2, 0.6, len(pairs)).tolist())
-    anchors = None
+    anchors = []
     if anchored:
-        one, zero = np.ones(1), np.zeros((1, 3))
-        reach = np.linalg.norm(position[:1], axis=1)
-        anchors = Anchors(np.array([0]), zero, zero, one, 0.0 * one, reach, 0.5 * one)
+        reach = float(np.linalg.norm(position[0]))
+        anchors = [(0, Anchor((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.0, reach, 0.5))]
     share = rng.uniform(0.05, 0.2, rows)
     values = by_hand(Distance(), net, position, share, anchors)
     found = modes(Distance(), net, position, share, 10.0, anchors=anchors)

@@ -1,4 +1,4 @@
-"""What robots are told: each its own part of the experiment, repetitions side by side."""
+"""Assignments: each robot has its own part of the experiment."""
 
 import math
 
@@ -13,7 +13,7 @@ from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta
 from experiments.definition import bodies
-from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Shadow, Start
+from experiments.definition.experiment import Arena, Experiment, Formation, Link, Rates, Robot, Start
 from experiments.definition.plan import Plan
 from experiments.file import document
 from twins.scene import Obstacle
@@ -26,20 +26,24 @@ def park():
     return document.read("robotic-park").cases()["periodic"]
 
 
-def test_everybody_together(park):
-    made = Plan(park).assignment(NAMES)
-    assert made.names == made.robots == NAMES
-    assert made.kinds == (TURTLEBOT3, KHEPERA4, KHEPERA4, KHEPERA4, CRAZYFLIE, CRAZYFLIE, CRAZYFLIE)
-    np.testing.assert_array_equal(made.hover, [np.nan] * 4 + [0.8] * 3)
+def test_the_part_of_the_leader(park):
+    made = Plan(park).assignment("TB01")
+    assert (made.name, made.kind, made.neighbours, made.guided) == ("TB01", TURTLEBOT3, (), False)
+    assert math.isnan(made.hover)
     assert made.law == Distance()
     assert made.trigger == Periodic(period_s=0.02)
     assert (made.clamp, made.tracking_gain, made.duration) == (0.1, 3.0, 45.0)
     assert (made.body_hz, made.pose_every, made.decide_every) == (100.0, 2, 10)
     assert made.patience_s is None
-    ((rows, (leg,)),) = made.legs
-    assert rows.tolist() == [0]
-    assert leg.at == 21.0
-    assert leg.planner == Line(move_by=[0.75, 0.0], speed_=0.15)
+    (leg,) = made.legs
+    assert (leg.at, leg.planner) == (21.0, Line(move_by=[0.75, 0.0], speed_=0.15))
+
+
+def test_kinds_and_heights_of_all(park):
+    parts = [Plan(park).assignment(name) for name in NAMES]
+    assert [part.kind for part in parts] == [TURTLEBOT3] + [KHEPERA4] * 3 + [CRAZYFLIE] * 3
+    assert [part.ground for part in parts] == [0.0] * 4 + [0.8] * 3
+    assert [bool(part.legs) for part in parts] == [True] + [False] * 6
 
 
 def test_the_links_of_the_paper(park):
@@ -63,35 +67,17 @@ def test_the_links_of_the_paper(park):
     np.testing.assert_array_equal(net.gain, np.where(by_drone, 1.0, 3.0))
 
 
-@pytest.mark.parametrize("names", [("CF01",), ("KH02", "CF03"), ("CF03", "TB01", "KH02")])
-def test_some_robots_in_any_order_know_their_own_part(park, names):
-    made, whole = Plan(park).assignment(names), Plan(park).links
-    assert made.names == names
-    assert made.robots == NAMES
-
-    def table(net, listeners):
-        return {(listeners[i], NAMES[j], d) for i, j, d in zip(net.receiver, net.sender, net.distance, strict=True)}
-
-    mine, everyone = table(made.links, names), table(whole, NAMES)
-    assert mine == {link for link in everyone if link[0] in names}
-    planned = [names[row] for rows, _ in made.legs for row in rows]
-    assert planned == [name for name in names if name == "TB01"]
+@pytest.mark.parametrize("name", NAMES)
+def test_a_robot_knows_its_own_links(park, name):
+    made, whole = Plan(park).assignment(name), Plan(park).links
+    row = NAMES.index(name)
+    wanted = zip(whole.receiver.tolist(), whole.sender.tolist(), whole.distance.tolist(), strict=True)
+    assert [(link.sender, link.distance) for link in made.neighbours] == [(j, d) for i, j, d in wanted if i == row]
+    assert all(link.name == NAMES[link.sender] and link.in_law for link in made.neighbours)
 
 
-def test_repetitions_stand_side_by_side(park):
-    made = Plan(park).assignment(NAMES, copies=3)
-    assert made.names == made.robots == NAMES * 3
-    assert len(made.links) == 3 * len(Plan(park).links)
-    assert (made.links.receiver // 7 == made.links.sender // 7).all()
-    ((rows, _),) = made.legs
-    assert rows.tolist() == [0, 7, 14]
-    assert made.hover.shape == (21,)
-    with pytest.raises(ValueError, match="only the whole experiment can be repeated"):
-        Plan(park).assignment(NAMES[1:], copies=2)
-
-
-def test_requests_differ_in_seeds_only(park):
-    made, other = (bodies.body_request(park, NAMES, seed) for seed in (5, 6))
+def test_bodies_of_other_seeds_are_alike(park):
+    made, other = bodies.body_request(park, NAMES, 5), bodies.body_request(park, NAMES, 6)
     assert made.names == NAMES
     assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
     assert made.addresses == ("twin",) * 7
@@ -99,22 +85,6 @@ def test_requests_differ_in_seeds_only(park):
     assert made.start == other.start
     assert (made.start[0], made.start[4]) == ((-0.6, 0.8, 0.0), (-0.2, 0.4, 0.0))
     assert made.disturbance == other.disturbance
-
-
-def test_quiet_request_keeps_latencies():
-    noisy = Disturbance(position_sigma=0.1, latency_s=0.2)
-    given = experiment(disturbance={"all": noisy})
-    assert bodies.body_request(given, ("A",), 1).disturbance == (noisy,)
-    assert bodies.body_request(given, ("A",), 1, quiet=True).disturbance == (Disturbance(latency_s=0.2),)
-
-
-def test_shadow_periods_are_infinite_for_once():
-    given = experiment()
-    given.robots["A"] = msgspec.structs.replace(given.robots["A"], shadow=Shadow())
-    given.robots["B"] = msgspec.structs.replace(given.robots["B"], shadow=Shadow(restart_s=None))
-    every, once, none = bodies.shadow_periods(given, ("A", "B", "C"))
-    assert (every, once) == (Shadow().restart_s, math.inf)
-    assert math.isnan(none)
 
 
 def experiment(**parts):
@@ -134,12 +104,11 @@ def test_starts_are_on_the_floor_with_a_yaw():
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
     given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
-    made = Plan(given).limits([])
-    np.testing.assert_array_equal(made.low, [-1.0, -1.5, 0.0])
-    np.testing.assert_array_equal(made.high, [1.0, 1.5, 4.0])
+    made = Plan(given).limits("A")
+    assert (made.low, made.high) == ((-1.0, -1.5, 0.0), (1.0, 1.5, 4.0))
     assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
     assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
-    assert Plan(experiment()).limits([]).top_speed == np.inf
+    assert Plan(experiment()).limits("A").top_speed == np.inf
 
 
 def test_links_may_have_gains_of_their_own():
@@ -178,13 +147,11 @@ def test_disturbances_merge_field_by_field_the_narrower_wins():
 def test_rates_patience_and_triggers():
     rates = Rates(body_hz=200.0, pose_hz=40.0, coordination_hz=20.0)
     trigger = {"kind": "send-on-delta", "threshold": 0.02, "maximum_silence_s": 1.0}
-    made = Plan(experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger)).assignment(
-        ("A", "B", "C")
-    )
+    made = Plan(experiment(rates=rates, start=Start(deadline_s=7.0, missing="go-on"), trigger=trigger)).assignment("A")
     assert (made.body_hz, made.pose_every, made.decide_every, made.patience_s) == (200.0, 5, 10, 7.0)
     assert made.trigger == SendOnDelta(threshold=0.02, maximum_silence_s=1.0)
     with pytest.raises(msgspec.ValidationError, match="threshold"):
-        Plan(experiment(trigger={**trigger, "threshold": -1.0})).assignment(("A",))
+        Plan(experiment(trigger={**trigger, "threshold": -1.0})).assignment("A")
 
 
 def test_robots_are_not_scattered_into_obstacles():

@@ -4,17 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.decision.lifecycle import DONE
-from agents.plugins import registry
 from experiments.check import check
 from experiments.check.realisation import contradictions
-from experiments.definition.experiment import Start
 from experiments.definition.formation import compile_anchors, errors_over_time
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.metrics.signals import net_rotation
 from experiments.virtual_time import simulation
-from tests.agents.swarm import Swarm
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 
@@ -83,13 +79,13 @@ def written(tmp_path):
     return read
 
 
-def flown(experiment, seeds=(1,)):
+def flown(experiment):
     """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
-    log = simulation.simulate(experiment, seeds)
+    log = simulation.simulate(experiment, 1)
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
-    time, position = log.time[running], log.true_position[running][:, : len(log.names)]
-    law = registry.build(registry.LAWS, experiment.formation.law)
-    return time, position, errors_over_time(law, Plan(experiment).formation, time, position)
+    time, position = log.time[running], log.true_position[running]
+    plan = Plan(experiment)
+    return time, position, errors_over_time(plan.law, plan.formation, time, position)
 
 
 def codes(given):
@@ -130,12 +126,12 @@ def test_anchors_from_the_file(written):
         written(
             "[formation.anchors]\nA = 1.0\nB = { along = [0.0, 2.0], to = [0.5, 0.0] }\nC = { across = [0, 0, 1], "
             'distance = 0.6 }\nD = { distance = 0.7, gain = 9.0 }\n[formation.links]\n"A - B" = 0.5'
-        ).experiment,
-        ("A", "B", "C", "D"),
+        ).experiment
     )
-    assert anchors.gain.tolist() == [6.0, 0.5, 6.0, 9.0]
+    assert [anchor.gain for (anchor,) in anchors.values()] == [6.0, 0.5, 6.0, 9.0]
     place = np.array([[1.0, 0.0, 0.0], [0.5, 7.0, 0.0], [3.0, 4.0, 0.6], [0.0, 0.7, 0.0]])
-    np.testing.assert_allclose(anchors.error(place), 0.0, atol=1e-15)
+    for (anchor,), at in zip(anchors.values(), place.tolist(), strict=True):
+        assert anchor.error(tuple(at)) == pytest.approx(0.0, abs=1e-15)
 
 
 # ---------------------------------------------------------------- in motion
@@ -207,28 +203,6 @@ def test_a_leader_that_listens_holds_its_plan_and_the_others_back(written):
     assert error[-1].max() < 0.05
 
 
-def test_everything_that_changes_is_the_same_whoever_shares_a_process(written):
-    text = MIXED + "[formation.anchors]\nD = { along = [1.0, 0.3] }\n[formation.proximity]\nrange = 1.4\n"
-    text += '[[formation.changes]]\nat_s = 1.0\nover_s = 2.0\nscale = 1.2\nrotate = 0.4\nlinks = { "C - D" = 0.6 }\n'
-    experiment = written(
-        text.replace('"B - C" = 0.8', '"B - C" = { distance = 0.8, from_s = 1.5, until_s = 3.0 }'), 4.0
-    )
-    experiment = experiment.experiment
-    names = tuple(experiment.robots)
-    together = Swarm(experiment, [names]).until(DONE)
-    apart = Swarm(experiment, [["C", "A"], ["B"], ["D"]]).until(DONE)
-    assert apart.sent == together.sent
-    for what in ("goal", "error", "setpoint", "truth"):
-        np.testing.assert_array_equal(apart.column(what), together.column(what), err_msg=what)
-
-
-def test_repetitions_side_by_side_are_as_they_are_alone(written):
-    text = SQUARE + "[formation.anchors]\nA = { distance = 0.4 }\n[[formation.changes]]\nat_s = 1.0\nrotate = 0.5\n"
-    experiment = msgspec.structs.replace(written(text, 4.0).experiment, start=Start(scatter=0.1))
-    both, alone = simulation.simulate(experiment, [3, 4]), simulation.simulate(experiment, [4])
-    np.testing.assert_array_equal(both.true_position[:, 4:], alone.true_position)
-
-
 def test_a_calm_event_triggered_ring_does_not_turn():
     """Five drones with half the gain that they bear, send-on-delta at 1 cm, nothing that disturbs them."""
     angle = 2 * np.pi * np.arange(5) / 5
@@ -242,11 +216,10 @@ def test_a_calm_event_triggered_ring_does_not_turn():
     rates, sent = [], []
     for gain in (0.5, 3.0):
         given["formation"]["gain"] = gain
-        log = simulation.simulate(msgspec.convert(given, document.Experiment), [200, 201, 202])
-        late = (log.time > 30.0) & (log.time < 60.0)
-        turns = [net_rotation(log.true_position[late][:, 5 * k : 5 * k + 5], log.time[late]) for k in range(3)]
-        rates.append(np.abs(turns).max())
-        sent.append(len(log.sent))
+        logs = [simulation.simulate(msgspec.convert(given, document.Experiment), seed) for seed in (200, 201)]
+        late = (logs[0].time > 30.0) & (logs[0].time < 60.0)
+        rates.append(max(abs(net_rotation(log.true_position[late], log.time[late])) for log in logs))
+        sent.append(sum(len(log.sent) for log in logs))
     assert rates[0] < 1e-9
     assert rates[1] > 1e-4
     assert sent[0] < sent[1] / 5

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.definition.rigidity import rigidity, rigidity_matrix
 from experiments.definition.graph import Links, adjacency, components, degree, edges, laplacian, links, reachable
+from experiments.definition.rigidity import rigidity, rigidity_matrix
 
 NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 PLACES = np.array(
@@ -83,57 +83,11 @@ def test_reached_and_components_are_those_of_networkx(made, data):
     assert {tuple(edge) for edge in edges(net).tolist()} == undirected
 
 
-@FEW
-@given(digraphs(), st.integers(1, 4))
-def test_sums_over_listeners_are_those_of_a_plain_loop(made, width):
-    rows, pairs = made
-    net = network(pairs)
-    value = np.random.default_rng(len(pairs)).normal(size=(len(pairs), width))
-    total = np.zeros((rows, width))
-    for link, listener in enumerate(net.receiver):
-        total[listener] += value[link]
-    np.testing.assert_allclose(net.sum_by_receiver(value, rows), total, rtol=0, atol=1e-14)
-
-
-@FEW
-@given(digraphs(), st.data())
-def test_the_links_of_some_rows_in_any_order(made, data):
-    rows, pairs = made
-    net = network(pairs)
-    own = np.array(data.draw(st.lists(st.integers(0, rows - 1), unique=True)), dtype=np.intp)
-    part = net.to_receivers(own)
-    assert (np.diff(part.receiver) >= 0).all()
-    known = {(i, j): (d, g) for i, j, d, g in zip(net.receiver, net.sender, net.distance, net.gain, strict=True)}
-    kept = {
-        (own[i], j): (d, g) for i, j, d, g in zip(part.receiver, part.sender, part.distance, part.gain, strict=True)
-    }
-    assert kept == {pair: value for pair, value in known.items() if pair[0] in own}
-    assert len(part) == len(kept)
-
-
-@FEW
-@given(digraphs(), st.integers(1, 4))
-def test_repetitions_stand_behind_one_another(made, times):
-    rows, pairs = made
-    net = network(pairs)
-    many = net.repeated(times, rows)
-    assert len(many) == times * len(net)
-    assert (np.diff(many.receiver) >= 0).all()
-    for copy in range(times):
-        mine = many.to_receivers(np.arange(copy * rows, (copy + 1) * rows))
-        np.testing.assert_array_equal(mine.receiver, net.receiver)
-        np.testing.assert_array_equal(mine.sender - copy * rows, net.sender)
-        np.testing.assert_array_equal(mine.distance, net.distance)
-        np.testing.assert_array_equal(mine.gain, net.gain)
-
-
 def test_no_links_at_all():
     net = links([], [], [])
     assert len(net) == 0
-    np.testing.assert_array_equal(net.sum_by_receiver(np.zeros((0, 3)), 4), np.zeros((4, 3)))
-    assert len(net.to_receivers(np.arange(4))) == len(net.repeated(3, 4)) == len(edges(net)) == 0
+    assert len(edges(net)) == 0
     assert components(net, 4) == 4
-    assert len(links([(0, 1)], [1.0], [1.0]).to_receivers(np.zeros(0, dtype=np.intp))) == 0
 
 
 def test_the_reference_network():

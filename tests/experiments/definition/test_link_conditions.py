@@ -1,6 +1,5 @@
 """[channel] of a file: what it means for each link, by name; and everything that can be wrong with it."""
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -25,34 +24,29 @@ def experiment(channel=None, **parts):
     return Experiment(**{**given, **parts})
 
 
-def virtual(channel, seeds=(1,)):
-    chosen = experiment(channel)
-    return link_conditions.virtual_conditions(chosen, Plan(chosen).assignment(NAMES, copies=len(seeds)).links, seeds)
+ENDS = (("B", "A"), ("A", "B"), ("A", "C"), ("B", "C"))  # sender and receiver of each link
 
 
-def at(channel, *names):
-    chosen = experiment(channel)
-    return link_conditions.receiver_conditions(chosen, Plan(chosen).assignment(names).links, names)
+def conditions(channel, seed=1, **how):
+    return link_conditions.conditions_of(experiment(channel), ENDS, seed, **how)
 
 
 def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
-    assert virtual(Channel()).delay.tolist() == [0.001] * 4
-    assert at(Channel(), "A").delay.tolist() == [0.0]
-    assert at(Channel(delay_s=0.02), "A").delay.tolist() == [0.02]
+    assert [link.delay for link in conditions(Channel())] == [0.001] * 4
+    assert [link.delay for link in conditions(Channel(), real=True)] == [0.0] * 4
+    assert [link.delay for link in conditions(Channel(delay_s=0.02), real=True)] == [0.02] * 4
     assert not link_conditions.models_network(experiment())
     assert link_conditions.models_network(experiment(Channel(loss=0.1)))
 
 
 def test_links_have_their_own():
     own = {"A > C": LinkChannel(loss=0.3, burst=4.0), "A - B": LinkChannel(delay_s=0.1, bandwidth=1e4)}
-    made = virtual(Channel(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
-    assert made.loss.tolist() == [0.1, 0.1, 0.3, 0.1]
-    np.testing.assert_array_equal(made.burst, [np.nan, np.nan, 4.0, np.nan])
-    assert made.delay.tolist() == [0.1, 0.1, 0.001, 0.001]
-    assert made.bandwidth.tolist() == [1e4, 1e4, np.inf, np.inf]
-    assert made.jitter.tolist() == [0.01] * 4
-    assert made.queue.tolist() == [0.2] * 4
-    assert made.duration == 10.0
+    made = conditions(Channel(loss=0.1, jitter_s=0.01, queue_s=0.2, links=own))
+    assert [link.loss for link in made] == [0.1, 0.1, 0.3, 0.1]
+    np.testing.assert_array_equal([link.burst for link in made], [np.nan, np.nan, 4.0, np.nan])
+    assert [link.delay for link in made] == [0.1, 0.1, 0.001, 0.001]
+    assert [link.bandwidth for link in made] == [1e4, 1e4, np.inf, np.inf]
+    assert {(link.jitter, link.queue) for link in made} == {(0.01, 0.2)}
 
 
 def test_outages_of_links_of_robots_and_of_all():
@@ -61,38 +55,18 @@ def test_outages_of_links_of_robots_and_of_all():
         Outage(from_s=3.0, links=["A > B", "B > C"]),
         Outage(from_s=4.0, until_s=5.0, robots=["B"]),
     ]
-    made = virtual(Channel(outages=outages), seeds=(1, 2)).outages
-    assert [(each.begin, each.end) for each in made] == [(1.0, 2.0), (3.0, np.inf), (4.0, 5.0)]
-    assert [each.links[:4].tolist() for each in made] == [
-        [True] * 4,
-        [False, True, False, True],
-        [True, True, False, True],
+    every, some, of_robot = (1.0, 2.0), (3.0, np.inf), (4.0, 5.0)
+    assert [[*link.outages] for link in conditions(Channel(outages=outages))] == [
+        [every, of_robot],
+        [every, some, of_robot],
+        [every],
+        [every, some, of_robot],
     ]
-    for each in made:
-        np.testing.assert_array_equal(each.links[4:], each.links[:4])
 
 
-def test_keys_come_from_the_seed_and_the_names_wherever_the_link_is():
-    channel = Channel(loss=0.2, links={"A > C": LinkChannel(loss=0.5)})
-    both = virtual(channel, seeds=(1, 7))
-    ends = [("B", "A"), ("A", "B"), ("A", "C"), ("B", "C")]
-    assert both.key.tolist() == [channel_model.key(seed, *names) for seed in (1, 7) for names in ends]
-    for names in (("A",), ("B",), ("C",), ("C", "A"), NAMES):  # processes with some of the robots
-        here = at(channel, *names)
-        links = Plan(experiment(channel)).assignment(names).links
-        for k, (i, j) in enumerate(zip(links.receiver, links.sender, strict=True)):
-            k_all = ends.index((NAMES[j], names[i]))
-            assert here.key[k] == both.key[k_all]
-            assert here.loss[k] == both.loss[k_all]
-
-
-def test_another_robot_does_not_change_the_luck_of_the_others():
-    channel = Channel(loss=0.2)
-    bigger = experiment(channel)
-    robots = {"Z": Robot(kind="khepera4", start=[0.0, 1.0]), **bigger.robots}
-    bigger = msgspec.structs.replace(bigger, robots=robots)
-    made = link_conditions.virtual_conditions(bigger, Plan(bigger).assignment(tuple(robots)).links, [1])
-    assert made.key.tolist() == virtual(channel).key.tolist()
+def test_keys_come_from_the_seed_and_the_names():
+    made = conditions(Channel(loss=0.2, links={"A > C": LinkChannel(loss=0.5)}), seed=7)
+    assert [link.key for link in made] == [channel_model.key(7, *names) for names in ENDS]
 
 
 def wrong(channel, **parts):
@@ -157,7 +131,7 @@ def test_links_that_only_avoidance_hears_are_links():
     everybody = {"kind": "potential", "hears": "all"}
     assert wrong(channel, avoidance=everybody) == []
     chosen = experiment(channel, avoidance=everybody)
-    links = Plan(chosen).assignment(NAMES).links
-    made = link_conditions.virtual_conditions(chosen, links, [1])
-    ((k),) = np.flatnonzero(made.loss)
-    assert (NAMES[links.receiver[k]], NAMES[links.sender[k]]) == ("A", "C")
+    links = Plan(chosen).pose_links
+    ends = [(NAMES[j], NAMES[i]) for i, j in zip(links.receiver, links.sender, strict=True)]
+    made = link_conditions.conditions_of(chosen, ends, 1)
+    assert [pair for pair, link in zip(ends, made, strict=True) if link.loss] == [("C", "A")]

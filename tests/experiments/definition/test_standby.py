@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-
 from agents.agent import Agent
+
 from agents.body.interface import BodyState
 from agents.network import messages
 from experiments import run

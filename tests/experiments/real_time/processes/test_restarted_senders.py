@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-
 from agents.agent import Agent
+
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
