@@ -1,7 +1,7 @@
 """Robots whose position, body or neighbours fail: each ends stopped or landed, and no drone comes up again."""
 
 import random
-from math import dist, isfinite, isnan, nan
+from math import dist, inf, isfinite, isnan, nan
 
 import pytest
 
@@ -36,6 +36,18 @@ def shifted(x, y=0.0):
 def cause(swarm, name):
     """Causes of the incidents of a robot so far."""
     return {incident.cause for incident in swarm.robot(name).hazards.incidents}
+
+
+def told(swarm, seconds):
+    """Texts of new incidents of each robot in some seconds."""
+    texts = {name: [] for name in swarm.names}
+    for _ in range(round(seconds / swarm.dt)):
+        swarm.step()
+        for name in swarm.names:
+            incidents = swarm.robot(name).hazards.incidents
+            texts[name] += [incident.text for incident in incidents]
+            incidents.clear()
+    return texts
 
 
 def climbing(seconds):
@@ -78,6 +90,16 @@ def test_blind_wheels_stop_and_go_on(what):
     assert any(swarm.run(0.3).last("A", "setpoint"))
 
 
+def test_wheels_with_an_old_position_know_no_error():
+    swarm = Swarm(pair()).running().run(0.3)
+    swarm.spoil("A", frozen(swarm.t))
+    swarm.run(0.4)
+    assert isfinite(swarm.robot("A").error)
+    swarm.run(0.3)
+    assert isnan(swarm.robot("A").error)
+    assert isfinite(swarm.robot("B").error)
+
+
 def test_followers_of_blind_wheels_stop():
     robots = {"A": Robot(kind="khepera4", start=[-1.5, 0.0]), "B": Robot(kind="khepera4", start=[-1.0, 0.0])}
     shape = Formation(links={"B > A": 0.5})
@@ -103,13 +125,51 @@ def test_wheels_that_jumped_hold_until_started():
     assert any(swarm.run(1.0).last("A", "setpoint"))
 
 
-def test_drone_that_jumped_lands():
-    swarm = drone().running().run(0.5)
-    swarm.spoil("F", shifted(0.8))
-    swarm.run(2.0)
-    assert Cause.POSITION in cause(swarm, "F")
-    swarm.until(DONE)
-    assert swarm.last("F", "truth")[2] == 0.0
+def jump(swarm, name, lasts_s, off=1.0):
+    """The measured position of a robot is `off` [m] for a time."""
+    begin = swarm.t
+
+    def spoil(state):
+        if swarm.t < begin + lasts_s:
+            x, y, z = state.position
+            state.position = (x, y + off, z)
+
+    swarm.spoil(name, spoil)
+
+
+@pytest.mark.parametrize(("lasts_s", "lands"), [(0.01, False), (0.25, False), (0.5, True)])
+def test_drone_that_jumped_lands_unless_back(lasts_s, lands):
+    swarm = drone().running().run(0.3)
+    place = swarm.last("F", "truth")
+    jump(swarm, "F", lasts_s)
+    texts = told(swarm, 2.0)["F"]
+    assert (swarm.phase("F") >= LANDING) == lands
+    assert texts[0].startswith("hold: its own position is lost: it jumped by 1.0")
+    assert dist(swarm.last("F", "truth")[:2], place[:2]) < 0.1
+
+
+@pytest.mark.parametrize("begins", ["climbing", "running", "landing"])
+def test_refused_far_position_cuts_no_motors(begins):
+    swarm = climbing(0.8) if begins == "climbing" else drone().running().run(0.3)
+    if begins == "landing":
+        swarm.robot("F").lifecycle.land("by a test")
+        swarm.run(0.2)
+    jump(swarm, "F", inf, off=1e5)
+    while swarm.phase("F") != DONE:
+        swarm.step()
+        assert isnan(swarm.robot("F").now.position[0])
+        assert Cause.FAR_OUTSIDE not in cause(swarm, "F")
+    assert swarm.last("F", "truth")[2] < 0.05  # it has landed
+
+
+@pytest.mark.slow
+def test_jumped_wheels_lead_nobody_astray():
+    swarm = Swarm(pair()).running().run(10.0)
+    before = {name: swarm.last(name, "truth") for name in "AB"}
+    jump(swarm, "A", inf)
+    texts = told(swarm, 20.0)
+    assert all(dist(swarm.last(name, "truth"), before[name]) < 0.01 for name in "AB")
+    assert texts == {"A": ["hold: its own position is lost: it jumped by 1.00 m"], "B": []}
 
 
 def test_wheels_whose_yaw_jumps_stand():
@@ -195,12 +255,12 @@ def test_stubborn_wheels_are_found():
     assert swarm.phase("A") >= LANDING
 
 
-def test_silent_body_with_a_fast_clock_is_lost():
+@pytest.mark.parametrize("ahead_s", [0.3, 100.0, inf])
+def test_silent_body_with_a_fast_clock_lands(ahead_s):
     """Stamps that are ahead would never become old."""
     swarm = drone().running().run(0.5)
-    begin = swarm.t
-    swarm.spoil("F", frozen(begin + 100.0))
-    swarm.run(1.0)
+    swarm.spoil("F", frozen(swarm.t + ahead_s))
+    swarm.run(1.5)
     assert swarm.phase("F") >= LANDING
     assert swarm.robot("F").lifecycle.reason == "its own position is lost"
 
@@ -230,12 +290,33 @@ def test_law_that_wants_nonsense_is_stopped(kind, monkeypatch):
         assert swarm.phase(name) >= LANDING or swarm.last(name, "setpoint")[:2] == (0.0, 0.0)
 
 
+def test_nonsense_is_known_before_take_off(monkeypatch):
+    robots = {"A": Robot(kind="khepera4", start=[-0.3, 0.0]), "B": Robot(kind="khepera4", start=[0.3, 0.0])}
+    monkeypatch.setattr(Plan, "law", Mad())
+    swarm = Swarm(pair(robots=robots))
+    swarm.run(0.2)
+    life = swarm.robot("A").lifecycle
+    assert (life.phase, life.reason) == (IDLE, "its law wants something that is not finite")
+    assert life.takeoff()
+
+
+def test_robots_that_nearly_touch_land():
+    experiment = pair()
+    swarm = Swarm(changed(experiment, safety=changed(experiment.safety, separation=0.3))).running().run(0.5)
+    x, y, z = swarm.last("A", "position")
+    swarm.robot("A").neighbours.receive(0, (x + 0.14, y, z), (0.0, 0.0, 0.0), 99.0, 99.0)
+    swarm.step()
+    swarm.step()
+    assert swarm.phase("A") >= LANDING
+    assert swarm.robot("A").lifecycle.reason == "far too near to another robot"
+    assert swarm.phase("B") == RUNNING  # it knows better where it is itself
+
+
 def test_robots_too_near_stop_and_go_on():
     experiment = pair(formation=Formation(links={"A - B": 0.35}))
     swarm = Swarm(changed(experiment, safety=changed(experiment.safety, separation=0.3))).running().run(0.5)
     x, y, _ = swarm.last("A", "position")
-    for place in ((x + 0.25, y, 0.0),):
-        swarm.robot("A").neighbours.receive(0, place, (0.0, 0.0, 0.0), swarm.t, swarm.t)
+    swarm.robot("A").neighbours.receive(0, (x + 0.25, y, 0.0), (0.0, 0.0, 0.0), swarm.t, swarm.t)
     swarm.muted.add(("B", "A"))
     swarm.run(0.3)
     assert Cause.SEPARATION in cause(swarm, "A")
