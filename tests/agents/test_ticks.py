@@ -28,7 +28,7 @@ class Loop:
         return self
 
 
-def test_a_loop_in_time_begins_each_tick_at_its_time():
+def test_ticks_in_time_begin_at_their_times():
     loop = Loop()
     for _ in range(5):
         loop.turn(works=0.8 * PERIOD)
@@ -38,7 +38,7 @@ def test_a_loop_in_time_begins_each_tick_at_its_time():
 
 
 @pytest.mark.parametrize(("works", "skipped", "late"), [(1.75, 0, 0.75), (2.0, 1, 0.0), (4.25, 3, 0.25)])
-def test_a_loop_that_comes_late_skips_what_is_over_and_keeps_the_times_of_the_rest(works, skipped, late):
+def test_late_loop_skips_ticks_that_are_over(works, skipped, late):
     loop = Loop().turn(works=works * PERIOD).turn()
     assert loop.skipped == [0, skipped]
     assert loop.times == [0.0, (1 + skipped) * PERIOD]
@@ -46,7 +46,7 @@ def test_a_loop_that_comes_late_skips_what_is_over_and_keeps_the_times_of_the_re
     assert loop.turn().begun[-1] == (2 + skipped) * PERIOD, "in time again"
 
 
-def test_some_ticks_are_made_up_for_and_older_ones_are_skipped():
+def test_few_ticks_are_made_up_for():
     loop = Loop(catch_up=3).turn(works=6.0 * PERIOD)
     for _ in range(5):
         loop.turn()
@@ -55,13 +55,13 @@ def test_some_ticks_are_made_up_for_and_older_ones_are_skipped():
     assert loop.begun == [0.0, *(k * PERIOD for k in (6, 6, 6, 6, 7))]
 
 
-def test_a_wait_that_lasts_too_long_delays_a_tick_and_skips_none():
+def test_long_wait_delays_and_skips_none():
     loop = Loop().turn().turn(oversleeps=1.5 * PERIOD).turn().turn()
     assert loop.skipped == [0, 0, 0, 0]
     assert loop.begun == [0.0, 2.5 * PERIOD, 2.5 * PERIOD, 3.0 * PERIOD]
 
 
-def test_a_loop_that_asks_again_after_another_wait_skips_from_where_it_is():
+def test_second_wait_skips_from_the_present():
     loop = Loop()
     loop.turn()
     loop.now += 2.5 * PERIOD
@@ -72,7 +72,7 @@ def test_a_loop_that_asks_again_after_another_wait_skips_from_where_it_is():
     assert loop.times[-1] == 10 * PERIOD
 
 
-def test_time_goes_on_from_the_start_and_with_a_slewed_clock():
+def test_time_follows_a_slewed_clock():
     loop = Loop()
     loop.now += 60.0
     assert loop.ticks.start() == BEGIN + 60.0
@@ -84,7 +84,7 @@ def test_time_goes_on_from_the_start_and_with_a_slewed_clock():
 
 
 @pytest.mark.parametrize(("at", "following"), [(5.4, 1.4), (5.0, 2.0), (1.01, 1.01), (0.3, 1.3)])
-def test_aligned_ticks_fall_on_a_time_and_follow_within_a_period(at, following):
+def test_aligned_ticks_fall_on_a_time(at, following):
     loop = Loop().turn().turn()  # at 0 and 1
     loop.ticks.align(at * PERIOD)
     assert loop.ticks.next == pytest.approx(following * PERIOD)
@@ -92,7 +92,7 @@ def test_aligned_ticks_fall_on_a_time_and_follow_within_a_period(at, following):
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 5.0)), max_size=40), st.integers(0, 4))
-def test_each_time_is_begun_or_skipped_once_and_none_before_it_is_due(delays, catch_up):
+def test_each_tick_is_begun_or_skipped_once(delays, catch_up):
     loop = Loop(catch_up=catch_up)
     for works, oversleeps in delays:
         before = loop.ticks.next

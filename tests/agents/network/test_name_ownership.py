@@ -123,13 +123,13 @@ def faked(monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(120))
-def test_of_several_that_claim_a_name_together_exactly_one_owns_it(seed, faked):
+def test_exactly_one_of_several_claims_succeeds(seed, faked):
     starts = {"a": 1.0, "b": 2.0, "c": 2.0}
     results = faked(Table(seed)).run({who: starts[who] for who in ("a", "b", "c")[: 2 + seed % 2]})
     assert sorted(isinstance(result, list) for result in results.values()) == [False] * (len(results) - 1) + [True]
 
 
-def test_an_owner_keeps_its_name_although_its_clock_is_ahead(faked):
+def test_owner_with_a_fast_clock_keeps_its_name(faked):
     table = faked(Table(0))
     first = table.run({"owner": 100.0})
     assert isinstance(first["owner"], list)
@@ -138,7 +138,7 @@ def test_an_owner_keeps_its_name_although_its_clock_is_ahead(faked):
     assert not any("later" in token for token in table.tokens)  # it leaves nothing behind
 
 
-def test_the_name_of_a_dead_owner_is_free_once_its_tokens_are_gone(faked, monkeypatch):
+def test_name_is_free_without_its_tokens(faked, monkeypatch):
     table = faked(Table(0))
     table.run({"dead": 1.0})
     step = table.step
@@ -172,7 +172,7 @@ def woken(table: Table, who: str, tokens: list[str]) -> Callable[[], object]:
 
 
 @pytest.mark.parametrize("seed", range(120))
-def test_of_an_owner_that_wakes_and_one_that_takes_its_name_at_most_one_drives_the_body(seed, faked):
+def test_at_most_one_owner_drives_the_body(seed, faked):
     table = faked(Table(seed))
     table.run({"old": 1.0})
     new = partial(claim, Session(table, "new"), [KEY], began=2.0)
@@ -182,7 +182,7 @@ def test_of_an_owner_that_wakes_and_one_that_takes_its_name_at_most_one_drives_t
 
 
 @pytest.mark.parametrize("began", [0.5, 2.0])  # the clock of the new one may be behind
-def test_an_owner_that_wakes_gives_way_to_the_one_that_took_its_name(began, faked):
+def test_waking_owner_gives_way(began, faked):
     table = faked(Table(0))
     table.run({"old": 1.0})
     lost = asleep(table, "old")
@@ -191,14 +191,14 @@ def test_an_owner_that_wakes_gives_way_to_the_one_that_took_its_name(began, fake
     assert Keys.life(KEY, "new") in table.tokens
 
 
-def test_an_owner_that_wakes_alone_keeps_its_name_although_it_shows_its_plain_token(faked):
+def test_owner_that_wakes_alone_keeps_its_name(faked):
     table = faked(Table(0))
     table.run({"old": 1.0})
     lost = [*asleep(table, "old"), KEY]
     assert table.together({"old": woken(table, "old", lost)})["old"] is None
 
 
-def test_one_empty_answer_of_a_link_that_is_lost_is_not_taken_for_a_name_that_is_still_owned(faked, monkeypatch):
+def test_empty_answer_of_a_lost_link_proves_nothing(faked, monkeypatch):
     table = faked(Table(0))
     table.tokens = [Keys.life(KEY, "new")]
     answers = iter([set(), set()])
@@ -209,13 +209,13 @@ def test_one_empty_answer_of_a_link_that_is_lost_is_not_taken_for_a_name_that_is
     assert isinstance(table.together({"old": woken(table, "old", [])})["old"], NameTaken)
 
 
-def test_a_robot_of_another_make_that_shows_its_plain_token_keeps_its_name(faked):
+def test_other_make_with_plain_token_keeps_its_name(faked):
     table = faked(Table(0))
     table.tokens.append(KEY)
     assert isinstance(table.run({"next": 2.0})["next"], NameTaken)
 
 
-def test_the_silence_of_a_router_is_not_taken_for_a_free_name(faked):
+def test_silent_router_frees_no_name(faked):
     table = faked(Table(0))
     table.answers = False
     table._running = {"a"}
@@ -256,7 +256,7 @@ class Woken(Airborne):
 
 
 @pytest.mark.parametrize("way", ["still", "opening", "cut off"])
-def test_who_wakes_and_finds_its_name_taken_leaves_the_body_as_it_is(way, monkeypatch):
+def test_displaced_owner_leaves_the_body_alone(way, monkeypatch):
     monkeypatch.setattr(name_ownership, "OWNER_VANISH_S", 0.0)
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False])
@@ -300,7 +300,7 @@ class CountedToken:
         self.live.remove(self.key)
 
 
-def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_is_undeclared_twice(monkeypatch):
+def test_late_alarm_leaves_the_tokens(monkeypatch):
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net, monkeypatch.context() as patched:
         patched.setattr(pubsub, "alive_token", CountedToken)
@@ -331,7 +331,7 @@ def test_the_alarm_of_a_loop_that_has_recovered_leaves_the_tokens_and_no_token_i
 
 @pytest.mark.mechanism("name ownership")
 @pytest.mark.system
-def test_a_real_router_knows_who_owns_a_name_and_a_frozen_one_says_nothing(router: RouterProcess, monkeypatch):
+def test_real_router_knows_owners_of_names(router: RouterProcess, monkeypatch):
     monkeypatch.setattr(name_ownership, "ANSWER_S", 0.5)
     with (
         network.open_session([router.endpoint], name="one") as one,

@@ -84,7 +84,7 @@ def bound(here, things):
     return BARRIER.bound(thing, 1.0)
 
 
-def test_half_of_the_gap_and_less_of_fast_ones():
+def test_bound_is_half_the_gap_or_less():
     here = own(TELLO, (0.0, 0.0, 1.0), velocity=(0.3, 0.0, 0.0))
     place = (TELLO.radius + CRAZYFLIE.radius + 0.05 + 0.4, 0.0)
     left = 0.4 - 0.3 * TELLO.lag

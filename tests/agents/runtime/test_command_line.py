@@ -11,7 +11,7 @@ from agents.runtime.command_line import NetworkLaunch, on_termination, parse
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_each_signal_is_heeded_each_time_and_then_no_more(number):
+def test_each_signal_is_handled_while_listening(number):
     before = signal.getsignal(number)
     told = []
     with on_termination(lambda: told.append(1)):

@@ -70,7 +70,7 @@ def test_router_ends_with_its_starter():
     assert said == "router: ends with its starter\n"
 
 
-def test_lines_are_passed_on_whole_and_heartbeats_are_not(pipe):
+def test_whole_lines_pass_without_heartbeats(pipe):
     lines = []
     line = Lifeline(threading.Event(), timeout_s=60.0, fd=pipe[0], on_line=lines.append)
     line.start()

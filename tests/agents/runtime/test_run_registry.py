@@ -34,7 +34,7 @@ def dead() -> Run:
     return msgspec.structs.replace(own_entry("run", "dead", nowhere()), pid=process.pid, born=started)
 
 
-def test_a_run_is_listed_as_long_as_it_is_up(folder: Path) -> None:
+def test_run_is_listed_while_it_is_up(folder: Path) -> None:
     run = own_entry(
         "run", "two", nowhere(), folder=Path("here"), realm="hall", robots={"CF01": "radio://0", "KH01": ""}
     )
@@ -51,7 +51,7 @@ def test_a_run_is_listed_as_long_as_it_is_up(folder: Path) -> None:
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
-def test_who_died_is_listed_only_while_its_router_answers(folder: Path) -> None:
+def test_dead_run_is_listed_while_its_router_answers(folder: Path) -> None:
     run = dead()
     with registered(run):
         assert runs() == []
@@ -63,7 +63,7 @@ def test_who_died_is_listed_only_while_its_router_answers(folder: Path) -> None:
             assert not left.alive
 
 
-def test_another_process_of_the_same_number_is_not_the_run() -> None:
+def test_other_process_of_its_number_is_no_run() -> None:
     assert not msgspec.structs.replace(own_entry("run", "two", nowhere()), born="1").alive
 
 
@@ -91,7 +91,7 @@ def test_garbage_is_left_alone_and_hides_nobody(folder: Path, text: bytes) -> No
         assert (folder / "0.json").exists()
 
 
-def test_a_folder_that_others_can_write_to_is_not_believed(folder: Path) -> None:
+def test_folder_writable_by_others_is_refused(folder: Path) -> None:
     folder.mkdir(0o700)
     (folder / "0.json").write_bytes(msgspec.json.encode(own_entry("run", "two", nowhere())))
     assert len(runs()) == 1
@@ -104,7 +104,7 @@ def test_a_folder_that_others_can_write_to_is_not_believed(folder: Path) -> None
     assert runs() == []
 
 
-def test_without_a_runtime_folder_it_is_one_of_the_users_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_runtime_folder_the_users_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ZENPARK_RUNTIME_DIR")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "missing"))

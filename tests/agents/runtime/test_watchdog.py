@@ -82,7 +82,7 @@ def test_a_loop_that_goes_round_is_left_alone():
     assert not kennel.dog.tripped
 
 
-def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: Callable[[Callable[[], object]], None]):
+def test_hanging_loop_is_landed_and_may_recover(eventually: Callable[[Callable[[], object]], None]):
     kennel = Kennel(silence_s=0.5)
     with kennel.watched():
         kennel.beat_for(0.05)
@@ -99,7 +99,7 @@ def test_a_loop_that_hangs_has_its_robots_landed_and_may_come_back(eventually: C
 
 
 @pytest.mark.parametrize("stuck", ["", "land", "stop"])
-def test_one_that_hangs_for_good_is_told_again_cut_and_ended(stuck: str, eventually):
+def test_endless_hang_is_cut_and_ended(stuck: str, eventually):
     kennel = Kennel(down_s=0.8)
     kennel.body.stuck = stuck
     with kennel.watched():
@@ -132,7 +132,7 @@ threading.Event().wait()
 
 @pytest.mark.mechanism("watchdog: suspended process")
 @pytest.mark.system
-def test_a_process_that_was_frozen_is_not_a_loop_that_hangs():
+def test_frozen_process_is_no_hanging_loop():
     """And one that hangs for good ends."""
     process = subprocess.Popen(
         [sys.executable, "-c", FROZEN], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
