@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
-from agents.agent import Agent
 
 from agents.body.interface import BodyState
 from agents.network import messages
+from agents.robot import Robot as Decision
 from experiments import run
 from experiments.definition import standby as reserves
 from experiments.definition.experiment import (
@@ -28,7 +27,6 @@ from experiments.definition.experiment import (
 from experiments.definition.plan import Plan
 from experiments.file import consistency, document
 from experiments.real_time.conductor.replacement import Refused, Spares
-from tests.agents.things import poses
 
 BOT = Robot(kind="khepera4", start=[0.0, 0.0])
 FLY = Robot(kind="crazyflie", start=[0.5, 0.5], hover=0.5)
@@ -99,21 +97,18 @@ def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
 def test_nobody_waits_for_a_robot_on_standby(standby: bool) -> None:
     case = experiment()
     robots = {**case.robots, "C": msgspec.structs.replace(FLY, standby=standby)}
-    told = Plan(msgspec.structs.replace(case, robots=robots)).assignment(["A"])
-    agent = Agent(told)
-    assert agent.missing_neighbours(0) == ["B", "C"]
-    link = np.array([told.robots[j] for j in told.links.sender]) == "B"
-    at = np.flatnonzero(link)
-    agent.neighbours.mark_alive(at)
-    agent.neighbours.receive(poses(at, np.array([[0.5, 0.0, 0.0]]), np.zeros((1, 3)), np.zeros(1), np.zeros(1)))
-    state = BodyState(
-        time=np.zeros(1), position=np.zeros((1, 3)), yaw=np.zeros(1), velocity=np.zeros((1, 3)),
-        flying=np.zeros(1, dtype=bool), battery=np.ones(1), true_position=np.zeros((1, 3)), true_yaw=np.zeros(1),
-    )  # fmt: skip
+    told = Plan(msgspec.structs.replace(case, robots=robots)).assignment("A")
+    robot = Decision(told)
+    assert robot.missing_neighbours() == ["B", "C"]
+    place = next(place for place, link in enumerate(told.neighbours) if link.name == "B")
+    robot.neighbours.mark_alive(place)
+    robot.neighbours.receive(place, (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
+    state = BodyState(time=0.0, position=(0.0, 0.0, 0.0), yaw=0.0, velocity=(0.0, 0.0, 0.0), flying=False, battery=1.0)
     for tick in range(3):
-        agent.step(0.01 * tick, state)
-    assert (agent.lifecycle.phase[0] > 0) == standby
-    assert agent.missing_neighbours(0) == ["C"]
+        robot.transmit(0.01 * tick, state)
+        robot.act(0.01 * tick)
+    assert (robot.lifecycle.phase > 0) == standby
+    assert robot.missing_neighbours() == ["C"]
 
 
 def order(**more: object) -> messages.RunOrder:

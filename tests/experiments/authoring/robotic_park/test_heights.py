@@ -4,11 +4,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4
-from agents.formation.anchors import Anchors
+from agents.formation.anchors import Anchor
+from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from experiments.authoring import layouts
 from experiments.authoring.robotic_park.heights import Room, find_shape
 from experiments.check.realisation import ENOUGH, Solids
-from experiments.definition.graph import BY_DISTANCE, BY_RELATIVE, Links, links
+from experiments.definition.graph import Links, links
 
 
 def asked(position, pairs=None, *, relative=False):
@@ -21,9 +22,8 @@ def asked(position, pairs=None, *, relative=False):
 
 
 def to_origin(position, *rows):
-    count, row = len(rows), np.array(rows)
-    one, zero, nowhere = np.ones(count), np.zeros(count), np.zeros((count, 3))
-    return Anchors(row, nowhere, nowhere, one, zero, np.linalg.norm(position[row], axis=1), one)
+    zero = (0.0, 0.0, 0.0)
+    return [(row, Anchor(zero, zero, 1.0, 0.0, float(np.linalg.norm(position[row])), 1.0)) for row in rows]
 
 
 @settings(max_examples=30)
@@ -41,7 +41,7 @@ def test_drones_from_one_plane_find_their_dome_and_robots_stay_on_the_floor():
     shape = np.concatenate([ring, [[0.0, 0.0, 1.0]]])
     climbs = np.arange(6) == 5
     flat = shape * [1.2, 1.2, 0.1]
-    found = find_shape(asked(shape), None, flat, climbs)
+    found = find_shape(asked(shape), (), flat, climbs)
     assert found.worst < 1e-4
     assert found.position[:5, 2] == pytest.approx(np.zeros(5))
     assert found.position[5, 2] == pytest.approx(1.0, abs=1e-3)
@@ -50,13 +50,13 @@ def test_drones_from_one_plane_find_their_dome_and_robots_stay_on_the_floor():
 def test_what_contradicts_itself_is_measured():
     wanted = links([(0, 1), (1, 2), (0, 2)], [1.0, 1.0, 2.3])
     start = np.array([(0.0, 0, 0), (1.0, 0.1, 0), (2.0, 0, 0)])
-    found = find_shape(wanted, None, start, np.zeros(3, dtype=bool))
+    found = find_shape(wanted, (), start, np.zeros(3, dtype=bool))
     assert found.worst == pytest.approx(0.1, abs=1e-3)  # 0.3 m, shared by three
 
 
 def test_a_shape_that_is_met_at_the_heights_of_the_starts_is_not_folded():
     ring = np.array([(np.cos(a), np.sin(a), 0.7) for a in 2.0 * np.pi * np.arange(6) / 6])
-    found = find_shape(asked(ring).take(np.arange(0, 15, 2)), None, ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
+    found = find_shape(asked(ring).take(np.arange(0, 15, 2)), (), ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
     assert found.worst < ENOUGH
     assert found.position[:, 2] == pytest.approx(0.7)
 
@@ -67,7 +67,7 @@ def test_shapes_in_space_are_found_from_starts_in_one_plane(seed):
     made = layouts.hemisphere(12, 0.6, 0.25)
     shape = made.position
     start = shape * [1.2, 1.2, 0.0] + np.random.default_rng(seed).normal(0.0, [0.25, 0.25, 0.0], shape.shape)
-    assert find_shape(asked(shape, made.pairs), None, start, np.ones(12, dtype=bool)).worst < ENOUGH
+    assert find_shape(asked(shape, made.pairs), (), start, np.ones(12, dtype=bool)).worst < ENOUGH
 
 
 def solids(flies):
@@ -80,10 +80,10 @@ def test_a_shape_below_the_floor_is_mirrored():
     shape = np.concatenate([ring, [[0.1, 0.0, 0.9], [-0.3, 0.2, 0.8]]])
     climbs = np.arange(7) >= 5
     start = shape * [1.2, 1.0, -0.2]  # nearer to the mirror image
-    below = find_shape(asked(shape), None, start, climbs)
+    below = find_shape(asked(shape), (), start, climbs)
     assert below.worst < ENOUGH
     assert below.position[climbs, 2].max() < 0.0
-    above = find_shape(asked(shape), None, start, climbs, solids(climbs))
+    above = find_shape(asked(shape), (), start, climbs, solids(climbs))
     assert above.worst < ENOUGH
     assert above.position[climbs, 2] == pytest.approx([0.9, 0.8], abs=1e-3)
 
@@ -94,7 +94,7 @@ def test_robots_in_one_place_are_no_shape():
     pairs = np.array([(0, 1), (1, 2), (2, 3), (0, 3)])
     flies = np.ones(4, dtype=bool)
     start = np.array([(0.0, 0, 0.7), (1.0, 0, 0.7), (0.01, 0.1, 0.7), (1.0, 0.01, 0.7)])
-    assert np.ptp(find_shape(asked(square, pairs), None, start, flies).position, axis=0)[2] < 0.01
-    found = find_shape(asked(square, pairs), None, start, flies, solids(flies))
+    assert np.ptp(find_shape(asked(square, pairs), (), start, flies).position, axis=0)[2] < 0.01
+    found = find_shape(asked(square, pairs), (), start, flies, solids(flies))
     assert found.worst < ENOUGH
     assert not len(solids(flies).solids.overlaps(found.position))
