@@ -27,7 +27,7 @@ from experiments.virtual_time import conductor, simulation
 from twins.models.quadrotor import RESPONSES, Response
 
 FAR: Final = 1e6  # [m] walls that no robot meets
-WORK: Final = 4e5  # robot ticks that are flown, of about 12 µs each: 570 s of seven robots, 4 s of a thousand
+WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
 STEPS_HZ: Final = 100.0  # steps of a drone's model between two decisions
 ROUNDED: Final = 1e-9  # of eigenvalues
 REPETITIONS: Final = 5  # flights with noise, each with another seed

@@ -203,7 +203,7 @@ class VirtualNetwork:
 
     def logged(self, begin: float) -> dict[str, Any]:
         """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
-        received = _table(self._received, begin)
+        received = _table(sorted(self._received, key=lambda each: (each[1], each[0])), begin)
         return {
             "sent": _table(self._sent, begin, bare=self._lean),
             "received": PoseTable(

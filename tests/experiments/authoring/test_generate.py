@@ -87,7 +87,7 @@ def test_by_offsets_they_come_from_anywhere(tmp_path):
     wanted = LayoutOptions(law="displacement", scatter=3.0, duration_s=30.0)
     read = written(tmp_path, "hemisphere", "20", wanted)
     assert [found for found in check(read) if found.severity != "note"] == []
-    log = simulation.simulate(read.experiment, [1])
+    log = simulation.simulate(read.experiment, 1)
     net = Plan(read.experiment).links
     law = Plan(read.experiment).assignment(tuple(read.experiment.robots)).law
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))

@@ -45,7 +45,7 @@ def test_robots_on_wheels_stop_before_a_weak_formation_is_acquired_as_they_do_in
     assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
     numbers = figures(weak)
     assert numbers.acquired_s is None
-    log = simulation.simulate(msgspec.structs.replace(weak, seed=7), [7], lean=True)
+    log = simulation.simulate(msgspec.structs.replace(weak, seed=7), 7, lean=True)
     (run,) = figures_of(log, weak)
     assert run.acquired_s is None
     last = log.true_position[log.time <= weak.duration_s][-1]

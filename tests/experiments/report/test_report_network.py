@@ -25,7 +25,7 @@ BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0
 def run():
     park = load("robotic-park").cases()["periodic"]
     park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
-    return Logbook(simulate(park, [1]), park, "bad", 0)
+    return Logbook(simulate(park, 1), park, "bad", 0)
 
 
 def test_what_was_dropped_is_told_apart_from_what_was_lost(run):

@@ -38,7 +38,7 @@ def test_a_lean_log_gives_the_figures_of_the_report_to_the_bit(park):
 
 @pytest.mark.slow
 def test_a_lean_log_is_small(park):
-    lean = simulate(park, [1], lean=True)
+    lean = simulate(park, 1, lean=True)
     assert lean.true_position.shape == (len(lean.time), 7, 3)
     for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase):
         assert column.size == 0

@@ -39,7 +39,7 @@ def test_with_the_barrier_they_keep_clear_and_arrive():
 
 def test_the_gap_is_that_between_true_surfaces_and_only_beside_each_other():
     experiment = encounter(("khepera4", "tello"), None, duration_s=10.0)
-    log = simulate(experiment, [3])
+    log = simulate(experiment, 3)
     place = log.true_position[(log.phase == RUNNING).all(axis=1)]
     expected = np.hypot(*(place[:, 0] - place[:, 1])[:, :2].T).min() - 0.07 - 0.1
     assert meet(experiment, [3]).gap[0] == pytest.approx(expected, abs=1e-12)

@@ -97,7 +97,7 @@ def test_triggers_where_they_make_sense_are_not(park, change):
 def flown(park):
     """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
     experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
-    log = simulation.simulate(experiment, [4])
+    log = simulation.simulate(experiment, 4)
     return log, Logbook(log, experiment, "predictive").trace()
 
 
@@ -211,4 +211,4 @@ def test_a_formation_without_links_has_no_law_to_gate(park):
         timeline=[],
         duration_s=2.0,
     )
-    assert simulation.simulate(alone, [1]).updates.tolist() == [20]
+    assert simulation.simulate(alone, 1).updates.tolist() == [20]

@@ -47,7 +47,7 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
 @pytest.mark.parametrize("count", FILES)
 def test_they_run(tmp_path, count):
     experiment = converted(tmp_path, FILES[count]())[0].experiment
-    log = simulation.simulate(experiment, [1])
+    log = simulation.simulate(experiment, 1)
     law = Plan(experiment).assignment(tuple(experiment.robots)).law
     net = Plan(experiment).links
     last = log.true_position[np.searchsorted(log.time, 19.9)]
