@@ -53,6 +53,8 @@ def faults(function: ast.FunctionDef):
                 yield node.lineno, BANNED[type(node)]
             elif isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, str)):
                 yield node.lineno, "None" if node.value is None else f"the text {node.value[:20]!r}"
+            elif isinstance(node, ast.Name) and node.id in {"np", "numpy"}:
+                yield node.lineno, "numpy"
             elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CALLS:
                 yield node.lineno, f"a call of {node.func.id}"
 

@@ -1,6 +1,7 @@
 """The loop of a robot process on a simulated clock: skipped ticks, and a hold after it stood still."""
 
 import types
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -10,6 +11,8 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages, name_ownership
 from agents.network import session as network
 from agents.network.keys import Keys
+from agents.plugins.registry import PluginError
+from agents.plugins.triggers import Trigger
 from agents.runtime import loop
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
@@ -201,3 +204,22 @@ def test_standstill_before_takeoff_keeps_it_down(monkeypatch):
         monkeypatch.setattr(stage.runtime, "_act", late)
         stage.run(visit)
     assert "takeoff" not in [order for _, order in stage.orders]
+
+
+class Faulty(Trigger, frozen=True):
+    """Fails at any question."""
+
+    def fires(self, view):
+        return view.nothing
+
+
+def test_plugins_of_all_robots_are_named():
+    plan = Plan(pair())
+    assignments = [plan.assignment("A"), replace(plan.assignment("B"), trigger=Faulty())]
+    setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
+    with Net().worn() as net:
+        runtime = Runtime(assignments, assemble(bodies.body_request(plan.experiment, ("A", "B"), 1)), setup)
+        runtime._subscribe_to_stops(net.session)
+        runtime._join(net.session)
+        with pytest.raises(PluginError, match="the trigger Faulty failed: AttributeError"):
+            runtime._tick(0.01)
