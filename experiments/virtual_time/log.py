@@ -106,6 +106,7 @@ class Logbook:
             contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
             dropped=self._log.lost,
+            foreign=np.zeros(len(log.names), dtype=np.intp),
             goals=None if log.lean else self.goals,
             **columns,
         )
