@@ -155,7 +155,7 @@ def _stamp_stops(stamp: Switch) -> None:
         cut(body, rows)
         stamp.write(stamp.read() or time.monotonic())
 
-    TwinBody.stop = stop  # type: ignore[method-assign]
+    TwinBody.stop = stop  # type: ignore[method-assign, assignment]
 
 
 if __name__ == "__main__":
