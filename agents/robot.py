@@ -11,7 +11,7 @@ runs and nothing is amiss both are quiet; what they call for texts, orders and c
 from __future__ import annotations
 
 from math import inf, isfinite, isnan, nan
-from typing import Final
+from typing import ClassVar, Final
 
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
@@ -41,6 +41,7 @@ HALT: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
 class Robot:
     """Decision of one robot."""
 
+    FIXED: ClassVar = ("_flies", "_predicts")
     __slots__ = (
         "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt", "_external",
         "_filter", "_flies", "_ordered", "_origin", "_perception", "_place", "_pose_every", "_predicts", "_preflight",
@@ -188,6 +189,8 @@ class Robot:
     def transmit(self, t: float, state: BodyState) -> bool:
         """First half of a tick at `t` [s]: advance the phase; returns whether the robot transmits its pose now."""
         self.now.state = state
+        if state.scan is not None and self._perception is not None:
+            self._perception.sees = True
         self.observe(t)
         if t >= self.lifecycle.settled_until:
             self._live(t)

@@ -38,9 +38,9 @@ class ControlUpdates:
         self.asking, self._anchored = TriggerState(trigger), anchored
         self._inputs = [Input() for _ in range(links)]
 
-    def due(
+    def due(  # noqa: PLR0917 - one caller, quiet
         self, t: float, position: Vector, velocity: Vector, neighbours: Neighbours, predictor: Predictor,
-        *, since_start: float, offset: Vector, error: float, energy: float,
+        since_start: float, offset: Vector, error: float, energy: float,
     ) -> bool:  # fmt: skip
         """Whether the law is computed now, at `t` [s]; without a known position it is not.
 

@@ -7,6 +7,7 @@ guides from that robot's last received pose. `errors`, `law_offset` and `decide`
 from __future__ import annotations
 
 from math import isfinite, nan
+from typing import ClassVar
 
 from agents.decision.assignment import Assignment
 from agents.decision.control_updates import ControlUpdates
@@ -21,6 +22,7 @@ from agents.vectors import UNKNOWN, ZERO, Vector, is_finite, norm
 class GoalComputer:
     """Goals of one robot."""
 
+    FIXED: ClassVar = ("_gated", "_reshapes", "follows")
     __slots__ = (
         "_anchors", "_changes", "_detour", "_detour_since", "_flies", "_gated", "_given", "_predictor", "_reshapes",
         "_updating", "clamp", "energy", "error", "follows", "goal", "ground", "itinerary", "law", "neighbours",
@@ -76,7 +78,10 @@ class GoalComputer:
         """Whether the law has no input: all neighbours are lost, or not there now."""
         if not self.follows or self._anchors:
             return False
-        return not any(sender.active for sender in self.neighbours.all)
+        for sender in self.neighbours.all:  # noqa: SIM110 - quiet
+            if sender.active:
+                return False
+        return True
 
     def begin_plan(self, place: Vector, yaw: float, elapsed_s: float = 0.0) -> None:
         """Begin the plan at `place` [m] and `yaw` [rad], if it has not begun.
@@ -124,8 +129,8 @@ class GoalComputer:
             if self._updating.asking.trigger.JUDGES_ERRORS:
                 self.errors(t, position)
             if not self._updating.due(
-                t, position, velocity, self.neighbours, self._predictor,
-                since_start=max(elapsed, 0.0), offset=offset, error=self.error, energy=self.energy,
+                t, position, velocity, self.neighbours, self._predictor, max(elapsed, 0.0), offset, self.error,
+                self.energy,
             ):  # fmt: skip
                 return False
         goal, goal_yaw = position, nan

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import cos, inf, isfinite, sin
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 from agents.body.interface import RangeScan
 from agents.decision.assignment import Assignment
@@ -38,10 +38,23 @@ class Perception:
     """Inputs of the avoidance of a robot."""
 
     __slots__ = (
-        "_clearance", "_height", "_link_silence_s", "_own_silence_s", "_points", "_radius", "_scan", "avoidance",
-        "near", "own",
+        "_clearance",
+        "_height",
+        "_link_silence_s",
+        "_links",
+        "_own_silence_s",
+        "_points",
+        "_radius",
+        "_scan",
+        "avoidance",
+        "near",
+        "own",
+        "sees",
     )  # fmt: skip
 
+    FIXED: ClassVar = ("sees",)
+
+    sees: bool  # there are range readings
     avoidance: Avoidance
     own: OwnState  # of the last call of `sense`
     near: Nearby  # likewise
@@ -53,12 +66,15 @@ class Perception:
         self._clearance = assignment.avoidance.clearance  # things farther above or below are ignored [m]
         self._radius, self._height = kind.radius, kind.height
         self.own, self.near = OwnState(), Nearby()
+        self._links = len(assignment.neighbours)
+        self.near.reserve(self._links)
         own = self.own
         own.radius, own.height, own.turn_rate = kind.radius, kind.height, kind.turn_rate
         own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
         self._scan: RangeScan | None = None
+        self.sees = False
         self._points: list[Point] = []
 
     def sense(self, t: float, now: Situation, neighbours: Neighbours) -> None:
@@ -80,10 +96,17 @@ class Perception:
         if aware:
             for sender in neighbours.all:
                 self._add_robot(t, now.position, sender)
-        if state.scan is not self._scan:
-            self._scan = state.scan
-            self._update_points(state.scan, now, neighbours)
-        if aware and self._scan is not None and t - self._scan.time <= SCAN_S:
+        if self.sees:
+            self._look(t, now, neighbours, aware)
+
+    def _look(self, t: float, now: Situation, neighbours: Neighbours, aware: bool) -> None:
+        """Add what the newest range readings saw; rare."""
+        scan = now.state.scan
+        if scan is not self._scan:
+            self._scan = scan
+            self._update_points(scan, now, neighbours)
+            self.near.reserve(self._links + len(self._points))
+        if aware and scan is not None and t - scan.time <= SCAN_S:
             self._add_points(now.position)
 
     def _add_robot(self, t: float, here: Vector, sender: Neighbour) -> None:

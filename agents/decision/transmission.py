@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import expm1, inf, isfinite, nan
-from typing import Final
+from typing import ClassVar, Final
 
 from agents.body.kinds import Kind
 from agents.network.validation import MAX_SPEED
@@ -17,6 +17,7 @@ STILL: Final[Vector] = ZERO
 class Transmitter:
     """Transmissions of one robot."""
 
+    FIXED: ClassVar = ("_smooths",)
     __slots__ = ("_smooths", "asking", "position", "predictor", "smoothed", "velocity")
 
     asking: TriggerState

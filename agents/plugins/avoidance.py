@@ -79,10 +79,12 @@ class Nearby:
     def __init__(self, planes: int = 9) -> None:
         self.count, self.things, self.planes = 0, [], [Plane() for _ in range(planes)]
 
+    def reserve(self, count: int) -> None:
+        """Make room for so many things; rare."""
+        self.things += [Thing() for _ in range(count - len(self.things))]
+
     def add(self) -> Thing:
-        """One more thing, to be filled in."""
-        if self.count == len(self.things):
-            self.things.append(Thing())
+        """One more thing, to be filled in; there is room for it."""
         self.count += 1
         return self.things[self.count - 1]
 
