@@ -23,7 +23,6 @@ from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
 from agents.decision.rehearsal import rehearse
 from agents.decision.transmission import Transmitter
-from agents.plugins.planners import Pose
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, Status
 from agents.safety.hazards import Cause, Hazards, Outcome
@@ -32,7 +31,7 @@ from agents.safety.positions import Continuity, ExternalPositions
 from agents.safety.preflight import Preflight
 from agents.safety.setpoint_filter import SetpointFilter
 from agents.safety.situation import ProcessHealth, Situation
-from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Setpoint, Vector, is_finite
+from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Pose, Setpoint, Vector, is_finite
 
 CENTRE: Final = "centre"  # missing neighbour of a guided robot without guidance
 HALT: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
@@ -190,7 +189,7 @@ class Robot:
         """First half of a tick at `t` [s]: advance the phase; returns whether the robot transmits its pose now."""
         self.now.state = state
         if state.scan is not None and self._perception is not None:
-            self._perception.sees = True
+            self._perception.sees = self._detector.sees = True
         self.observe(t)
         if t >= self.lifecycle.settled_until:
             self._live(t)

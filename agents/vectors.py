@@ -12,6 +12,7 @@ from msgspec import Meta
 
 Vector = tuple[float, float, float]  # x, y, z
 Setpoint = tuple[float, float, float, float]  # x y z yaw, v_x v_y v_z yaw rate, or v ω 0 0
+Pose = tuple[float, float, float, float]  # x, y, z [m] and yaw [rad]
 
 UNKNOWN: Final[Vector] = (nan, nan, nan)
 ZERO: Final[Vector] = (0.0, 0.0, 0.0)

@@ -154,6 +154,11 @@ class Twin:
         """Take a jump to another place for no motion: the robot moves with `velocity` [m/s]."""
         self._velocity = velocity
 
+    def reserve(self, steps: int) -> None:
+        """Draw noise for so many steps and measurements ahead."""
+        for each in (self._jitter.noise, self._measurement.noise, self._drift.noise):
+            each.reserve(steps + 1)
+
     def refill(self) -> None:
         """Draw noise for more steps; due when `advance` or `measure` say so."""
         noise.refill(self._jitter.noise, self._measurement.noise, self._drift.noise)
@@ -270,6 +275,16 @@ class TwinBody:
 
     def close(self) -> None:
         """See `Body.close`."""
+
+    @property
+    def lonely(self) -> bool:
+        """Whether every robot moves by itself, in a room where nothing moves, and sees nothing: see `Twin`."""
+        alone = self._alone
+        return alone is not None and not (alone.moves_obstacles or self._sensors is not None or self._external)
+
+    def moved_to(self, t: float) -> None:
+        """The twins were advanced to `t` [s], and measured, one by one."""
+        self._t = t
 
     def _advance(self, t: float) -> None:
         if self._alone is None:

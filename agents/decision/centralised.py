@@ -13,8 +13,7 @@ from typing import Final, NamedTuple
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
-from agents.plugins.planners import Pose
-from agents.vectors import UNKNOWN, ZERO, Vector, is_finite
+from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite
 
 ROUNDING_S: Final = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
 

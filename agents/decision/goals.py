@@ -15,8 +15,8 @@ from agents.decision.neighbours import Neighbours
 from agents.formation.changes import change_target, exists, planned_at
 from agents.formation.link import Link
 from agents.plugins.laws import Law, goal_position, tracking_offset
-from agents.plugins.planners import Itinerary, Leg, Pose, Waypoints
-from agents.vectors import UNKNOWN, ZERO, Vector, is_finite, norm
+from agents.plugins.planners import Itinerary, Leg, Waypoints
+from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite, norm
 
 
 class GoalComputer:

@@ -14,10 +14,9 @@ from typing import Annotated, Final, Protocol
 import msgspec
 from msgspec import Meta
 
-from agents.vectors import Positive, Setpoint, Vector, distance, is_finite
+from agents.vectors import Pose, Positive, Vector, distance, is_finite
 
 Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
-Pose = Setpoint  # x, y, z [m] and yaw [rad], NaN where any yaw will do
 NO_TARGET: Final[Pose] = (nan, nan, nan, nan)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import asin, degrees, hypot, inf, isfinite, nan, sin, sqrt
-from typing import Final
+from typing import ClassVar, Final
 
 from agents.body.interface import Attitude, BodyState, RangeScan
 from agents.body.kinds import Kind
@@ -141,9 +141,10 @@ class Descent:
 class Detector:
     """Detector of the causes of hazards of one robot."""
 
+    FIXED: ClassVar = ("flies", "sees")
     __slots__ = (
         "ascent", "avoids", "battery_low", "behind_s", "descent", "fastest", "fastest_squared", "flies", "lean",
-        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "separation",
+        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "sees", "separation",
         "silence_s", "slow_squared",
     )  # fmt: skip
 
@@ -166,6 +167,7 @@ class Detector:
     descent: Descent
     leaned: bool  # on the tick before
     leans_since: float  # time of the first sample of that [s]
+    sees: bool  # it avoids, and has range readings
     scan: RangeScan | None  # on the tick before
     scanned: float  # time of the newest range readings [s]; infinity before the first
 
@@ -185,7 +187,7 @@ class Detector:
         self.avoids = assignment.avoidance is not None and assignment.avoids
         self.obedience, self.ascent = Obedience(kind), Ascent(kind, assignment.hover)
         self.descent = Descent(limits.high[2])
-        self.leaned, self.leans_since = False, 0.0
+        self.leaned, self.leans_since, self.sees = False, 0.0, False
         self.scan, self.scanned = None, inf
 
     def causes(self, now: Situation, status: Status, neighbours: Neighbours, health: ProcessHealth) -> int:
@@ -222,7 +224,7 @@ class Detector:
                 self.ascent.update(t, status.climbing, state.flying, now.position)
         if status.landing or status.ordered or status.not_finite or status.unguided:
             found |= self.of_orders(now, status)
-        if self.avoids and self.sees_nothing(t, state) and status.cruising:
+        if self.sees and self.sees_nothing(t, state) and status.cruising:
             found |= 1 << Cause.UNSEEING
         obedience, ascent = self.obedience, self.ascent
         obedience.update(t, status.setpoint, now.position, now.yaw, status.cruising and not now.invalid)

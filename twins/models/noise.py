@@ -6,6 +6,7 @@ Reading is quiet; `refill` is rare, and alone needs numpy.
 from __future__ import annotations
 
 import zlib
+from array import array
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -28,7 +29,7 @@ class Noise:
     __slots__ = ("_block", "_generator", "_scale", "ahead", "end", "next", "present")
 
     present: bool  # a scale is not 0
-    ahead: list[float]  # numbers drawn ahead, one draw after the other
+    ahead: array[float]  # numbers drawn ahead, one draw after the other
     next: int  # index of the next draw in `ahead`
     end: int  # value of `next` at which `refill` is due; −1 without noise
     _scale: tuple[float, ...]  # standard deviations of the numbers of a draw
@@ -38,17 +39,28 @@ class Noise:
     def __init__(self, name: str, seed: int, purpose: str, scale: Sequence[float], block: int = BLOCK) -> None:
         """`scale`: standard deviations. The stream does not depend on `block`, the draws per refill."""
         self.present = any(scale)
-        self.ahead, self.next, self.end = [], 0, -1
+        self.ahead, self.next, self.end = array("d"), 0, -1
         self._scale, self._block = tuple(scale), block
         if self.present:
             self._generator = stream(name, seed, purpose)
-            self.end = block * len(self._scale)
             self.refill()
 
     def refill(self) -> None:
         """Draw the next block."""
-        drawn = self._generator.standard_normal((self._block, len(self._scale)))
-        self.ahead, self.next = (drawn * self._scale).ravel().tolist(), 0
+        self.ahead, self.next = self._drawn(self._block), 0
+        self.end = len(self.ahead)
+
+    def reserve(self, draws: int) -> None:
+        """Draw as much ahead as `draws` take."""
+        if self.present:
+            left = self.ahead[self.next :]
+            more = draws - len(left) // len(self._scale)
+            self.ahead, self.next = left + self._drawn(more) if more > 0 else left, 0
+            self.end = len(self.ahead)
+
+    def _drawn(self, draws: int) -> array[float]:
+        drawn = self._generator.standard_normal((draws, len(self._scale))) * self._scale
+        return array("d", drawn.tobytes())
 
 
 def refill(*noises: Noise) -> None:

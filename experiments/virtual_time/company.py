@@ -1,0 +1,180 @@
+"""Robots and their twins in a run of virtual time, and one tick of all of them: quiet functions alone.
+
+`experiments.virtual_time.simulation` lets a compiler run them for as long as nothing happens to a robot.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import ClassVar, Final
+
+from agents.decision.neighbours import Neighbour
+from agents.network.channel_model import ROUNDING_S
+from agents.robot import Robot
+from agents.vectors import UNKNOWN, Pose, Vector
+from twins.body import Twin
+
+WIDTH: Final = 19  # numbers of a robot in a sample
+SENT: Final = 9  # numbers of a transmission
+
+
+class Way:
+    """Link of constant delay, with the samples that are on it."""
+
+    __slots__ = (
+        "arrivals", "delay", "first", "neighbour", "next", "positions", "seqs", "size", "stamps", "velocities", "yaws",
+    )  # fmt: skip
+
+    neighbour: Neighbour  # the sender, as the receiver knows it
+    delay: float  # [s]
+    size: int  # samples for which there is room, and one more
+    first: int  # index of the first sample
+    next: int  # index behind the last one
+
+    def __init__(self, neighbour: Neighbour, delay: float, size: int) -> None:
+        self.neighbour, self.delay, self.size, self.first, self.next = neighbour, delay, size, 0, 0
+        self.arrivals, self.stamps, self.yaws = [0.0] * size, [0.0] * size, [0.0] * size
+        self.seqs = [0] * size
+        self.positions: list[Vector] = [UNKNOWN] * size
+        self.velocities: list[Vector] = [UNKNOWN] * size
+
+    def put(self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float) -> None:
+        """A sample sets out."""
+        k = self.next
+        self.arrivals[k], self.stamps[k], self.seqs[k] = stamp + self.delay, stamp, seq
+        self.positions[k], self.velocities[k], self.yaws[k] = position, velocity, yaw
+        self.next = (k + 1) % self.size
+
+    def deliver(self, t: float) -> None:
+        """The receiver gets the samples that have arrived by `t` [s]."""
+        while self.first != self.next and self.arrivals[self.first] <= t + ROUNDING_S:
+            k, sender = self.first, self.neighbour
+            if self.stamps[k] > sender.stamp:
+                sender.position, sender.velocity = self.positions[k], self.velocities[k]
+                sender.stamp, sender.arrival = self.stamps[k], self.arrivals[k]
+            self.first = (k + 1) % self.size
+
+
+class Member:
+    """Robot with its twin, and the links on which it sends."""
+
+    __slots__ = ("robot", "row", "seq", "twin", "ways")
+
+    row: int
+    seq: int  # number of its last transmission
+    robot: Robot
+    twin: Twin
+    ways: list[Way]
+
+    def __init__(self, row: int, robot: Robot, twin: Twin) -> None:
+        self.row, self.robot, self.twin, self.seq, self.ways = row, robot, twin, 0, []
+
+
+class Planned:
+    """Itinerary whose targets are known beforehand, one for each decision."""
+
+    __slots__ = ("decide_hz", "first", "targets")
+
+    first: int  # number of the decision of the first target
+    decide_hz: float  # [1/s]
+    targets: list[Pose]
+
+    def __init__(self, first: int, decide_hz: float, targets: list[Pose]) -> None:
+        self.first, self.decide_hz, self.targets = first, decide_hz, targets
+
+    def target(self, t: float, position: Vector, yaw: float) -> Pose:
+        """As `Itinerary.target`, at the time of a decision."""
+        return self.targets[round(t * self.decide_hz) - self.first]
+
+
+class Ledger:
+    """What a run notes."""
+
+    FIXED: ClassVar = ("lean",)
+    __slots__ = ("count", "lean", "rows", "sample", "samples", "sent")
+
+    lean: bool  # of samples true positions alone
+    count: int  # transmissions so far
+    sent: array[float]  # row, number, time [s], position [m], velocity [m/s] of each, `SENT` numbers and yaw behind
+    rows: int
+    sample: int  # samples so far
+    samples: array[float]  # `WIDTH` numbers for each sample and robot
+
+    def __init__(self, rows: int, transmissions: int, samples: int, *, lean: bool) -> None:
+        self.rows, self.lean, self.count, self.sample = rows, lean, 0, 0
+        self.sent = array("d", bytes(8 * (SENT + 1) * transmissions))
+        self.samples = array("d", bytes(8 * (3 if lean else WIDTH) * samples * rows))
+
+    def note_sent(self, member: Member, t: float) -> None:
+        robot, sent, k = member.robot, self.sent, self.count * (SENT + 1)
+        sent[k], sent[k + 1], sent[k + 2] = float(member.row), float(member.seq), t
+        sent[k + 3], sent[k + 4], sent[k + 5] = robot.sent_position
+        sent[k + 6], sent[k + 7], sent[k + 8] = robot.sent_velocity
+        sent[k + 9] = robot.now.state.yaw
+        self.count += 1
+
+    def note_state(self, member: Member) -> None:
+        """Note the state of a robot in the present sample."""
+        robot, samples = member.robot, self.samples
+        state = robot.now.state
+        if self.lean:
+            k = 3 * (self.sample * self.rows + member.row)
+            samples[k], samples[k + 1], samples[k + 2] = state.true_position
+            return
+        k = WIDTH * (self.sample * self.rows + member.row)
+        samples[k], samples[k + 1], samples[k + 2] = state.position
+        samples[k + 3], samples[k + 4], samples[k + 5] = state.velocity
+        samples[k + 6], samples[k + 10] = state.yaw, state.true_yaw
+        samples[k + 7], samples[k + 8], samples[k + 9] = state.true_position
+        samples[k + 11], samples[k + 12], samples[k + 13] = robot.goal
+        samples[k + 14], samples[k + 15], samples[k + 16], samples[k + 17] = robot.setpoint
+        samples[k + 18] = robot.error
+
+
+def advance(members: list[Member], t: float, dt: float) -> None:
+    """Twins move on to `t` [s], and measure."""
+    for member in members:
+        member.twin.advance(t, dt)
+        member.twin.measure(member.robot.now.state)
+
+
+def deliver(members: list[Member], t: float) -> None:
+    """Poses that have arrived by `t` [s] are received."""
+    for member in members:
+        for way in member.ways:
+            way.deliver(t)
+
+
+def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
+    """First half of the decisions."""
+    for member in members:
+        robot = member.robot
+        robot.observe(t)
+        if robot.question(t):
+            member.seq += 1
+            ledger.note_sent(member, t)
+            for way in member.ways:
+                way.put(member.seq, t, robot.sent_position, robot.sent_velocity, robot.now.state.yaw)
+
+
+def detect(members: list[Member], t: float) -> bool:
+    """Causes of hazards; returns whether a robot has any."""
+    found = False
+    for member in members:
+        if member.robot.detect(t):
+            found = True
+    return found
+
+
+def pursue(members: list[Member], t: float) -> None:
+    """Second half of the decisions of robots without hazards, and commands to their twins."""
+    for member in members:
+        robot = member.robot
+        robot.pursue(t, False)
+        member.twin.command(robot.setpoint)
+
+
+def note(members: list[Member], ledger: Ledger) -> None:
+    """Note the states of these robots."""
+    for member in members:
+        ledger.note_state(member)

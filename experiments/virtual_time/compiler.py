@@ -1,0 +1,225 @@
+"""Compilation of quiet functions over records; the only module that knows numba.
+
+`Thing` is what numba sees of an object: an address, and the layout of the record that stands there.
+"""
+
+from __future__ import annotations
+
+import inspect
+import operator
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.imputils import lower_builtin, lower_getattr_generic, lower_setattr_generic
+from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_getattr, infer_global, signature
+from numba.extending import intrinsic, register_model
+
+from experiments.virtual_time.records import BOOL, FLOAT, INT, WORD, Floats, Items, Layout, width
+from experiments.virtual_time.source import PREFIX, specialised
+
+NUMBER = ir.IntType(64)
+SIMPLE = {FLOAT: types.float64, INT: types.int64, BOOL: types.boolean}
+
+
+class Thing(types.Type):  # type: ignore[misc]
+    """Object of a layout."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        super().__init__(name=layout.name)
+
+
+class Several(types.Type):  # type: ignore[misc]
+    """List of values of a kind."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind, self.type = kind, type_of(kind)
+        super().__init__(name=f"Several({self.type})")
+
+
+@cache
+def type_of(kind: Any) -> Any:
+    """numba's type of a kind of value."""
+    if isinstance(kind, Floats):
+        return types.UniTuple(types.float64, kind.count)
+    if isinstance(kind, Items):
+        return Several(kind.item)
+    return Thing(kind) if isinstance(kind, Layout) else SIMPLE[kind]
+
+
+@register_model(Thing)
+class _ThingModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, NUMBER)
+
+
+@register_model(Several)
+class _SeveralModel(models.StructModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, [("address", types.int64), ("count", types.int64)])
+
+
+def _place(builder: Any, address: Any, word: int, of: Any = NUMBER) -> Any:
+    return builder.inttoptr(builder.add(address, ir.Constant(NUMBER, WORD * word)), of.as_pointer())
+
+
+def _load(context: Any, builder: Any, kind: Any, address: Any, word: int) -> Any:
+    """Value of a kind that stands some words behind an address."""
+    if kind == FLOAT:
+        return builder.load(_place(builder, address, word, ir.DoubleType()))
+    if isinstance(kind, Floats):
+        values = [_load(context, builder, FLOAT, address, word + k) for k in range(kind.count)]
+        return context.make_tuple(builder, type_of(kind), values)
+    whole = builder.load(_place(builder, address, word))
+    if kind == BOOL:
+        return builder.trunc(whole, ir.IntType(1))
+    if isinstance(kind, Items):
+        return _several(context, builder, type_of(kind), whole, builder.load(_place(builder, address, word + 1)))
+    return whole
+
+
+def _several(context: Any, builder: Any, kind: Any, address: Any, count: Any) -> Any:
+    made = cgutils.create_struct_proxy(kind)(context, builder)
+    made.address, made.count = address, count
+    return made._getvalue()  # noqa: SLF001 - numba's way
+
+
+def _store(builder: Any, kind: Any, address: Any, word: int, value: Any) -> None:
+    if kind == FLOAT:
+        builder.store(value, _place(builder, address, word, ir.DoubleType()))
+    elif isinstance(kind, Floats):
+        for k in range(kind.count):
+            _store(builder, FLOAT, address, word + k, builder.extract_value(value, k))
+    else:
+        builder.store(builder.zext(value, NUMBER) if kind == BOOL else value, _place(builder, address, word))
+
+
+@cache
+def method(layout: Layout, name: str) -> Any:
+    """Compiled method of objects of a layout; None if there is none."""
+    found = getattr(layout.owner, name, None)
+    return compiled(found, layout) if inspect.isfunction(found) else None
+
+
+@cache
+def compiled(function: Callable[..., Any], layout: Layout | None = None) -> Any:
+    """Function, compiled; a method for objects of a layout."""
+    code, names = specialised(function, {} if layout is None else layout.fixed)
+    space: dict[str, Any] = {"__name__": function.__module__}
+    exec(code, space)  # noqa: S102 - our own source
+    made = njit(space[function.__name__])
+    for name in names:
+        value = function.__globals__.get(name)
+        if value is not None and name not in space:
+            space[name] = compiled(value) if inspect.isfunction(value) else value
+    return made
+
+
+@infer_getattr
+class _Attributes(AttributeTemplate):  # type: ignore[misc]
+    key = Thing
+
+    def generic_resolve(self, thing: Any, name: str) -> Any:
+        layout, name = thing.layout, name.removeprefix(PREFIX)
+        if name in layout.fields:
+            return type_of(layout.fields[name])
+        if (found := method(layout, name)) is None:
+            return None
+        _lower_method(name)
+        of_method = types.Dispatcher(found)
+
+        class Method(AbstractTemplate):  # type: ignore[misc]
+            key = (Thing, name)
+
+            def generic(self, args: Any, kws: Any) -> Any:
+                return of_method.get_call_type(self.context, (thing, *args), kws).as_method()
+
+        return types.BoundFunction(Method, thing)
+
+
+@cache
+def _lower_method(name: str) -> None:
+    @lower_builtin((Thing, name), Thing, types.VarArg(types.Any))  # type: ignore[untyped-decorator]
+    def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        function = context.get_function(types.Dispatcher(method(sig.args[0].layout, name)), sig)
+        context.add_linking_libs(getattr(function, "libs", ()))
+        return function(builder, args)
+
+
+@lower_getattr_generic(Thing)  # type: ignore[untyped-decorator]
+def _get(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
+    layout, name = kind.layout, name.removeprefix(PREFIX)
+    if name not in layout.fields:  # a method
+        return value
+    return _load(context, builder, layout.fields[name], value, layout.offset[name])
+
+
+@lower_setattr_generic(Thing)  # type: ignore[untyped-decorator]
+def _set(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
+    layout, name = sig.args[0].layout, name.removeprefix(PREFIX)
+    kind = layout.fields[name]
+    _store(builder, kind, args[0], layout.offset[name], context.cast(builder, args[1], sig.args[1], type_of(kind)))
+
+
+@infer_global(operator.getitem)
+class _GetItem(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, args: Any, kws: Any) -> Any:
+        if isinstance(args[0], Several) and isinstance(args[1], types.Integer):
+            return signature(args[0].type, args[0], types.int64)
+        return None
+
+
+@infer_global(operator.setitem)
+class _SetItem(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, args: Any, kws: Any) -> Any:
+        if isinstance(args[0], Several) and isinstance(args[1], types.Integer):
+            return signature(types.void, args[0], types.int64, args[0].type)
+        return None
+
+
+@infer_global(len)
+class _Len(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, args: Any, kws: Any) -> Any:
+        return signature(types.int64, args[0]) if isinstance(args[0], Several) else None
+
+
+def _item(builder: Any, kind: Any, several: Any, index: Any) -> Any:
+    step = builder.mul(index, ir.Constant(NUMBER, WORD * width(kind)))
+    return builder.add(builder.extract_value(several, 0), step)
+
+
+@lower_builtin(operator.getitem, Several, types.int64)  # type: ignore[untyped-decorator]
+def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind = sig.args[0].kind
+    return _load(context, builder, kind, _item(builder, kind, *args), 0)
+
+
+@lower_builtin(operator.setitem, Several, types.int64, types.Any)  # type: ignore[untyped-decorator]
+def _set_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind = sig.args[0].kind
+    _store(builder, kind, _item(builder, kind, *args[:2]), 0, args[2])
+    return context.get_dummy_value()
+
+
+@lower_builtin(len, Several)  # type: ignore[untyped-decorator]
+def _len(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.extract_value(args[0], 1)
+
+
+def opened(kind: Any) -> Any:
+    """Compiled function that gives the object, or the list of so many values, at an address."""
+    of = type_of(kind)
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def found(typing_context: Any, address: Any, count: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return args[0] if isinstance(of, Thing) else _several(context, builder, of, *args)
+
+        return of(types.int64, types.int64), code
+
+    return found
