@@ -191,8 +191,8 @@ class Robot:
         if state.scan is not None and self._perception is not None:
             self._perception.sees = self._detector.sees = True
         self.observe(t)
-        if t >= self.lifecycle.settled_until:
-            self._live(t)
+        if not self.is_steady(t):
+            self.live(t)
         return self.question(t)
 
     def observe(self, t: float) -> None:
@@ -218,8 +218,15 @@ class Robot:
         if external.deceived:
             now.position = UNKNOWN
 
-    def _live(self, t: float) -> None:
-        """Advance the phase, with what follows; not while the robot runs, and goes on."""
+    def is_steady(self, t: float) -> bool:
+        """Whether the phase stays as it is at `t` [s], and nothing is due; quiet."""
+        life, now = self.lifecycle, self.now
+        if t < life.settled_until:
+            return True
+        return not self.landing.aside and life.stays(t, now.position, now.velocity, now.state.flying)
+
+    def live(self, t: float) -> None:
+        """Advance the phase of a robot that is not steady, with what follows."""
         life, now = self.lifecycle, self.now
         ready = life.phase <= READY and self._ready()
         life.advance(t, now.position, now.velocity, flying=now.state.flying, ready=ready)
@@ -276,7 +283,7 @@ class Robot:
         """Second half of the tick at `t` [s]: goal, setpoint and commands."""
         troubled = self.detect(t)
         if troubled:
-            self._apply_hazards(self.causes)
+            self.respond()
         self.pursue(t, troubled)
 
     def detect(self, t: float) -> bool:
@@ -352,7 +359,7 @@ class Robot:
             return False
         return True
 
-    def _apply_hazards(self, causes: int) -> None:
+    def respond(self) -> None:
         """Apply outcomes of hazards: the robot holds, lands, or has its motors cut."""
         life, now, status = self.lifecycle, self.now, self._status
 
@@ -361,7 +368,7 @@ class Robot:
                 return self.landing.robot_below()
             return self._detector.words(cause, now, status, self.neighbours, self.health)
 
-        serious = self.hazards.update(now.t, causes, words, active=life.active, landing=life.phase == LANDING)
+        serious = self.hazards.update(now.t, self.causes, words, active=life.active, landing=life.phase == LANDING)
         for incident in serious:
             end = life.stop if incident.outcome == Outcome.CUT else life.land
             end(incident.cause.rule.words)

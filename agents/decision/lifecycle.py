@@ -116,6 +116,29 @@ class Lifecycle:
         """Whether the robot climbs, waits in the air, runs, or lands."""
         return self.climbing or AIRBORNE <= self.phase <= LANDING
 
+    def stays(self, t: float, position: Vector, velocity: Vector, flying: bool) -> bool:
+        """Whether `advance` would change nothing at `t` [s]; quiet. Of a robot that has yet to climb it is False."""
+        if self.takeoff_due or self.land_due or self.stop_due:
+            return False
+        if self.climbing:
+            return not self._is_up(position, velocity)
+        if self.phase == AIRBORNE:
+            return t < self.start_at - 1e-6
+        if self.phase == LANDING:
+            return not self._is_down(velocity, flying)
+        return self.phase == DONE or (self.phase == RUNNING and t < self.settled_until)
+
+    def _is_up(self, position: Vector, velocity: Vector) -> bool:
+        """Whether a climb has ended."""
+        above = position[2] - self._hover
+        return not self._flies or (-AT_HEIGHT < above < ABOVE_HEIGHT and abs(velocity[2]) < SETTLED)
+
+    def _is_down(self, velocity: Vector, flying: bool) -> bool:
+        """Whether a landing has ended; an unknown velocity counts as slow."""
+        vx, vy, vz = velocity
+        slow = not vx * vx + vy * vy + vz * vz >= SETTLED * SETTLED
+        return not flying if self._flies else slow
+
     def advance(self, t: float, position: Vector, velocity: Vector, *, flying: bool, ready: bool) -> None:
         """Advance the phase at `t` [s]: `position` [m], `velocity` [m/s], `flying`: the motors are on.
 
@@ -132,16 +155,11 @@ class Lifecycle:
             self.phase, self.reason = READY, ""
         elif self.phase == READY and not (ready or self.climbing):
             self.phase, self.reason = IDLE, self._waits
-        if self.climbing and not self.takeoff_due:
-            at_height = -AT_HEIGHT < position[2] - self._hover < ABOVE_HEIGHT and abs(velocity[2]) < SETTLED
-            if at_height or not self._flies:
-                self.phase, self.climbing = AIRBORNE, False
+        if self.climbing and not self.takeoff_due and self._is_up(position, velocity):
+            self.phase, self.climbing = AIRBORNE, False
         if self.phase == AIRBORNE and t >= self.start_at - 1e-6:
             self.phase = RUNNING
         if self.phase == RUNNING and t - self.start_at >= self._duration - 1e-6:
             self.land(FINISHED)
-        if self.phase == LANDING and not self.land_due:  # else the body has not received the command yet
-            vx, vy, vz = velocity
-            slow = not vx * vx + vy * vy + vz * vz >= SETTLED * SETTLED  # an unknown velocity counts as slow
-            if not flying if self._flies else slow:
-                self.phase = DONE
+        if self.phase == LANDING and not self.land_due and self._is_down(velocity, flying):
+            self.phase = DONE  # but not before the body has received the command

@@ -15,7 +15,9 @@ from agents.vectors import UNKNOWN, Pose, Vector
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
-SENT: Final = 9  # numbers of a transmission
+LEAN: Final = 3  # of true positions alone
+SENT: Final = 10  # numbers of a transmission
+AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 
 
 class Way:
@@ -91,22 +93,25 @@ class Ledger:
     """What a run notes."""
 
     FIXED: ClassVar = ("lean",)
-    __slots__ = ("count", "lean", "rows", "sample", "samples", "sent")
+    __slots__ = ("count", "lean", "reason", "rows", "sample", "samples", "sent", "times")
 
     lean: bool  # of samples true positions alone
+    reason: int  # why a stretch ended: `AT_END`, or with the tick half done `AT_PHASES` or `AT_HAZARDS`
     count: int  # transmissions so far
-    sent: array[float]  # row, number, time [s], position [m], velocity [m/s] of each, `SENT` numbers and yaw behind
+    sent: array[float]  # row, number, time [s], position [m], velocity [m/s] and yaw [rad] of each
     rows: int
     sample: int  # samples so far
-    samples: array[float]  # `WIDTH` numbers for each sample and robot
+    times: array[float]  # of samples [s]
+    samples: array[float]  # `WIDTH` numbers for each sample and robot, or `LEAN`
 
     def __init__(self, rows: int, transmissions: int, samples: int, *, lean: bool) -> None:
-        self.rows, self.lean, self.count, self.sample = rows, lean, 0, 0
-        self.sent = array("d", bytes(8 * (SENT + 1) * transmissions))
-        self.samples = array("d", bytes(8 * (3 if lean else WIDTH) * samples * rows))
+        self.rows, self.lean, self.count, self.sample, self.reason = rows, lean, 0, 0, AT_END
+        self.times = array("d", bytes(8 * samples))
+        self.sent = array("d", bytes(8 * SENT * transmissions))
+        self.samples = array("d", bytes(8 * (LEAN if lean else WIDTH) * samples * rows))
 
     def note_sent(self, member: Member, t: float) -> None:
-        robot, sent, k = member.robot, self.sent, self.count * (SENT + 1)
+        robot, sent, k = member.robot, self.sent, self.count * SENT
         sent[k], sent[k + 1], sent[k + 2] = float(member.row), float(member.seq), t
         sent[k + 3], sent[k + 4], sent[k + 5] = robot.sent_position
         sent[k + 6], sent[k + 7], sent[k + 8] = robot.sent_velocity
@@ -118,7 +123,7 @@ class Ledger:
         robot, samples = member.robot, self.samples
         state = robot.now.state
         if self.lean:
-            k = 3 * (self.sample * self.rows + member.row)
+            k = LEAN * (self.sample * self.rows + member.row)
             samples[k], samples[k + 1], samples[k + 2] = state.true_position
             return
         k = WIDTH * (self.sample * self.rows + member.row)
@@ -145,11 +150,20 @@ def deliver(members: list[Member], t: float) -> None:
             way.deliver(t)
 
 
+def observe(members: list[Member], t: float) -> bool:
+    """Robots take the states of their bodies; returns whether the phase of one moves on."""
+    moves = False
+    for member in members:
+        member.robot.observe(t)
+        if not member.robot.is_steady(t):
+            moves = True
+    return moves
+
+
 def transmit(members: list[Member], t: float, ledger: Ledger) -> None:
     """First half of the decisions."""
     for member in members:
         robot = member.robot
-        robot.observe(t)
         if robot.question(t):
             member.seq += 1
             ledger.note_sent(member, t)

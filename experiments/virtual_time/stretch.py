@@ -14,7 +14,7 @@ from experiments.virtual_time.company import Ledger, Member
 from experiments.virtual_time.compiler import compiled, opened
 from experiments.virtual_time.records import Image, Items, Layouts
 
-STEPS: Final = ("advance", "deliver", "transmit", "detect", "pursue", "note")
+STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
 def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
     {open}
@@ -23,16 +23,23 @@ def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
         t = k * dt
         {advance}
         {deliver}
+        moves = False
+        {observe}
+        if moves:
+            ledger.reason = AT_PHASES
+            return k
         {transmit}
         if instant:
             {deliver}
         trouble = False
         {detect}
         if trouble:
-            return -k - 1
+            ledger.reason = AT_HAZARDS
+            return k
         {pursue}
         if (g0[0].robot.tick - 1) % log_every == 0:
             {note}
+            ledger.times[ledger.sample] = t
             ledger.sample += 1
         k += 1
     return k
@@ -46,9 +53,9 @@ class Stretches:
         self._members, self._ledger, self._layouts = members, ledger, Layouts()
 
     def fly(self, k: int, end: int, dt: float, log_every: int, *, instant: bool) -> int:
-        """Fly the ticks from `k` on to before `end`, of `dt` [s]; returns the next tick.
+        """Fly the ticks from `k` on to before `end`, of `dt` [s]; returns the tick at which the stretch ended.
 
-        It is −k − 1 where a robot is in trouble on tick k, of which the second half is left to the caller.
+        The ledger has the reason: of a tick that is half done the rest is left to the caller.
         """
         layouts, groups = self._layouts, dict[str, list[Member]]()
         layouts.forget()
@@ -89,6 +96,7 @@ def driver(kinds: tuple[Items, ...], of_ledger: Any) -> Any:
         open=each("g{k} = open{k}(a{k}, n{k})"),
         advance=each("advance(g{k}, t, dt)"),
         deliver=each("deliver(g{k}, t)"),
+        observe=each("moves = observe(g{k}, t) or moves"),
         transmit=each("transmit(g{k}, t, ledger)"),
         detect=each("trouble = detect(g{k}, t) or trouble"),
         pursue=each("pursue(g{k}, t)"),
@@ -97,6 +105,7 @@ def driver(kinds: tuple[Items, ...], of_ledger: Any) -> Any:
     space: dict[str, Any] = {"__name__": __name__}
     space |= {step: compiled(getattr(company, step)) for step in STEPS}
     space |= {f"open{k}": opened(kind) for k, kind in enumerate(kinds)}
+    space |= {"AT_PHASES": company.AT_PHASES, "AT_HAZARDS": company.AT_HAZARDS}
     space["open_ledger"] = opened(of_ledger)
     exec(compile(source, __file__, "exec"), space)  # noqa: S102 - our own source
     made = DRIVERS[key] = njit(space[name], cache=True, nogil=True)
