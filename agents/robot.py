@@ -187,16 +187,20 @@ class Robot:
 
     def transmit(self, t: float, state: BodyState) -> bool:
         """First half of a tick at `t` [s]: advance the phase; returns whether the robot transmits its pose now."""
-        self.now.state = state
-        if state.scan is not None and self._perception is not None:
-            self._perception.sees = self._detector.sees = True
-        self.observe(t)
+        self.take(t, state)
         if not self.is_steady(t):
             self.live(t)
         return self.question(t)
 
+    def take(self, t: float, state: BodyState) -> None:
+        """Take the state of the body at `t` [s]."""
+        self.now.state = state
+        if state.scan is not None and self._perception is not None:
+            self._perception.sees = self._detector.sees = True
+        self.observe(t)
+
     def observe(self, t: float) -> None:
-        """Take the state of the body, without what jumped; quiet."""
+        """Look at the state of the body, without what jumped; quiet."""
         self.goals.update_links(t)
         life, now = self.lifecycle, self.now
         life.moved = self.takes_off = self.lands = self.stops = False
@@ -281,7 +285,12 @@ class Robot:
 
     def act(self, t: float) -> None:
         """Second half of the tick at `t` [s]: goal, setpoint and commands."""
-        troubled = self.detect(t)
+        self.detect(t)
+        self.finish(t)
+
+    def finish(self, t: float) -> None:
+        """What follows the detection of hazards."""
+        troubled = self.causes != 0 or self.hazards.under_way
         if troubled:
             self.respond()
         self.pursue(t, troubled)

@@ -127,7 +127,7 @@ def _column(values: Sequence[Any]) -> list[Any]:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
-Watch = Callable[[str, Experiment], Callable[[simulation.Instant], object]]  # of a case
+Watch = Callable[[str, Experiment], Callable[[simulation.Instant], object] | None]  # of a case
 
 
 def simulate(
@@ -154,7 +154,7 @@ def simulate_seeds(
     cases: Sequence[str] = (),
     folder: str | Path | None = None,
     progress: Progress = lambda *_: None,
-    watch: Watch = lambda *_: lambda _: None,
+    watch: Watch = lambda *_: None,
 ) -> list[Run]:
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
@@ -175,7 +175,7 @@ def simulate_seeds(
                 experiment,
                 seed,
                 progress=partial(_pass_progress, progress, name, experiment.duration_s),
-                watch=shown if k == 0 else lambda _: None,
+                watch=shown if k == 0 else None,
             )
             logbook = Logbook(log, experiment, name)
             traces[k][name] = logbook.trace()

@@ -92,6 +92,11 @@ class GoalComputer:
             self.itinerary.target(elapsed_s, (place[0], place[1], self.ground), yaw)
 
     @property
+    def changes_shape(self) -> bool:
+        """Whether targets or links of the formation change."""
+        return self._reshapes
+
+    @property
     def leads(self) -> bool:
         """Whether the robot has neither links nor anchors: it follows a plan, or stays."""
         return not self.follows

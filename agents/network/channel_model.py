@@ -102,15 +102,17 @@ class Conditions(msgspec.Struct, frozen=True):
 class LinkChannel:
     """Carries samples over one link."""
 
-    __slots__ = ("_conditions", "_enter", "_free", "_leave", "_plain", "dropped")
+    __slots__ = ("_conditions", "_enter", "_free", "_leave", "delay", "dropped", "plain")
 
     dropped: int  # samples that were lost
+    delay: float  # [s]
+    plain: bool  # the delay is all that there is
 
     def __init__(self, conditions: Conditions) -> None:
-        self._conditions, self.dropped = conditions, 0
+        self._conditions, self.dropped, self.delay = conditions, 0, conditions.delay
         self._enter, self._leave = _thresholds(conditions)
         self._free = -inf  # when the link has sent all that it has taken [s]
-        self._plain = not (conditions.random or conditions.bandwidth < inf or conditions.outages)
+        self.plain = not (conditions.random or conditions.bandwidth < inf or conditions.outages)
 
     def arrival(self, seq: int, stamp: float, since: float, size: int) -> float:
         """Time at which a sample that sets out at `stamp` [s] gets through; infinity if it is lost.
@@ -120,7 +122,7 @@ class LinkChannel:
         their neighbours, and the real network repeats a first pose until it arrives. Nor is anything after the end.
         """
         conditions = self._conditions
-        if self._plain:
+        if self.plain:
             return stamp + conditions.delay
         begun = since >= -ROUNDING_S and since < conditions.duration - ROUNDING_S
         took, passes = 0.0, True
@@ -179,6 +181,20 @@ class Channel:
         self.ideal = self.instant and not any(each.loss or each.outages for each in conditions)
         self._flying: list[tuple[float, int, int, Any]] = []
         self._count = 0
+
+    @property
+    def plain(self) -> bool:
+        """Whether all that a link does is to take its time, always the same."""
+        return all(link.plain for link in self._links)
+
+    @property
+    def delays(self) -> list[float]:
+        """Delay of each link [s]."""
+        return [link.delay for link in self._links]
+
+    def clear(self) -> list[tuple[int, float, Any]]:
+        """Take all samples that are under way, as `due` does."""
+        return self.due(inf)
 
     @property
     def dropped(self) -> list[int]:

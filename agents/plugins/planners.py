@@ -162,9 +162,10 @@ class Leg(msgspec.Struct, frozen=True):
 class Itinerary:
     """Legs that a robot follows one after the other, and where each began."""
 
-    __slots__ = ("_anchor", "_heading", "_leg", "_next", "legs", "origin")
+    __slots__ = ("_anchor", "_heading", "_leg", "legs", "next_at", "origin")
 
     legs: tuple[Leg, ...]
+    next_at: float  # time of the next leg [s]; infinity after the last
     origin: Pose | None  # x, y, z [m] and yaw [rad] where its first leg began; None before
 
     def __init__(self, legs: Sequence[Leg], *, holds_before: bool) -> None:
@@ -175,14 +176,14 @@ class Itinerary:
         self.legs = (Leg(0.0, Hold()), *legs) if holds_before else tuple(legs)
         self.origin = None
         self._leg, self._anchor, self._heading = -1, (0.0, 0.0, 0.0), 0.0
-        self._next = self.legs[0].at if self.legs else inf
+        self.next_at = self.legs[0].at if self.legs else inf
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
         """Target x, y, z [m] and yaw [rad] at time `t` [s]; NaN before the first leg.
 
         The first leg begins at `position` [m] and `yaw` [rad].
         """
-        if t >= self._next - 1e-9 and is_finite(position):  # else it begins later
+        if t >= self.next_at - 1e-9 and is_finite(position):  # else it begins later
             self._begin(t, position, yaw)
         if self._leg < 0:
             return NO_TARGET
@@ -200,4 +201,4 @@ class Itinerary:
                 x, y, z, toward = before.planner.target(after.at - before.at, self._anchor, self._heading)
                 self._anchor, self._heading = (x, y, z), yaw if isnan(toward) else toward
             self._leg += 1
-        self._next = self.legs[self._leg + 1].at if self._leg + 1 < len(self.legs) else inf
+        self.next_at = self.legs[self._leg + 1].at if self._leg + 1 < len(self.legs) else inf

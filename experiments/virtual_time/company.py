@@ -10,11 +10,16 @@ from typing import ClassVar, Final
 
 from agents.decision.neighbours import Neighbour
 from agents.network.channel_model import ROUNDING_S
+from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
 from agents.vectors import UNKNOWN, Pose, Vector
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
+PLACES: Final = {  # of each in those
+    "position": (0, 3), "velocity": (3, 6), "yaw": (6, 7), "true_position": (7, 10), "true_yaw": (10, 11),
+    "goal": (11, 14), "setpoint": (14, 18), "error": (18, 19),
+}  # fmt: skip
 LEAN: Final = 3  # of true positions alone
 SENT: Final = 10  # numbers of a transmission
 AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
@@ -81,8 +86,8 @@ class Planned:
     decide_hz: float  # [1/s]
     targets: list[Pose]
 
-    def __init__(self, first: int, decide_hz: float, targets: list[Pose]) -> None:
-        self.first, self.decide_hz, self.targets = first, decide_hz, targets
+    def __init__(self, decide_hz: float) -> None:
+        self.first, self.decide_hz, self.targets = 0, decide_hz, [NO_TARGET]
 
     def target(self, t: float, position: Vector, yaw: float) -> Pose:
         """As `Itinerary.target`, at the time of a decision."""

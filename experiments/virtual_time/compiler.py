@@ -86,7 +86,7 @@ def _load(context: Any, builder: Any, kind: Any, address: Any, word: int) -> Any
 def _several(context: Any, builder: Any, kind: Any, address: Any, count: Any) -> Any:
     made = cgutils.create_struct_proxy(kind)(context, builder)
     made.address, made.count = address, count
-    return made._getvalue()  # noqa: SLF001 - numba's way
+    return made._getvalue()
 
 
 def _store(builder: Any, kind: Any, address: Any, word: int, value: Any) -> None:
@@ -111,7 +111,7 @@ def compiled(function: Callable[..., Any], layout: Layout | None = None) -> Any:
     """Function, compiled; a method for objects of a layout."""
     code, names = specialised(function, {} if layout is None else layout.fixed)
     space: dict[str, Any] = {"__name__": function.__module__}
-    exec(code, space)  # noqa: S102 - our own source
+    exec(code, space)
     made = njit(space[function.__name__])
     for name in names:
         value = function.__globals__.get(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from math import nan
 from typing import Final
@@ -32,6 +33,15 @@ class VirtualConductor:
         self._since = 0.0
         self.airborne_at = self.start_at = nan
         self.over = False
+
+    def next_order(self, tick: int, dt: float) -> int:
+        """Tick after which an order may be due, as long as no phase changes; asked before `tick`, of `dt` [s]."""
+        if self._stage >= Phase.RUNNING:
+            return sys.maxsize
+        if min([robot.lifecycle.phase for robot in self._robots]) < self._stage:
+            return round((self._since + PATIENCE_S) / dt)
+        every = max(1, round(ORDERS_S / dt))
+        return -(-tick // every) * every
 
     def give_orders(self, t: float, dt: float) -> None:
         """Gives the orders that are due after the tick at `t`, of length `dt` [s]."""

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from agents.arrays import Index, PoseTable
+from agents.arrays import Array, Index, PoseTable
 from agents.decision.centralised import Centre
 from agents.network import messages
-from agents.network.channel_model import Channel
+from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
 from agents.vectors import UNKNOWN, Vector
 from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
+from experiments.virtual_time.company import SENT, Ledger, Member, Way
 
 NOTHING: Final[Vector] = UNKNOWN
 
@@ -162,17 +164,16 @@ class VirtualNetwork:
         ends = [(sender.name, robot.assignment.name) for robot in robots for sender in robot.neighbours.all]
         self._channel = Channel(conditions_of(experiment, ends, seed))
         # by link: the robot that receives on it, and the number among its links
-        self._receivers = [(robot, k) for robot in robots for k in range(len(robot.neighbours.all))]
+        self.receivers = [(robot, k) for robot in robots for k in range(len(robot.neighbours.all))]
         self._links: list[list[int]] = [[] for _ in robots]  # on which each robot is the sender
-        for link, (robot, k) in enumerate(self._receivers):
+        for link, (robot, k) in enumerate(self.receivers):
             self._links[robot.neighbours.all[k].sender].append(link)
             robot.neighbours.mark_alive(k)  # all robots are there from the beginning
         guided = any(robot.guidance is not None for robot in robots)
         self.centre = VirtualCentre(experiment, plan, robots, seed) if guided else None
-        self._seq = [0] * len(robots)
+        self.seq = [0] * len(robots)  # number of the last pose of each robot
         self._sizes = _Sizes(experiment, names)
-        self._sent: list[Arrived] = []
-        self._received: list[Arrived] = []
+        self._sent, self._received = _Samples(), _Samples()
 
     @property
     def instant(self) -> bool:
@@ -181,10 +182,10 @@ class VirtualNetwork:
 
     def transmit(self, row: int, robot: Robot, t: float, yaw: float, start: float) -> None:
         """A robot transmits its pose at `t` [s]. Before the common start at `start` [s] nothing is lost."""
-        self._seq[row] += 1
-        seq, channel = self._seq[row], self._channel
+        self.seq[row] += 1
+        seq, channel = self.seq[row], self._channel
         sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw)
-        self._sent.append((row, t, sample))
+        self._sent.add((row, t, sample))
         size = self._sizes.of(sample, start) if channel.limited else 0
         for link in self._links[row]:
             channel.send(link, sample, seq, t, start=start, size=size)
@@ -194,21 +195,121 @@ class VirtualNetwork:
     def deliver(self, t: float) -> None:
         """Delivers poses and goals that have arrived by `t` [s]."""
         for link, arrival, sample in self._channel.due(t):
-            robot, k = self._receivers[link]
+            robot, k = self.receivers[link]
             robot.neighbours.receive(k, sample.position, sample.velocity, sample.stamp, arrival)
             if not self._lean:
-                self._received.append((link, arrival, sample))
+                self._received.add((link, arrival, sample))
         if self.centre is not None:
             self.centre.deliver(t)
 
     def logged(self, begin: float) -> dict[str, Any]:
         """Columns of the log, see `experiments.virtual_time.simulation.Log`; the common start is at `begin` [s]."""
-        received = _table(sorted(self._received, key=lambda each: (each[1], each[0])), begin)
+        received = self._received.table(begin)
+        received = received.take(np.lexsort((received.link, received.arrival)))  # as a recording has them
         return {
-            "sent": _table(self._sent, begin, bare=self._lean),
+            "sent": self._sent.table(begin, bare=self._lean),
             "received": PoseTable(
                 received.link, received.seq, received.stamp, received.arrival, received.position, received.velocity
             ),
             "lost": np.array(self._channel.dropped, dtype=np.intp),
             "centre": None if self.centre is None else self.centre.logged(begin),
         }
+
+    # ------------------------------------------------------------------ compiled stretches
+
+    @property
+    def delays(self) -> list[float]:
+        """Delay of each link [s], where `is_plain`."""
+        return self._channel.delays
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all that a link does is to take its time."""
+        return self.centre is None and self._channel.plain
+
+    def board(self, ways: Sequence[Way]) -> list[tuple[int, float, Sample]]:
+        """Hand all samples that are under way to the `ways` of their links; returns them."""
+        under_way = self._channel.clear()
+        for way in ways:
+            way.first = way.next = 0
+        for link, _, sample in under_way:
+            ways[link].put(sample.seq, sample.stamp, sample.position, sample.velocity, sample.yaw)
+        return under_way
+
+    def leave(
+        self, ways: Sequence[Way], members: Sequence[Member], ledger: Ledger, before: Sequence[Arrived], t: float
+    ) -> None:
+        """Take over what members sent until `t` [s], by their ledger, and what was received of it and of `before`."""
+        for member in members:
+            self.seq[member.row] = member.seq
+        under_way = []
+        for link, way in enumerate(ways):
+            robot, number = self.receivers[link]
+            while way.first != way.next:
+                k, row = way.first, robot.neighbours.all[number].sender
+                sample = Sample(row, way.seqs[k], way.stamps[k], way.positions[k], way.velocities[k], way.yaws[k])
+                under_way.append((sample.stamp, row, link, sample))
+                way.first = (k + 1) % way.size
+        for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # as they were sent
+            self._channel.send(link, sample, sample.seq, stamp)
+        sent = np.array(ledger.sent[: ledger.count * SENT]).reshape(-1, SENT)
+        self._sent.extend(sent, sent[:, 2], sent[:, 0])
+        if not self._lean:
+            self._receive_all(sent, before, t)
+
+    def _receive_all(self, sent: Array, before: Sequence[Arrived], t: float) -> None:
+        """Note what was received until `t` [s] of what was `sent` (K, 10), and of what was under way `before`."""
+        first = np.array([_row(sample) for _, _, sample in before]).reshape(-1, SENT)
+        links = [np.array([link for link, _, _ in before], dtype=float)]
+        rows = [first]
+        for link, (robot, k) in enumerate(self.receivers):
+            mine = sent[sent[:, 0] == robot.neighbours.all[k].sender]
+            rows.append(mine)
+            links.append(np.full(len(mine), float(link)))
+        every, link = np.concatenate(rows), np.concatenate(links)
+        arrival = every[:, 2] + np.array(self.delays)[link.astype(np.intp)] if len(link) else np.zeros(0)
+        order = np.lexsort((link, every[:, 0], every[:, 2], arrival))
+        order = order[arrival[order] <= t + ROUNDING_S]
+        self._received.extend(every[order], arrival[order], link[order])
+
+
+def _row(sample: Sample) -> tuple[float, ...]:
+    """Numbers of a sample, as `Ledger.sent` has them."""
+    return (float(sample.row), float(sample.seq), sample.stamp, *sample.position, *sample.velocity, sample.yaw)
+
+
+class _Samples:
+    """Samples with their links and arrivals, in the order in which they were noted."""
+
+    def __init__(self) -> None:
+        self._parts: list[Array] = []  # (K, 12): link, arrival [s], and the numbers of a sample
+        self._last: list[tuple[float, ...]] = []
+
+    def add(self, arrived: Arrived) -> None:
+        link, arrival, sample = arrived
+        self._last.append((float(link), arrival, *_row(sample)))
+
+    def extend(self, samples: Array, arrival: Array, link: Array) -> None:
+        """Add samples (K, 10) with their `arrival` (K,) [s] and `link` (K,)."""
+        self._settle()
+        self._parts.append(np.column_stack([link, arrival, samples]))
+
+    def _settle(self) -> None:
+        if self._last:
+            self._parts.append(np.array(self._last))
+            self._last = []
+
+    def table(self, begin: float, *, bare: bool = False) -> PoseTable:
+        """A table with times since the common start at `begin` [s]; `bare`: numbers and times alone."""
+        self._settle()
+        all_of_them = np.concatenate([np.zeros((0, SENT + 2)), *self._parts])
+        nothing = np.zeros((len(all_of_them), 0))
+        return PoseTable(
+            all_of_them[:, 0].astype(np.intp),
+            all_of_them[:, 3].astype(np.intp),
+            all_of_them[:, 4] - begin,
+            all_of_them[:, 1] - begin,
+            nothing if bare else all_of_them[:, 5:8],
+            nothing if bare else all_of_them[:, 8:11],
+            None if bare else all_of_them[:, 11],
+        )

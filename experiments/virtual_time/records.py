@@ -82,8 +82,18 @@ class Layouts:
         self.guessed = False  # whether a list was empty of which no other one was filled
 
     def forget(self) -> None:
-        """Look at all objects anew: their values may be of other kinds now."""
+        """Look at all objects anew."""
         self._of.clear()
+        self.guessed = False
+
+    def hold(self) -> bool:
+        """Whether all constant attributes of the objects are what they were."""
+        for thing, layout in self._of.values():
+            for name, value in () if layout is None else layout.fixed.items():
+                now = getattr(thing, name)
+                if now is not value and (value is None or now is None or now != value):
+                    return False
+        return True
 
     def kind(self, value: Any, where: tuple[type, str] | None = None) -> Any:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""

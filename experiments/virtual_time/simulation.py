@@ -22,8 +22,10 @@ from agents.safety.hazards import Incident
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
+from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
+from experiments.virtual_time.stretch import stretches_of
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
 
@@ -87,7 +89,7 @@ def simulate(
     lean: bool = False,
     landing: bool = True,
     progress: Callable[[float], object] = lambda _: None,
-    watch: Callable[[Instant], object] = lambda _: None,
+    watch: Callable[[Instant], object] | None = None,
 ) -> Log:
     """Flies one case of an experiment.
 
@@ -118,56 +120,68 @@ class Flight:
 
     def __init__(self, experiment: Experiment, seed: int, *, quiet: bool, lean: bool) -> None:
         plan = Plan(experiment)
-        self._experiment, self._seed, self._lean = experiment, seed, lean
+        self.experiment, self._seed, self.lean = experiment, seed, lean
         self.names = names = plan.names
         self.robots = [Robot(plan.assignment(name)) for name in names]
         request = bodies.body_request(experiment, names, seed, quiet=quiet)
         request = replace(request, external=(False,) * len(names))  # no motion capture in virtual time
-        self._twin = TwinBody(request, bodies.shared_world(experiment, names))
-        self._body = shadowed(self._twin, request, bodies.shadow_periods(experiment, names))
-        self._network = VirtualNetwork(experiment, plan, self.robots, seed, lean=lean)
+        self.twin = TwinBody(request, bodies.shared_world(experiment, names))
+        self._body = shadowed(self.twin, request, bodies.shadow_periods(experiment, names))
+        self.network = VirtualNetwork(experiment, plan, self.robots, seed, lean=lean)
         self._conductor = VirtualConductor(self.robots)
-        self._dt = 1.0 / experiment.rates.body_hz
+        rates = experiment.rates
+        self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
         self._tick = 0
         self._samples: list[dict[str, Any]] = []
+        self._columns: dict[str, list[Array]] = {}
         self._touches: list[Touch] = []
 
-    def fly(self, *, landing: bool, progress: Callable[[float], object], watch: Callable[[Instant], object]) -> None:
+    @property
+    def lonely(self) -> bool:
+        """Whether each robot moves by itself, and the network does nothing but take its time."""
+        return self._body is self.twin and self.twin.lonely and self.network.is_plain
+
+    def fly(
+        self,
+        *,
+        landing: bool,
+        progress: Callable[[float], object],
+        watch: Callable[[Instant], object] | None,
+    ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
-        experiment, robots, conductor, dt = self._experiment, self.robots, self._conductor, self._dt
-        log_every = round(experiment.rates.body_hz / experiment.rates.state_hz)
-        first = robots[0]
+        conductor, dt, first = self._conductor, self.dt, self.robots[0]
+        stretches = stretches_of(self) if watch is None else None
         while not conductor.over:
+            reason = AT_END
+            if stretches is not None:
+                self._tick, reason = stretches.fly(self._tick, conductor.next_order(self._tick, dt))
             t = self._tick * dt
-            states = self.step(t)
-            if (first.tick - 1) % log_every == 0:  # the robots' count begins anew at the common start
+            self.step(t, reason)
+            if (first.tick - 1) % self.log_every == 0:  # the robots' count begins anew at the common start
                 progress(t - conductor.start_at)
-                watch(Instant(t - conductor.start_at, t, robots, states, self._twin.engine))
-                self._sample(t, states)
-            if not landing and t - conductor.start_at >= experiment.duration_s - 0.5 * dt:
+                if watch is not None:
+                    watch(Instant(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))
+                self._sample(t)
+            if not landing and t - conductor.start_at >= self.experiment.duration_s - 0.5 * dt:
                 return
             conductor.give_orders(t, dt)
-            self._twin.begun_at = conductor.start_at
+            self.twin.begun_at = conductor.start_at
             self._tick += 1
 
-    def step(self, t: float) -> Sequence[BodyState]:
-        """One tick at `t` [s]; returns the states of the bodies."""
-        robots, network, body = self.robots, self._network, self._body
-        states = body.read(t)
-        network.deliver(t)
-        start, sent = self._conductor.start_at, False
+    def step(self, t: float, reason: int = AT_END) -> None:
+        """One tick at `t` [s], or the rest of one that a compiled stretch has begun, for this `reason`."""
+        robots, body = self.robots, self._body
+        if reason == AT_END:
+            self._states = body.read(t)
+            self.network.deliver(t)
+            for robot, state in zip(robots, self._states, strict=True):
+                robot.take(t, state)
+        if reason != AT_HAZARDS:
+            self._transmit(t)
+            for robot in robots:
+                robot.detect(t)
         for row, robot in enumerate(robots):
-            if robot.transmit(t, states[row]):
-                network.transmit(row, robot, t, states[row].yaw, start)
-                sent = True
-        if sent and network.instant:
-            network.deliver(t)
-        if network.centre is not None and robots[0].decision_due:
-            network.centre.decide(t)
-            if network.centre.instant:
-                network.centre.deliver(t)
-        for row, robot in enumerate(robots):
-            robot.act(t)
+            robot.finish(t)
             if robot.takes_off:
                 body.takeoff((row,), (robot.assignment.hover,))
             if robot.lands:
@@ -175,51 +189,97 @@ class Flight:
             if robot.stops:
                 body.stop((row,))
         body.command([robot.setpoint for robot in robots])
-        if touches := self._twin.touches():
+        if touches := self.twin.touches():
             self._touches += touches
-        return states
 
-    def _sample(self, t: float, states: Sequence[BodyState]) -> None:
+    def _transmit(self, t: float) -> None:
+        """Phases move on, poses are transmitted, and goals of a central controller."""
+        robots, network, start, sent = self.robots, self.network, self._conductor.start_at, False
+        for row, robot in enumerate(robots):
+            if not robot.is_steady(t):
+                robot.live(t)
+            if robot.question(t):
+                network.transmit(row, robot, t, robot.now.state.yaw, start)
+                sent = True
+        if sent and network.instant:
+            network.deliver(t)
+        if network.centre is not None and robots[0].decision_due:
+            network.centre.decide(t)
+            if network.centre.instant:
+                network.centre.deliver(t)
+
+    def _sample(self, t: float) -> None:
+        """Note the state of all robots."""
+        states = [robot.now.state for robot in self.robots]
         sample: dict[str, Any] = {"time": t, "true_position": [state.true_position for state in states]}
-        if not self._lean:
+        if not self.lean:
             for what in (*STATE, *OPTIONAL):
                 sample[what] = [getattr(state, what) for state in states]
             sample["phase"] = [robot.lifecycle.phase for robot in self.robots]
             for what in ("goal", "setpoint", "error"):
                 sample[what] = [getattr(robot, what) for robot in self.robots]
-            sample["obstacles"] = [tuple(each) for each in self._twin.engine.obstacles]
+            sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
         self._samples.append(sample)
+
+    def note(self, ledger: Ledger) -> None:
+        """Note the samples of a compiled stretch."""
+        self._settle()
+        count, rows, columns = ledger.sample, len(self.robots), self._columns
+        columns.setdefault("time", []).append(np.array(ledger.times[:count]))
+        wide = LEAN if self.lean else WIDTH
+        numbers = np.array(ledger.samples[: count * rows * wide]).reshape(count, rows, wide)
+        if self.lean:
+            columns.setdefault("true_position", []).append(numbers)
+            return
+        for what, (begin, end) in PLACES.items():
+            column = numbers[:, :, begin] if end == begin + 1 else numbers[:, :, begin:end]
+            columns.setdefault(what, []).append(column)
+        alike = {
+            **{what: [getattr(robot.now.state, what) for robot in self.robots] for what in OPTIONAL},
+            "phase": [robot.lifecycle.phase for robot in self.robots],
+            "obstacles": [tuple(each) for each in self.twin.engine.obstacles],
+        }
+        for what, values in alike.items():
+            columns.setdefault(what, []).append(np.repeat(np.array(values)[None], count, axis=0))
+
+    def _settle(self) -> None:
+        """Turn samples into columns."""
+        if self._samples:
+            for what in self._samples[0]:
+                self._columns.setdefault(what, []).append(np.array([sample[what] for sample in self._samples]))
+            self._samples = []
 
     def log(self) -> Log:
         """Everything recorded so far."""
+        self._settle()
         conductor, names = self._conductor, self.names
-        begin, count = conductor.start_at, len(self._samples)
+        begin, time = conductor.start_at, np.concatenate(self._columns["time"])
         columns: dict[str, Any] = {}
         for what in (*STATE, *OPTIONAL, "phase", "goal", "setpoint", "error", "obstacles"):
-            if self._lean and what != "true_position":
-                columns[what] = None if what in OPTIONAL else np.zeros((count, len(names), 0))
+            if self.lean and what != "true_position":
+                columns[what] = None if what in OPTIONAL else np.zeros((len(time), len(names), 0))
                 continue
-            columns[what] = np.array([sample[what] for sample in self._samples])
+            columns[what] = np.concatenate(self._columns[what])
             if what in OPTIONAL and np.isnan(columns[what]).all():
                 columns[what] = None
         incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]
         return Log(
             names=names,
             seed=self._seed,
-            lean=self._lean,
-            time=np.array([sample["time"] for sample in self._samples]) - begin,
+            lean=self.lean,
+            time=time - begin,
             decisions=max(robot.decisions for robot in self.robots),
             updates=np.array([robot.updates for robot in self.robots], dtype=np.intp),
             interventions=np.array([robot.interventions for robot in self.robots], dtype=np.intp),
             avoided=np.array([robot.evasions for robot in self.robots], dtype=np.intp),
             touches=tuple(replace(touch, time=touch.time - begin) for touch in self._touches),
-            ticks=round(self._experiment.duration_s / self._dt),
+            ticks=round(self.experiment.duration_s / self.dt),
             airborne=conductor.airborne_at - begin,
-            ended=self._tick * self._dt - begin,
+            ended=self._tick * self.dt - begin,
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
                 for row, each in sorted(incidents, key=lambda pair: pair[1].time)
             ),
-            **self._network.logged(begin),
+            **self.network.logged(begin),
             **columns,
         )

@@ -1,19 +1,41 @@
-"""Stretches of a run in which nothing happens to a robot, flown by compiled functions."""
+"""Stretches of a run in which nothing happens to a robot, flown by compiled functions.
+
+What is compiled is kept in the user's cache folder: the first time takes a quarter of a minute, later ones a fraction
+of a second. It is used where it pays.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import numba
-from numba import njit
+import numpy as np
 
+from agents.decision.lifecycle import READY
+from agents.plugins.planners import Itinerary
+from agents.user_folder import cache_folder
+from experiments.recording.version import digest
 from experiments.virtual_time import company
-from experiments.virtual_time.company import Ledger, Member
-from experiments.virtual_time.compiler import compiled, opened
-from experiments.virtual_time.records import Image, Items, Layouts
+from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
+from experiments.virtual_time.records import Image, Items, Layout, Layouts
 
+if TYPE_CHECKING:
+    from experiments.virtual_time.simulation import Flight
+
+TICK_S: Final = 12e-6  # of CPU for a tick of a robot in plain Python, about
+PAYS_S: Final = 3.0  # plain Python is quicker than to load numba for less work in a process than this,
+COMPILES_S: Final = 30.0  # or to compile
+LONGEST: Final = 2000  # ticks of a stretch: noise is drawn for all of them beforehand
+LEAST: Final = 20  # after a stretch of fewer ticks
+PAUSE: Final = 100  # so many are flown in plain Python
+ROOM: Final = 2  # more samples on a link than its delay asks for
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
 def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
@@ -44,48 +66,149 @@ def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
         k += 1
     return k
 """
+WORK: Final = [0.0]  # seconds of plain Python that the flights of this process take, about
+REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
+
+
+def stretches_of(flight: Flight) -> Stretches | None:
+    """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
+    ticks = flight.experiment.duration_s * flight.experiment.rates.body_hz
+    WORK[0] += TICK_S * ticks * len(flight.robots)
+    if WORK[0] < PAYS_S or not flight.lonely or find_spec("numba") is None:
+        return None
+    if any(robot.goals.changes_shape or robot.guidance is not None for robot in flight.robots):
+        return None
+    return Stretches(flight)
 
 
 class Stretches:
-    """Compiled tick of the robots of a flight."""
+    """Compiled ticks of the robots of a flight."""
 
-    def __init__(self, members: list[Member], ledger: Ledger) -> None:
-        self._members, self._ledger, self._layouts = members, ledger, Layouts()
+    def __init__(self, flight: Flight) -> None:
+        self._flight, self._layouts = flight, Layouts()
+        twins = flight.twin.twins
+        self._members = [Member(row, *each) for row, each in enumerate(zip(flight.robots, twins, strict=True))]
+        network, rates = flight.network, flight.experiment.rates
+        self._ways: list[Way] = []
+        for (robot, k), delay in zip(network.receivers, network.delays, strict=True):
+            sender = robot.neighbours.all[k]
+            way = Way(sender, delay, ROOM + round(delay * rates.pose_hz))
+            self._members[sender.sender].ways.append(way)
+            self._ways.append(way)
+        self._plans: dict[int, Planned] = {}
+        self._paused_until = 0
 
-    def fly(self, k: int, end: int, dt: float, log_every: int, *, instant: bool) -> int:
-        """Fly the ticks from `k` on to before `end`, of `dt` [s]; returns the tick at which the stretch ended.
+    def fly(self, k: int, end: int) -> tuple[int, int]:
+        """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
 
-        The ledger has the reason: of a tick that is half done the rest is left to the caller.
+        Of a tick that is half done the rest is left to the caller, see `Ledger.reason`.
         """
+        flight = self._flight
+        end = min(end, k + LONGEST, self._next_leg())
+        waits = any(robot.lifecycle.phase <= READY and not robot.lifecycle.climbing for robot in flight.robots)
+        if k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
+            return k, AT_END
+        ticks, rows, rates = end - k, len(self._members), flight.experiment.rates
+        questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
+        ledger = Ledger(rows, questions * rows, ticks // flight.log_every + ROOM, lean=flight.lean)
+        for member in self._members:
+            member.seq = flight.network.seq[member.row]
+            member.twin.reserve(ticks)
+        before = flight.network.board(self._ways)
+        with self._planned(k, end):
+            last = self._run(ledger, k, end)
+        if last < 0:
+            self._paused_until = sys.maxsize  # it cannot be compiled, or others do that now
+            flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
+            return k, AT_END
+        if last - k < LEAST:
+            self._paused_until = last + PAUSE
+        done = last - 1 if ledger.reason == AT_END else last
+        flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
+        flight.note(ledger)
+        flight.twin.moved_to(done * flight.dt)
+        return last, ledger.reason
+
+    def _run(self, ledger: Ledger, k: int, end: int) -> int:
+        """Run the compiled loop; returns the tick at which it ended, −1 without one."""
         layouts, groups = self._layouts, dict[str, list[Member]]()
-        layouts.forget()
-        layouts.guessed = False
+        if not layouts.hold():
+            layouts.forget()
         for member in self._members:
             layouts.of(member)
         if layouts.guessed:  # the kinds of lists that are empty for some robots are known now
             layouts.forget()
         for member in self._members:
             groups.setdefault(str(layouts.of(member)), []).append(member)
-        kinds = [Items(layouts.of(group[0])) for group in groups.values()]
-        of_ledger = layouts.of(self._ledger)
-        image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (self._ledger, of_ledger)])
+        kinds = tuple(Items(layouts.of(group[0])) for group in groups.values())
+        of_ledger = Layouts().of(ledger)
+        assert of_ledger is not None
+        run = driver(kinds, of_ledger)
+        if run is None:
+            return -1
+        flight = self._flight
+        image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (ledger, of_ledger)])
         numbers = [number for group in groups.values() for number in (image.address(group), len(group))]
-        run = driver(tuple(kinds), of_ledger)
-        k = run(*numbers, image.address(self._ledger), 1, k, end, dt, log_every, instant)
+        instant = flight.network.instant
+        found = run(*numbers, image.address(ledger), 1, k, end, flight.dt, flight.log_every, instant)
         image.load()
-        return k
+        return int(found)
+
+    def _next_leg(self) -> int:
+        """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain."""
+        flight, first = self._flight, sys.maxsize
+        for robot in flight.robots:
+            itinerary, begin = robot.goals.itinerary, robot.lifecycle.start_at
+            if itinerary is not None and robot.begun and itinerary.next_at < np.inf:
+                first = min(first, int((begin + itinerary.next_at) / flight.dt) - 1)
+        return first
+
+    @contextmanager
+    def _planned(self, k: int, end: int) -> Iterator[None]:
+        """Plans of the robots, computed for all decisions of a stretch, in place of their itineraries."""
+        flight, kept = self._flight, dict[int, Itinerary]()
+        for row, robot in enumerate(flight.robots):
+            itinerary = robot.goals.itinerary
+            if itinerary is None:
+                continue
+            kept[row] = itinerary
+            every, begin = robot.assignment.decide_every, robot.lifecycle.start_at
+            hz, first = robot.assignment.body_hz / every, robot.tick // every
+            place, targets = (np.nan, np.nan, np.nan), []
+            for number in range(first, first + (end - k) // every + 2):
+                t = (k + number * every - robot.tick) * flight.dt
+                targets.append(itinerary.target(t - begin, place, np.nan) if robot.begun else company.NO_TARGET)
+            planned = self._plans.setdefault(row, Planned(hz))
+            planned.first, planned.targets = first, targets
+            robot.goals.itinerary = planned  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            for row, itinerary in kept.items():
+                flight.robots[row].goals.itinerary = itinerary
 
 
-DRIVERS: Final[dict[Any, Any]] = {}
+@cache
+def driver(kinds: tuple[Items, ...], of_ledger: Layout) -> Any:
+    """Compiled loop over ticks, for groups of robots of these kinds; None if there is none, or another makes it now."""
+    owners = {layout.owner for layout in _layouts((*kinds, of_ledger))}
+    files = sorted({_digest(Path(str(sys.modules[owner.__module__].__file__))) for owner in owners})
+    name = "fly_" + hashlib.sha256(f"{kinds} {of_ledger} {files} {digest()}".encode()).hexdigest()[:24]
+    folder = cache_folder() / "compiled"
+    known = any(folder.glob(f"*/*{name}*.nbi")) if folder.is_dir() else False
+    if not known and WORK[0] < COMPILES_S:
+        return None
+    with _alone(folder, name) as alone:
+        return _compiled(name, kinds, of_ledger, folder) if known or alone else None
 
 
-def driver(kinds: tuple[Items, ...], of_ledger: Any) -> Any:
-    """Compiled loop over ticks, for groups of robots of these kinds."""
-    key = kinds, of_ledger
-    if key in DRIVERS:
-        return DRIVERS[key]
+def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
+    import numba  # noqa: PLC0415 - half a second, and a level of its own
+
+    from experiments.virtual_time.compiler import compiled, opened  # noqa: PLC0415
+
+    numba.config.CACHE_DIR = str(folder)
     count = range(len(kinds))
-    name = "fly_" + hashlib.sha256(f"{kinds} {of_ledger}".encode()).hexdigest()[:20]
 
     def each(text: str) -> str:
         return "; ".join(text.format(k=k) for k in count)
@@ -102,11 +225,51 @@ def driver(kinds: tuple[Items, ...], of_ledger: Any) -> Any:
         pursue=each("pursue(g{k}, t)"),
         note=each("note(g{k}, ledger)"),
     )
-    space: dict[str, Any] = {"__name__": __name__}
+    space: dict[str, Any] = {"__name__": __name__, "AT_PHASES": company.AT_PHASES, "AT_HAZARDS": company.AT_HAZARDS}
     space |= {step: compiled(getattr(company, step)) for step in STEPS}
     space |= {f"open{k}": opened(kind) for k, kind in enumerate(kinds)}
-    space |= {"AT_PHASES": company.AT_PHASES, "AT_HAZARDS": company.AT_HAZARDS}
     space["open_ledger"] = opened(of_ledger)
-    exec(compile(source, __file__, "exec"), space)  # noqa: S102 - our own source
-    made = DRIVERS[key] = njit(space[name], cache=True, nogil=True)
+    exec(compile(source, __file__, "exec"), space)
+    integer = numba.types.int64
+    signature = (*(integer,) * (2 * len(kinds) + 4), numba.types.float64, integer, numba.types.boolean)
+    made = numba.njit(space[name], cache=True, nogil=True)
+    try:
+        made.compile(signature)
+    except (numba.core.errors.NumbaError, SyntaxError, OSError) as error:
+        REFUSED[name] = str(error)
+        return None
     return made
+
+
+def _layouts(kinds: Sequence[Any]) -> Iterator[Layout]:
+    """All layouts that these kinds lead to."""
+    for kind in kinds:
+        if isinstance(kind, Items):
+            yield from _layouts([kind.item])
+        elif isinstance(kind, Layout):
+            yield kind
+            yield from _layouts(list(kind.fields.values()))
+
+
+@cache
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+@contextmanager
+def _alone(folder: Path, name: str) -> Iterator[bool]:
+    """Whether no other process compiles this loop now; none does as long as this lasts."""
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        file = (folder / f"{name}.lock").open("w")
+    except OSError:  # nothing can be kept there
+        yield True
+        return
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True

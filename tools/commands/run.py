@@ -156,7 +156,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         read.keep(folder / SOURCE)
         with using(folder), _kept_origin(folder, origin, read, options):
             if origin.virtual:
-                with viewing.paced(show.pace or 1.0) if show.view else nullcontext(lambda *_: lambda _: None) as watch:
+                with viewing.paced(show.pace or 1.0) if show.view else nullcontext(lambda *_: None) as watch:
                     runs, stopped, code = _simulate(read, folder, options, origin.seeds, watch), "", 0
             else:
                 with viewing.following(folder, options.identity) if show.view else nullcontext():
