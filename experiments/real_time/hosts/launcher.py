@@ -26,7 +26,6 @@ from typing import IO, Final, Self
 
 from agents.clock import Clock
 from agents.runtime.lifeline import BEAT_S, SILENCE_S
-from agents.user_folder import runtime_folder
 from experiments.real_time.processes import zygote
 from experiments.real_time.processes.zygote import Forked, NoZygote
 
@@ -130,8 +129,8 @@ class Launcher:
 
     def preload(self) -> None:
         """Start the zygote, which imports what robots need while others are started."""
-        with contextlib.suppress(NoZygote, OSError):
-            path = runtime_folder() / f"zygote-{secrets.token_hex(8)}"
+        with contextlib.suppress(NoZygote):
+            path = zygote.address(secrets.token_hex(8))
             with zygote.listen(path) as listener:
                 self.spawn(ZYGOTE, zygote.command(listener), inherited=[listener.fileno()])
             self._zygote = path

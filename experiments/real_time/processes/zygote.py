@@ -6,8 +6,8 @@ standard input, output and error of the new process; the answer is its id with a
 exit code. A process that has been forked is held by its own lifeline and not by the zygote, whose end it survives.
 
 A fork copies only the thread that asks for it: the zygote has one, or refuses, and whoever has no zygote, or one that
-refuses, spawns. Linux only. Importing this module imports nothing but the standard library: on other machines each
-robot's ssh runs a process that does no more than `stand_for` it.
+refuses, spawns. Linux only. This module is light to import: on other machines the ssh of each robot runs a process that
+does no more than `stand_for` the robot's.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
+from agents.user_folder import runtime_folder
+
 MODULE: Final = "experiments.real_time.processes.zygote"
 ROBOT: Final = "experiments.real_time.processes.robot"
 PRELOADED: Final = (ROBOT, "numpy.random", "twins.body", "bridges.external")
@@ -44,6 +46,14 @@ UNKNOWN: Final = 256  # exit code of a process whose zygote ended before it
 
 class NoZygote(Exception):
     """No zygote here, or one that did not answer."""
+
+
+def address(run: str) -> Path:
+    """Path of the socket of a zygote, by a word that only its run has; raises NoZygote without a folder for it."""
+    try:
+        return runtime_folder() / f"zygote-{run}"
+    except OSError as error:
+        raise NoZygote(str(error)) from None
 
 
 def listen(path: Path) -> socket.socket:
@@ -148,6 +158,30 @@ def fork(path: Path, request: Request, streams: Sequence[int], stdin: BinaryIO |
     except (OSError, ValueError) as error:
         zygote.close()
         raise NoZygote(str(error)) from None
+
+
+def stand_for(run: str, arguments: Sequence[str]) -> int | None:
+    """Have the zygote of a run fork a robot's process with the standard streams of this one.
+
+    Returns:
+        Its exit code, at its end; signals are passed on, in both directions. None without a zygote.
+    """
+    try:
+        forked = fork(address(run), Request("robot", ROBOT, arguments), (0, 1, 2))
+    except NoZygote:
+        return None
+    show("stand-in", [sys.executable, "-m", MODULE])
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for fd in (0, 1, 2):
+        os.dup2(nothing, fd)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: forked.send_signal(number))
+    code = forked.wait()
+    if code < 0:
+        with contextlib.suppress(OSError):  # that of SIGKILL cannot be set
+            signal.signal(-code, signal.SIG_DFL)
+        os.kill(os.getpid(), -code)
+    return min(code, 255)
 
 
 # ---------------------------------------------------------------------- in the zygote
