@@ -170,7 +170,7 @@ def stand_for(run: str, arguments: Sequence[str]) -> int | None:
         forked = fork(address(run), Request("robot", ROBOT, arguments), (0, 1, 2))
     except NoZygote:
         return None
-    show("stand-in", [sys.executable, "-m", MODULE])
+    show("stand-in", [MODULE])
     nothing = os.open(os.devnull, os.O_RDWR)
     for fd in (0, 1, 2):
         os.dup2(nothing, fd)
@@ -282,6 +282,7 @@ def main() -> None:
     for module in PRELOADED:
         import_module(module)
     del sys.modules[ROBOT]  # it runs as the main module of the new process
+    os.register_at_fork(after_in_child=import_module("numpy.random").seed)  # as the standard library's `random` does
     gc.collect()
     gc.freeze()  # the collector would write to the pages that all share
     request = Zygote(socket.socket(fileno=int(sys.argv[1]))).serve()
