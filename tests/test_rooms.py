@@ -37,7 +37,8 @@ experiments.metrics
 experiments.scene
 experiments.virtual_time
 experiments.check
-experiments.authoring experiments.real_time.hosts experiments.real_time.processes
+experiments.authoring experiments.real_time.processes
+experiments.real_time.hosts
 experiments.report experiments.real_time.conductor
 experiments.run
 experiments.sweep experiments.view

@@ -54,6 +54,11 @@ def _become_station(words: list[str]) -> None:
 
         sys.exit(serve())
     if words[:1] == ["agent"] and "--lifeline" in words:
+        from experiments.real_time.hosts.launcher import RUN  # noqa: PLC0415
+        from experiments.real_time.processes import zygote  # noqa: PLC0415
+
+        if (run := os.environ.get(RUN)) and (code := zygote.stand_for(run, words[1:])) is not None:
+            sys.exit(code)
         from agents.network.shutdown import end  # noqa: PLC0415
         from experiments.real_time.processes.robot import main as robot  # noqa: PLC0415
 

@@ -28,6 +28,7 @@ from experiments.recording import version
 
 MOST: Final = 200  # verdicts that are kept, and files beside an experiment that are read
 LARGEST: Final = 4_000_000  # [bytes] of such a file
+UNCOUNTED: Final = ("__pycache__", "runs")  # in a folder of modules: what Python, or a run, makes there
 OTHERS: Final = 0o022  # mode of a folder in which others may write
 
 
@@ -126,7 +127,7 @@ def _importable(path: str) -> Iterator[tuple[str, int]]:
     """Names in a folder of modules; of distributions, whose name has their version, when they were installed [ns]."""
     with suppress(OSError), os.scandir(path or ".") as entries:
         for each in entries:
-            if not each.name.startswith((".", "__pycache__")):
+            if not each.name.startswith(".") and each.name not in UNCOUNTED:
                 yield each.name, each.stat().st_mtime_ns if each.name.endswith(".dist-info") else 0
 
 

@@ -67,10 +67,11 @@ class Chunk(ChunkBuilder):
 
     HEAD: Final = struct.Struct("<BQHIQQ")  # a message's record up to its data
 
-    def __init__(self, writer: Writer) -> None:
-        """Takes the place of a new writer's chunk."""
+    def __init__(self, writer: Writer, size: int = CHUNK_BYTES) -> None:
+        """Takes the place of a new writer's chunk; it is full at this size [bytes]."""
         super().__init__()
         self.full = False
+        self._size = size
         self._statistics: Statistics = getattr(writer, STATISTICS)
         setattr(writer, CHUNK, self)
 
@@ -87,7 +88,7 @@ class Chunk(ChunkBuilder):
         self.num_messages += 1
         # its opcode and the length itself, 9 bytes, are not in the length
         self.record_writer.write(self.HEAD.pack(Opcode.MESSAGE, length - 9, channel, number, logged, stamp) + data)
-        self.full = offset + length > CHUNK_BYTES
+        self.full = offset + length > self._size
 
     def reset(self) -> None:
         """Counts the messages of a chunk that was taken by `end` and written, and begins the next."""
@@ -136,6 +137,7 @@ class Recording:
         started: float | None = None,
         draw: Draw | None = None,
         utc: Callable[[], float] | None = None,
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         """Creates the file; raises RecordingError if the file exists or cannot be written.
 
@@ -144,12 +146,14 @@ class Recording:
             started: UTC time of the common start [s], if it is known already; the event `start` says it as well.
             draw: Draws the scene for viewers.
             utc: Clock of the recorder [s]: nothing is logged later than it came. Without one, messages come in order.
+            chunk_bytes: Messages that are written together, and lost together by a kill [bytes].
         """
         self.path = path
         self.refused = 0  # messages left out, because they hold what their type excludes
         self._channels: dict[tuple[str, str], int] = {}  # by topic and robot
         self._schemas: dict[str, int] = {}
-        self._latest = 0  # [ns]
+        self._stamp = -inf  # [s, UTC] the last good one
+        self._latest = 0  # [ns] the same
         self._utc, self._draw = utc, draw
         self._places: dict[str, Vector] = {}  # [m] of each robot, the last known
         self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
@@ -171,8 +175,8 @@ class Recording:
             raise RecordingError(f"{path}: exists already; move it away or record under another name") from None
         except OSError as error:
             raise RecordingError(f"{path}: cannot be created: {error.strerror}; record somewhere else") from error
-        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._chunk = Chunk(self._writer)
+        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        self._chunk = Chunk(self._writer, chunk_bytes)
         self._index = ChunkIndices(path.parent, self._writer)
         made = version.provenance()
         about = {"case": case, "seed": str(seed), "clock": clock, "version": made.zenpark}
@@ -269,8 +273,14 @@ class Recording:
         begun = self._nanoseconds(logged)
         stamp = begun if message.stamp == logged else self._nanoseconds(message.stamp)
         number = getattr(message, "seq", 0) & 0xFFFFFFFF
-        # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
-        self._write_or_fail(self._chunk.add, channel, max(self._index.end, begun), data, stamp, number)
+        if self._over:
+            raise RecordingError(self._over)
+        try:
+            # chunks in order of time, as viewers want them: what was late by a moment joins the present chunk
+            self._chunk.add(channel, max(self._index.end, begun), data, stamp, number)
+        except BaseException:
+            self._over = self._interrupted
+            raise
         if self._chunk.full:
             self.flush()
         return True
@@ -283,8 +293,8 @@ class Recording:
         return channel
 
     def _nanoseconds(self, stamp: float) -> int:
-        if 0.0 <= stamp < LATEST_S:
-            self._latest = round(stamp * 1e9)
+        if stamp != self._stamp and 0.0 <= stamp < LATEST_S:
+            self._stamp, self._latest = stamp, round(stamp * 1e9)
         return self._latest  # a broken clock must not stretch the time line of the whole file
 
     def _write_or_fail(self, write: Callable[..., object], *what: object) -> None:
@@ -300,10 +310,12 @@ class Recording:
             )
             raise RecordingError(self._over) from error
         except BaseException:
-            self._over = (
-                f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
-            )
+            self._over = self._interrupted
             raise
+
+    @property
+    def _interrupted(self) -> str:
+        return f"{self.path}: the recorder was interrupted while it wrote; run `./zenpark recover` on the file"
 
 
 @dataclass(frozen=True)

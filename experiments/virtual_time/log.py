@@ -6,7 +6,6 @@ import heapq
 import math
 from collections.abc import Iterable, Iterator
 from functools import cached_property
-from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -44,6 +43,8 @@ from experiments.virtual_time.simulation import OPTIONAL, Log
 
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 
+
+LARGE_CHUNK_BYTES: Final = 512 * 1024  # of a run that is over: there is nothing to be lost by a kill
 
 T = TypeVar("T")
 
@@ -122,6 +123,7 @@ class Logbook:
             clock="virtual",
             started=EPOCH,
             draw=markers.drawing(self._experiment),
+            chunk_bytes=LARGE_CHUNK_BYTES,
         ) as recording:
             for logged, message, size in heapq.merge(*self._messages(), key=itemgetter(0)):
                 if size is None:
@@ -189,11 +191,11 @@ class Logbook:
         log = self._log
         words = [phase.word for phase in Phase]
         columns = (log.phase, log.position, log.velocity, log.yaw, log.goal, log.setpoint, log.error)
-        rest = [getattr(log, what) for what in OPTIONAL]
+        known = {what: column for what in OPTIONAL if (column := getattr(log, what)) is not None}
         samples = zip(
             log.time.tolist(),
             *(column.tolist() for column in (*columns, log.true_position, log.true_yaw)),
-            *(repeat(None, len(log.time)) if column is None else column.tolist() for column in rest),
+            *(column.tolist() for column in known.values()),
             strict=True,
         )
         received, receipts = self._received_by_sample(), self._goals_by_sample()
@@ -215,7 +217,7 @@ class Logbook:
                         messages.vector(truth[row]),
                         messages.heading(true_yaw[row]),
                         received.get((k, row), []),
-                        **{what: each and _known(each[row]) for what, each in zip(OPTIONAL, more, strict=True)},
+                        **{what: _known(each[row]) for what, each in zip(known, more, strict=True)},
                         goal_receipts=receipts.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)

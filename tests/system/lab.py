@@ -191,7 +191,7 @@ class Flight:
         )
 
     def children(self) -> dict[str, psutil.Process]:
-        """The processes that it started, by robot name, "router", "recorder", "world", "centre"."""
+        """The processes that it started, by robot name, "zygote", "router", "recorder", "world", "centre"."""
         found = {}
         for child in psutil.Process(self.process.pid).children(recursive=True):
             try:
@@ -201,6 +201,8 @@ class Flight:
             if "experiments.real_time.processes.robot" in line:
                 for name in line[line.index("experiments.real_time.processes.robot") + 2 : line.index("--connect")]:
                     found[name] = child
+            elif "experiments.real_time.processes.zygote" in line:
+                found["zygote"] = child
             elif "agents.runtime.router" in line:
                 found["router"] = child
             elif "experiments.real_time.processes.recorder" in line:

@@ -59,7 +59,7 @@ def test_two_tellos_and_three_crazyflies_fly_one_formation(tmp_path: Path) -> No
     file = str(ROOT / "tests" / "system" / "flock.toml")
     flight = Flight(tmp_path / "run", file, "--bodies", "protocol", "--json", "--no-report")
     code, out = flight.finish(90.0)
-    assert code == 0, flight.said
+    assert code == 0, flight.said()
     robots = json.loads(out)["cases"]["event"]["robots"]
     assert set(robots) == {"CF01", "CF02", "CF03", "TE01", "TE02"}
     assert all(robot["acquired_s"] is not None and robot["lost"] == 0 for robot in robots.values()), robots

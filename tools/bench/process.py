@@ -37,6 +37,7 @@ class Meter:
     def __init__(self) -> None:
         self.first: dict[str, tuple[float, Usage]] = {}  # with its time [s, monotonic]
         self.last: dict[str, tuple[float, Usage]] = {}
+        self.pss_mb: dict[str, float] = {}  # memory, of shared pages a part (proportional set size)
 
     def measure(self, pids: Mapping[str, int]) -> None:
         """Measure now; processes that have ended are left out."""
@@ -44,6 +45,12 @@ class Meter:
             if (usage := usage_of(pid)) is not None:
                 self.last[name] = time.monotonic(), usage
                 self.first.setdefault(name, self.last[name])
+
+    def weigh(self, pids: Mapping[str, int]) -> None:
+        """Measure the memory, once: that takes milliseconds."""
+        for name, pid in pids.items():
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text("ascii").splitlines()
+            self.pss_mb[name] = sum(int(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1.024e-3
 
     def shares(self) -> dict[str, float]:
         """CPU time of each process over wall time [%]."""
@@ -71,10 +78,14 @@ def process() -> Iterator[Figure]:
             last[name] = status
         robots.measure({name: status.pid for name, status in running.items()})
         bare.measure({name: beside[name] for name in running})
+        if not robots.pss_mb and len(running) == len(experiment.robots) and (progress.elapsed or 0.0) > FLIGHT_S / 2.0:
+            robots.weigh({name: status.pid for name, status in running.items()})
+            bare.weigh(beside)
 
     with tempfile.TemporaryDirectory() as name:
         folder, endpoints = Path(name), [free_endpoint()]
         with Launcher(folder / "logs") as launcher:
+            launcher.preload()
             start_router(launcher, endpoints)
             for robot in experiment.robots:
                 senders = [link.name for link in plan.assignment(robot).neighbours]
@@ -97,9 +108,8 @@ def process() -> Iterator[Figure]:
     ratio = statistics.median(of_robots[name] / rates[name] * pose_hz / of_bare[name] for name in rates)
     cpu, of = statistics.median(of_robots.values()), "× bare process, each pose"
     yield Figure("process", "CPU of a robot (50 Hz pose, 100 Hz body)", cpu, "% of a core", ratio, of)
-    memory = max(usage.rss_mb for _, usage in bare.last.values())
-    yield Figure("process", "largest resident memory of a bare process", memory, "MB", 1.0, "yardstick")
-    larger = max(usage.rss_mb for _, usage in robots.last.values())
-    yield Figure("process", "largest resident memory of a robot", larger, "MB", larger / memory, "× bare process")
+    memory, of_robot = (statistics.median(meter.pss_mb.values()) for meter in (bare, robots))
+    yield Figure("process", "memory of a bare process (PSS)", memory, "MB", 1.0, "yardstick")
+    yield Figure("process", "memory of a robot (PSS)", of_robot, "MB", of_robot / memory, "× bare process")
     missed = 100.0 * sum(s.missed for s in last.values()) / sum(s.ticks for s in last.values())
     yield Figure("process", "missed deadlines", missed, "%", missed, "× 1 %")

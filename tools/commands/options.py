@@ -32,7 +32,7 @@ PANELS: Final = {
 
 
 class _Coercion:
-    """Value of a parameter as its type; by typer's pydantic (70 ms of imports) only where it is no text already."""
+    """Value of a parameter as its type; by typer's pydantic (70 ms of imports) only where it is not already."""
 
     def __init__(self, parameter: Any) -> None:  # noqa: ANN401 - of typer's private click
         self._build = parameter.get_runtime_param
@@ -47,7 +47,7 @@ class _Coercion:
         if value is None:
             return () if several else None
         wanted = param.type_descriptor.annotation
-        if wanted is str and isinstance(value, str):
+        if type(value) is wanted:  # a text, or a default
             return value
         if wanted == list[str] and isinstance(value, list | tuple):
             return list(value)
@@ -62,7 +62,7 @@ def _quick(parameters: list[Any]) -> list[Any]:
 
 
 class Command(TyperCommand):
-    """A command that imports pydantic for numbers and paths alone."""
+    """A command that imports pydantic for the numbers and paths that are given alone."""
 
     def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - of typer's private click
         """Parameters, that of help included."""

@@ -85,10 +85,11 @@ class SpoiltLauncher(Launcher):
         super().__init__(logs)
         self._request = request
 
-    def start(self, name: str, module: str, *arguments: str) -> Process:
+    def start(self, name: str, module: str, *arguments: str, forked: bool = False) -> Process:
         own = self._request.cables.get(spoilt_process.role_of([module, *arguments]), {})
         words = (own.get(word, word) for word in arguments)
-        return super().start(name, spoilt_process.MODULE, self._request.switches, module, *words)
+        spoilt = self._request.switches, module, *words
+        return super().start(name, spoilt_process.MODULE, *spoilt, forked=forked)
 
 
 class SpoiltRun:
@@ -234,7 +235,7 @@ class SpoiltRun:
     def start_duplicate(self, robot: str) -> Process:
         """Start a second process of a robot's name: the same command again."""
         pid = self._running(robot)[0]
-        words = dict(tagged(self._tag))[pid][:-1]  # the last one is empty
+        words = dict(tagged(self._tag))[pid]
         return self._spawn(f"double-{robot}-{pid}-{time.monotonic_ns()}", words)
 
     def fill_disk(self) -> str:

@@ -53,4 +53,4 @@ class CaseContext:
     def start(self, role: str, module: str, *arguments: str) -> Process:
         """Start a process of this case on this machine, with a lifeline and the routers."""
         connect = [part for endpoint in self.endpoints for part in ("--connect", endpoint)]
-        return self.launcher.start(self.process(role), module, *arguments, *connect, "--lifeline")
+        return self.launcher.start(self.process(role), module, *arguments, *connect, "--lifeline", forked=True)

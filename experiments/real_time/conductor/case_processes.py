@@ -20,7 +20,7 @@ from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.support import Servants
 from experiments.real_time.hosts.hosts import STATION
-from experiments.real_time.hosts.launcher import LAND_S, Process
+from experiments.real_time.hosts.launcher import LAND_S, ZYGOTE, Process
 from experiments.recording.reader import RecordingError, recover
 
 ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for silent neighbours
@@ -30,8 +30,8 @@ ALONE_S: Final = 3.0  # limit for a robot that joins a run under way to wait for
 class Death:
     """Unexpected end of a process."""
 
-    # "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), or the role of
-    # a process that was started again
+    # "lost" (a robot's process), "host" (the connection to one), "device" (a protocol twin), "zygote", or the
+    # role of a process that was started again
     kind: str
     source: str  # robot or host concerned, or "conductor"
     text: str
@@ -199,6 +199,9 @@ class CaseProcesses:
                 what = process.name.removeprefix(self._context.process(""))
                 text = f"the {what} ended ({process.exit}); robots that need it hold, or land{process.because}"
                 yield Death("device", "conductor", text)
+            elif process.name == ZYGOTE:
+                what = f"the zygote ended ({process.exit}); processes are started without it{process.because}"
+                yield Death("zygote", "conductor", what)
             elif process.name.startswith(STATION):
                 what = f"the connection to it ended ({process.exit}); without a router robots hold{process.because}"
                 yield Death("host", process.name.removeprefix(STATION), what)

@@ -175,6 +175,7 @@ def _staged(
     )  # fmt: skip
     with run_registry.registered(me) as unlisted, user.launching(folder / "logs") as launcher:
         user.tell([*([unlisted] if unlisted else []), *check_other_runs(me, run_registry.runs(), str(read.path))])
+        launcher.preload()
         routers = make_routers(listening, network.routers) if own_router else []
         start_routers(launcher, routers, rights)
         hosts = Hosts(launcher, endpoints if meshed else listening)

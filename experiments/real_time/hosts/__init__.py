@@ -1,4 +1,5 @@
 """Starting processes here and, over ssh, on other machines; their clocks and certificates.
 
-May import: agents, twins, bridges, experiments.definition, experiments.recording.
+May import: agents, twins, bridges, experiments.definition, experiments.recording,
+experiments.real_time.processes.zygote.
 """

@@ -254,6 +254,8 @@ class Hosts:
                     trouble.append(_other_version(station))
                 else:
                     trouble += station.distrusted(station.host.robots)
+                    if len(station.host.robots) > 1:
+                        station.ask(Question("preload"))
             except HostError as error:
                 trouble.append(str(error))
         if trouble:

@@ -11,22 +11,26 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import IO, Final, Self
 
 from agents.clock import Clock
 from agents.runtime.lifeline import BEAT_S, SILENCE_S
+from experiments.real_time.processes import zygote
+from experiments.real_time.processes.zygote import Forked, NoZygote
 
 ROUTER: Final = "router"  # the first; others are router2, router3, ...
+ZYGOTE: Final = "zygote"
 LAND_S: Final = 15.0  # for robots to come down after their lifeline was cut
 TAIL: Final = 12  # lines of a dead process's output that are worth showing
 
@@ -36,7 +40,7 @@ class Process:
     """A started process: its name, its handle, and the file that its output goes to."""
 
     name: str
-    handle: subprocess.Popen[bytes]
+    handle: subprocess.Popen[bytes] | Forked
     log: Path  # begins with the output of processes of this name before it
     begins: int = 0  # [bytes] where its own output begins there
     unsent: bytearray = field(default_factory=bytearray)  # input that its pipe has not taken yet
@@ -55,6 +59,8 @@ class Process:
         code = self.handle.poll()
         if code is None:
             return "still running"
+        if code == zygote.UNKNOWN:
+            return "exit code unknown"
         return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
 
     @property
@@ -100,6 +106,7 @@ class Launcher:
         # the clock of modules that are started here; None: each reads the wall clock anew
         self.clock: Clock | None = None
         self._processes: dict[str, Process] = {}
+        self._zygote: Path | None = None  # its socket; None if there is none, or none any more
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._silence_at, self._beat_at = -inf, time.monotonic()
@@ -116,12 +123,30 @@ class Launcher:
     ) -> None:
         self.end([name for name in self._processes if not is_router(name)], grace_s=LAND_S)
         self.end(list(self._processes), grace_s=0.0)  # all robots are down: no router is needed any more
+        self._forget_zygote()
         self._over.set()
         self._beat.join()
 
-    def start(self, name: str, module: str, *arguments: str) -> Process:
-        """Start a module of this project in a process and session of its own; one thread per numeric library."""
+    def preload(self) -> None:
+        """Start the zygote, which imports what robots need while others are started."""
+        with contextlib.suppress(NoZygote):
+            path = zygote.address(secrets.token_hex(8))
+            with zygote.listen(path) as listener:
+                self.spawn(ZYGOTE, zygote.command(listener), inherited=[listener.fileno()])
+            self._zygote = path
+
+    def start(self, name: str, module: str, *arguments: str, forked: bool = False) -> Process:
+        """Start a module of this project in a process and session of its own; one thread per numeric library.
+
+        `forked` by the zygote, if there is one: it starts at once, and shares what it imports with the others.
+        """
         shared = {} if self.clock is None else self.clock.shared()
+        if forked and (path := self._zygote) is not None:
+            request = zygote.Request(name, module, arguments, shared)
+            try:
+                return self._begin(name, lambda log: _fork(request, path, log))
+            except NoZygote:
+                self._forget_zygote()
         return self.spawn(name, [sys.executable, "-m", module, *arguments], environment=shared)
 
     def spawn(
@@ -132,6 +157,7 @@ class Launcher:
         first_input: bytes = b"",
         answers: bool = False,
         environment: Mapping[str, str] | None = None,
+        inherited: Sequence[int] = (),
     ) -> Process:
         """Start any command that holds its standard input as a lifeline.
 
@@ -139,19 +165,30 @@ class Launcher:
             first_input: Read there before the first heartbeat.
             answers: Its standard output is the caller's to read, and only its errors are logged.
             environment: Added to the launcher's own.
+            inherited: File descriptors that it keeps, by the same numbers.
         """
-        own = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+
+        def popen(log: IO[bytes]) -> subprocess.Popen[bytes]:
+            return subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE if answers else log,
+                stderr=log,
+                start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
+                env={**os.environ, **zygote.ONE_THREAD, "PYTHONUNBUFFERED": "1", **(environment or {})},
+                pass_fds=inherited,
+            )
+
+        return self._begin(name, popen, first_input)
+
+    def _begin(
+        self, name: str, start: Callable[[IO[bytes]], subprocess.Popen[bytes] | Forked], first_input: bytes = b""
+    ) -> Process:
+        """Start a process in one of the ways, with its log, and hold its lifeline."""
         log = self._logs / f"{name}.log"
         with log.open("ab") as output:
             begins = os.fstat(output.fileno()).st_size
-            handle = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE if answers else output,
-                stderr=output,
-                start_new_session=True,  # Ctrl-C is the launcher's: it lands the robots first
-                env={**own, **(environment or {})},
-            )
+            handle = start(output)
         assert handle.stdin is not None
         os.set_blocking(handle.stdin.fileno(), False)  # a stopped process must not stop the heartbeat of the others
         process = Process(name, handle, log, begins, bytearray(first_input))
@@ -184,8 +221,8 @@ class Launcher:
     def kill(self, name: str) -> None:
         """End a process that ignores its lifeline, at once; `died` reports its end."""
         with self._lock:
-            if name in self._processes and self._processes[name].alive:
-                os.killpg(self._processes[name].handle.pid, signal.SIGKILL)
+            if name in self._processes:
+                self._signal(self._processes[name], signal.SIGKILL)
 
     def died(self) -> list[Process]:
         """Processes that have ended by themselves since the last call; they are forgotten."""
@@ -205,15 +242,27 @@ class Launcher:
         for process in ending:
             self._close(process)
         self._wait(ending, grace_s)
+        stubborn: list[Process] = []
         for number, wait_s in ((signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0)):
             stubborn = [process for process in ending if process.alive]
             for process in stubborn:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.handle.pid, number)
+                self._signal(process, number)
             self._wait(stubborn, wait_s)
         for process in ending:
             self._forget(process)
-        return [process for process in ending if (process.handle.returncode or 0) == -signal.SIGKILL]
+        return [each for each in ending if each in stubborn or each.handle.returncode == -signal.SIGKILL]
+
+    def _forget_zygote(self) -> None:
+        if self._zygote is not None:
+            self._zygote.unlink(missing_ok=True)
+            self._zygote = None
+
+    @staticmethod
+    def _signal(process: Process, number: signal.Signals) -> None:
+        """Send a signal to a process that runs, and to all that it has started."""
+        if process.alive:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.handle.pid, number)
 
     @staticmethod
     def _wait(processes: Sequence[Process], limit_s: float) -> None:
@@ -257,6 +306,19 @@ class Launcher:
                     del process.unsent[: os.write(process.handle.stdin.fileno(), process.unsent)]
 
 
+def _fork(request: zygote.Request, path: Path, log: IO[bytes]) -> Forked:
+    """Have a zygote fork a process that holds a pipe from here as its lifeline; raises NoZygote."""
+    end, stdin = os.pipe()
+    held = os.fdopen(stdin, "wb", buffering=0)
+    try:
+        return zygote.fork(path, request, [end, log.fileno(), log.fileno()], held)
+    except NoZygote:
+        held.close()
+        raise
+    finally:
+        os.close(end)
+
+
 RUN: Final = "ZENPARK_RUN"  # in the environment of every process of a run, here or on a host, by which they are found
 
 
@@ -265,4 +327,5 @@ def tagged(tag: str) -> Iterator[tuple[int, list[str]]]:
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # another user's, or ended meanwhile
             if tag.encode() in (folder / "environ").read_bytes().split(b"\0"):
-                yield int(folder.name), (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+                words = (folder / "cmdline").read_bytes().rstrip(b"\0")  # of a forked process there are many at the end
+                yield int(folder.name), words.decode(errors="replace").split("\0")

@@ -14,6 +14,7 @@ import re
 import select
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -31,6 +32,8 @@ from agents.runtime.lifeline import FAR_SILENCE_S
 from experiments.definition.bodies import missing_library
 from experiments.real_time.hosts import certificates
 from experiments.real_time.hosts.launcher import LAND_S, RUN, tagged
+from experiments.real_time.processes import zygote
+from experiments.real_time.processes.zygote import NoZygote
 from experiments.recording import version
 
 POLL_S: Final = 0.1
@@ -44,7 +47,7 @@ UDEV: Final = "add a udev rule for it and plug it in again (docs/crazyflie.md)"
 class Question(msgspec.Struct, frozen=True, omit_defaults=True):
     """A launcher's question."""
 
-    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep"]
+    ask: Literal["hello", "clock", "reach", "devices", "certificates", "sweep", "preload"]
     endpoints: list[str] = []  # routers to reach
     bodies: list[str] = []  # whose devices are asked for
     lab: str | None = None  # folder of certificates
@@ -75,7 +78,7 @@ class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
 def answer(question: Question, clock: float) -> Answer:
     code = version.digest()
     match question.ask:
-        case "clock":
+        case "clock" | "preload":
             return Answer(code, clock)
         case "reach":
             return Answer(code, clock, found=[_reach(endpoint, question) for endpoint in question.endpoints])
@@ -141,9 +144,39 @@ def _radios() -> Iterator[Found]:
 
 
 def _other_processes() -> list[int]:
-    """Processes of the same run on this machine, but for this one and its parent."""
-    run = os.environ.get(RUN)
-    return [pid for pid, _ in tagged(f"{RUN}={run}") if pid not in (os.getpid(), os.getppid())] if run else []
+    """Processes of the same run on this machine, but for this one, its parent, the zygote and those that stand for
+    robots: these end with the robots, or with this one."""
+    run, mine = os.environ.get(RUN), (os.getpid(), os.getppid())
+    found = tagged(f"{RUN}={run}") if run else []
+    return [pid for pid, words in found if pid not in mine and zygote.MODULE not in words]
+
+
+@contextlib.contextmanager
+def _preloaded() -> Iterator[None]:
+    """Inside, the robots of the run that are started here are forked by a zygote, if there can be one."""
+    try:
+        with zygote.listen(zygote.address(os.environ.get(RUN, ""))) as listener:
+            started = subprocess.Popen(
+                zygote.command(listener),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+                env={**os.environ, **zygote.ONE_THREAD},
+                pass_fds=[listener.fileno()],
+            )
+    except NoZygote:
+        yield
+        return
+    assert started.stdin is not None
+    try:
+        yield
+    finally:
+        started.stdin.close()
+        try:
+            started.wait(FROZEN_S)
+        except subprocess.TimeoutExpired:
+            started.kill()
 
 
 def _frozen(pid: int) -> bool:
@@ -175,7 +208,7 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
     rest = b""
-    with contextlib.suppress(OSError):  # the other end is closed
+    with contextlib.suppress(OSError), contextlib.ExitStack() as until_lost:  # OSError: the other end is closed
         while waiting.poll(FAR_SILENCE_S * 1e3):
             data = os.read(fd, 65536)
             clock = here.utc()
@@ -190,6 +223,8 @@ def serve(fd: int = 0, patience_s: float = LAND_S) -> int:
                 except msgspec.MsgspecError as error:
                     print(f"station: not understood: {error}", file=sys.stderr)
                     continue
+                if question.ask == "preload":
+                    until_lost.enter_context(_preloaded())
                 os.write(1, msgspec.json.encode(answer(question, clock)) + b"\n")
     lost = time.monotonic()
     while (left := _other_processes()) and time.monotonic() < lost + patience_s:

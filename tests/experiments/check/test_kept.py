@@ -79,6 +79,12 @@ def test_nothing_that_changes_keeps_its_verdict(park, what):
     assert KeptVerdict(str(park)).read() is None
 
 
+def test_folder_of_runs_changes_nothing(park):
+    KeptVerdict(str(park)).keep(SAID)
+    (park.parents[1] / "site" / "runs").mkdir()
+    assert KeptVerdict(str(park)).read() == SAID
+
+
 def test_options_and_code_have_verdicts_of_their_own(park, monkeypatch):
     KeptVerdict(str(park), ["seed=2"], ["event"]).keep(SAID)
     for options in ((), (["seed=3"], ["event"]), (["seed=2"], []), (["seed=2", "event"],), (["event"], ["seed=2"])):

@@ -240,6 +240,22 @@ def test_viewers_find_frames_and_a_scene_in_standard_types(path):
     ]
 
 
+def test_size_of_chunks_changes_no_message(tmp_path):
+    kept = []
+    for size in (1_000, CHUNK_BYTES, 1_000_000):
+        file = tmp_path / f"{size}.mcap"
+        with Recording(file, PAIR, case="only", seed=4, clock="real", chunk_bytes=size) as recording:
+            for k in range(200):
+                recording.write(state("CF01", k, START + 0.02 * k))
+        with file.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            found = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
+            kept.append((len(reader.get_summary().chunk_indexes), found))
+    counts, found = zip(*kept, strict=True)
+    assert counts[0] > counts[1] > counts[2] == 1
+    assert found[0] == found[1] == found[2]
+
+
 def test_chunks_are_in_order_of_time(path):
     drawn_scene(path)
     with path.open("rb") as file:

@@ -12,6 +12,7 @@ import pytest
 
 from experiments.real_time.hosts.launcher import RUN
 from experiments.real_time.hosts.station import Answer, Question, answer, devices
+from experiments.real_time.processes import zygote
 from experiments.recording import version
 from tests.system.lab import ENVIRONMENT, ROOT
 from tests.waiting import until
@@ -118,3 +119,33 @@ def test_it_waits_for_robots_that_land_and_kills_those_that_do_not():
         assert frozen.wait(30) == -signal.SIGKILL
     finally:
         frozen.stdin.close()
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("number", [None, signal.SIGKILL, signal.SIGTERM])
+def test_a_preloaded_station_forks_its_robots(number):
+    started = Started("run.lab3")
+    started.ask(Question("preload"))
+    robot = subprocess.Popen(
+        [sys.executable, "-m", "tools.guard", "agent", "-", "KH01", "--lifeline"],
+        cwd=ROOT,
+        env={**ENVIRONMENT, RUN: "run.lab3"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    pid = int(robot.stdout.readline().rpartition(" ")[2])
+    forked = psutil.Process(pid)
+    assert pid != robot.pid
+    assert zygote.MODULE in forked.parent().cmdline()
+    assert [word for word in forked.cmdline() if word][2:] == [zygote.ROBOT, "-", "KH01", "--lifeline"]
+    if number is signal.SIGKILL:
+        forked.kill()
+    elif number is not None:
+        robot.send_signal(number)
+    out, errors = robot.communicate(timeout=30)
+    assert robot.returncode == (2 if number is None else -number)
+    assert (out, "no experiment came" in errors) == ("", number is None)
+    assert started.ask(Question("sweep")).found == []
+    assert started.leave() == 0
