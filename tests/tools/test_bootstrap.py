@@ -3,6 +3,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,15 @@ from tests.system import rclpy_wheels, zenohd
 ROOT = Path(__file__).resolve().parents[2]
 
 
-LOCKS = ("requirements.lock", "requirements-view.lock", "requirements-hardware.lock", "requirements-dev.lock")
+LEVELS = {
+    "core": "requirements.lock",
+    "view": "requirements-view.lock",
+    "fast": "requirements-fast.lock",
+    "hardware": "requirements-hardware.lock",
+    "dev": "requirements-dev.lock",
+}
+LOCKS = tuple(LEVELS.values())
+SWEEP = ["sweep", "triangle", "seeds=5"]
 
 
 def locked(name):
@@ -36,7 +45,106 @@ def test_locks_hold_every_requirement():
     wanted = {re.match(r"[a-z0-9-]+", line)[0] for line in project["project"]["dependencies"]}
     assert wanted <= core.keys()
     assert {re.match(r"[a-z0-9-]+", line)[0] for line in project["dependency-groups"]["dev"]} <= dev.keys()
-    assert core.items() <= dev.items()
+
+
+def test_each_lock_has_all_of_the_one_before(bootstrap):
+    assert {level: path.name for level, path in bootstrap.LOCKS.items()} == LEVELS
+    for less, more in pairwise(LOCKS[:-1]):
+        assert locked(less).items() < locked(more).items()
+    assert locked("requirements-fast.lock").items() < locked("requirements-dev.lock").items()
+
+
+def test_numba_is_locked_above_view_only():
+    assert [name for name in LOCKS if "numba" in locked(name)] == list(LOCKS[2:])
+
+
+@pytest.fixture
+def installed(bootstrap, monkeypatch):
+    """Levels that were installed, in order; `fast` comes without numba."""
+    levels = []
+
+    def install(level):
+        levels.append(level)
+        bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} {level}\n")
+
+    monkeypatch.setattr(bootstrap, "install", install)
+    monkeypatch.setattr(bootstrap.os, "execve", lambda *_: None)
+    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *_: None)
+    return levels
+
+
+@pytest.mark.parametrize(
+    ("words", "levels"),
+    [
+        ("--version", ["core"]),
+        ("sweep", ["core"]),
+        ("sweep triangle --help", ["core"]),
+        ("sweep triangle", ["core", "fast"]),
+        ("run triangle --seeds 5", ["core"]),
+        ("run triangle --virtual", ["core"]),
+        ("run triangle --virtual --seeds 1", ["core"]),
+        ("run triangle --virtual --seeds x", ["core"]),
+        ("run triangle --virtual --seeds 20 -h", ["core"]),
+        ("run triangle --virtual --seeds 20", ["core", "fast"]),
+        ("run --seeds=2 triangle --virtual", ["core", "fast"]),
+        ("run triangle --virtual --view", ["view"]),
+        ("hardware", ["hardware"]),
+    ],
+)
+def test_level_of_a_command(bootstrap, installed, words, levels):
+    bootstrap.main(words.split())
+    bootstrap.main(words.split())
+    assert installed == levels
+
+
+def test_many_runs_without_numba_say_so(bootstrap, installed, capsys):
+    bootstrap.main(SWEEP)
+    assert capsys.readouterr().err.count("no numba") == 1
+    (bootstrap.VENV / "lib" / "python3.11" / "site-packages" / "numba").mkdir(parents=True)
+    bootstrap.main(SWEEP)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.fixture
+def commands(bootstrap, monkeypatch):
+    """The core is there and works; commands of an installation are kept and those that get packages fail."""
+    kept = []
+
+    def call(command, environment, what, remedy):
+        kept.append((command, environment))
+        raise bootstrap.Trouble("offline")
+
+    bootstrap.STAMP.write_text(f"{bootstrap.fingerprint()} core\n")
+    monkeypatch.setattr(bootstrap, "call", call)
+    monkeypatch.setattr(bootstrap, "works", lambda python: True)
+    monkeypatch.setattr(bootstrap, "get_uv", lambda base: "uv")
+    monkeypatch.setattr(bootstrap, "uv_environment", lambda base: {})
+    return kept
+
+
+def test_offline_a_sweep_goes_on_with_the_core(bootstrap, commands, monkeypatch, capsys):
+    started = []
+    monkeypatch.setattr(bootstrap.os, "execve", lambda path, command, environment: started.append(command[2:]))
+    monkeypatch.setattr(bootstrap.signal, "pthread_sigmask", lambda *_: None)
+    bootstrap.main(SWEEP)
+    assert started == [SWEEP]
+    assert bootstrap.ready("core")
+    assert [environment["UV_HTTP_RETRIES"] for _, environment in commands] == ["0"]
+    assert capsys.readouterr().err.splitlines()[-1].startswith("zenpark: no numba (offline")
+
+
+def test_failed_hardware_keeps_the_core(bootstrap, commands):
+    assert bootstrap.main(["hardware"]) == 2
+    assert bootstrap.ready("core")
+    assert "UV_HTTP_RETRIES" not in commands[0][1]
+
+
+def test_higher_level_only_adds_packages(bootstrap, commands, monkeypatch):
+    done = []
+    monkeypatch.setattr(bootstrap, "call", lambda command, *_: done.append(command))
+    bootstrap.prepare("view")
+    assert bootstrap.ready("view")
+    assert [command[-1] for command in done] == [str(bootstrap.LOCKS["view"])]
 
 
 def test_ready_only_for_what_was_installed(bootstrap):
