@@ -144,8 +144,8 @@ class Detector:
     FIXED: ClassVar = ("flies", "sees")
     __slots__ = (
         "ascent", "avoids", "battery_low", "behind_s", "descent", "fastest", "fastest_squared", "flies", "lean",
-        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "sees", "separation",
-        "silence_s", "slow_squared",
+        "leaned", "leans_since", "limits", "name", "obedience", "predictor", "radius", "scan", "scanned", "sees",
+        "separation", "silence_s", "slow_squared",
     )  # fmt: skip
 
     name: str  # of the robot

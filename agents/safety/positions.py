@@ -17,6 +17,7 @@ JUMP_M: Final = 0.5  # [m] beyond what a robot can move between two measurements
 GAP_S: Final = 0.5  # longest time that counts between them; after a longer one it stood, or was landed
 REACH: Final = 1.5  # share of a kind's speed: what it can move
 FLIP: Final = 0.5  # [rad] beyond what a robot can turn between two measurements: its markers are mistaken
+ABSURD: Final = 1e6  # [rad] no yaw
 MOST_TURNED: Final = 1.2  # [rad] between two measurements, however long the time between them
 
 
@@ -135,7 +136,7 @@ class ExternalPositions:
 
         Markers that look the same when turned make it flip; it is wrong until it has flipped back.
         """
-        if not isfinite(yaw):
+        if not abs(yaw) < ABSURD:  # NaN is not smaller either
             return nan
         jump, since = remainder(yaw - self._yaw, tau), time - self._yaw_time
         if not watched:

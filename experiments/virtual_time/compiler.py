@@ -188,7 +188,13 @@ class _Len(AbstractTemplate):  # type: ignore[misc]
         return signature(types.int64, args[0]) if isinstance(args[0], Several) else None
 
 
-def _item(builder: Any, kind: Any, several: Any, index: Any) -> Any:
+def _item(context: Any, builder: Any, kind: Any, several: Any, index: Any) -> Any:
+    """Address of an item; IndexError as Python has it."""
+    count = builder.extract_value(several, 1)
+    behind = builder.icmp_signed("<", index, ir.Constant(NUMBER, 0))
+    index = builder.select(behind, builder.add(index, count), index)
+    with builder.if_then(builder.icmp_unsigned(">=", index, count), likely=False):
+        context.call_conv.return_user_exc(builder, IndexError, ("list index out of range",))
     step = builder.mul(index, ir.Constant(NUMBER, WORD * width(kind)))
     return builder.add(builder.extract_value(several, 0), step)
 
@@ -196,13 +202,13 @@ def _item(builder: Any, kind: Any, several: Any, index: Any) -> Any:
 @lower_builtin(operator.getitem, Several, types.int64)  # type: ignore[untyped-decorator]
 def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kind = sig.args[0].kind
-    return _load(context, builder, kind, _item(builder, kind, *args), 0)
+    return _load(context, builder, kind, _item(context, builder, kind, *args), 0)
 
 
 @lower_builtin(operator.setitem, Several, types.int64, types.Any)  # type: ignore[untyped-decorator]
 def _set_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kind = sig.args[0].kind
-    _store(builder, kind, _item(builder, kind, *args[:2]), 0, args[2])
+    _store(builder, kind, _item(context, builder, kind, *args[:2]), 0, args[2])
     return context.get_dummy_value()
 
 

@@ -150,7 +150,10 @@ class Stretches:
         image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (ledger, of_ledger)])
         numbers = [number for group in groups.values() for number in (image.address(group), len(group))]
         instant = flight.network.instant
-        found = run(*numbers, image.address(ledger), 1, k, end, flight.dt, flight.log_every, instant)
+        try:
+            found = run(*numbers, image.address(ledger), 1, k, end, flight.dt, flight.log_every, instant)
+        except (ArithmeticError, LookupError, ValueError):  # of a plug-in: flown plain, the error tells where
+            return -1
         image.load()
         return int(found)
 

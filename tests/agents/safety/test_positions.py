@@ -127,3 +127,5 @@ def test_flipped_yaw_is_unknown_until_it_is_back():
     assert not any(known(1100, 1200, -math.pi / 2))
     assert all(known(1200, 1300, -math.pi / 2, watched=False))  # it stands: it may have been turned
     assert math.isnan(external.believed_yaw(99.0, nan, watched=True))
+    assert math.isnan(external.believed_yaw(99.1, 1e308, watched=True))
+    assert math.isnan(external.believed_yaw(99.2, -1e308, watched=True))
