@@ -1,9 +1,7 @@
 """Decisions of the central controller on a simulated clock: half a tick after their time, at the robots' instants."""
 
-import numpy as np
 import pytest
 
-from agents.decision.centralised import CentreGoals
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
 from agents.ticks import Ticks
@@ -31,7 +29,7 @@ class Over:
         return self.is_set()
 
 
-def test_decisions_follow_the_common_start_and_those_of_a_standstill_are_skipped(monkeypatch):
+def test_decisions_follow_start_and_skip_standstill(monkeypatch):
     over, decided = Over(12), []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
@@ -42,9 +40,10 @@ def test_decisions_follow_the_common_start_and_those_of_a_standstill_are_skipped
         def decide(t, _phase, start):
             decided.append((round(t * hz, 6), round((over.now - BEGIN) * hz, 6)))
             if len(decided) == 3:
-                start[process._guided] = 4.25 / hz  # robots began there
+                for row in process._guided:
+                    start[row] = 4.25 / hz  # robots began there
             over.now += (3.9 if len(decided) == 8 else 0.1) / hz
-            return CentreGoals(np.zeros(0, dtype=np.intp), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+            return []
 
         monkeypatch.setattr(process.centre, "decide", decide)
         process.run(over)
@@ -57,7 +56,7 @@ def test_decisions_follow_the_common_start_and_those_of_a_standstill_are_skipped
     assert ticks.next == pytest.approx(13.25 / hz)
 
 
-def test_a_wait_that_lasts_too_long_leads_to_no_decision_for_a_past_instant(monkeypatch):
+def test_long_wait_decides_for_no_past_instant(monkeypatch):
     over, decided, late = Over(12, more=0.73), [], []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
@@ -68,7 +67,7 @@ def test_a_wait_that_lasts_too_long_leads_to_no_decision_for_a_past_instant(monk
         def decide(t, *_):
             decided.append(over.now - BEGIN - t)
             late.append(process._late_s)
-            return CentreGoals(np.zeros(0, dtype=np.intp), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+            return []
 
         monkeypatch.setattr(process.centre, "decide", decide)
         process.run(over)

@@ -7,10 +7,9 @@ import signal
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from agents.decision.centralised import CentreGoals
+from agents.decision.centralised import CentreGoal
 from agents.network import name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
@@ -31,7 +30,7 @@ KEYS = Keys()
 
 @pytest.mark.parametrize("way", ["still", "cut off"])
 @pytest.mark.parametrize("what", ["world", "centre"])
-def test_who_wakes_and_finds_its_name_taken_sends_nothing(what, way, monkeypatch):
+def test_replaced_process_sends_nothing(what, way, monkeypatch):
     sent: list[bytes] = []
     now, silent = [0.0], [math.inf]
     over = threading.Event()
@@ -63,7 +62,7 @@ def test_who_wakes_and_finds_its_name_taken_sends_nothing(what, way, monkeypatch
             process = WorldProcess(experiment, Population(experiment), joint, lost)
         else:
             process = CentreProcess(pair(architecture="centralised"), joint)
-            goals = CentreGoals(np.array([0]), np.zeros((1, 3)), np.zeros(1), np.zeros(1))
+            goals = [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)]
             monkeypatch.setattr(process.centre, "decide", lambda *_: goals)
             process._goals[0] = Counted()
         with pytest.raises(NameTaken):

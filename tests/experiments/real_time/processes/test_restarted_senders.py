@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from agents.agent import Agent
-
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
+from agents.robot import Robot
 from agents.runtime.goal_inbox import GoalInbox
-from experiments.definition.experiment import Formation, Robot
+from experiments.definition import experiment as definition
+from experiments.definition.experiment import Formation
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world_network import Exchange
@@ -26,8 +25,8 @@ def own(net: Net, alive: str, session: str, *, gone: bool = False) -> None:
     net.deliver(f"{Keys.life(alive, session)}\0\0".encode(), gone=gone)
 
 
-def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_one_before():
-    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+def test_world_obeys_sender_with_clock_behind():
+    drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
         world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
@@ -49,9 +48,9 @@ def test_a_world_obeys_the_stop_of_a_process_whose_clock_is_behind_that_of_the_o
         assert order(BEHIND, "stop")
 
 
-def test_a_world_of_many_robots_knows_who_owns_each_name():
+def test_world_of_many_robots_knows_name_owners():
     names = [f"F{row:03}" for row in range(120)]  # each with a token, a claim and the token of an owner
-    drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
+    drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
         world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
@@ -63,18 +62,18 @@ def test_a_world_of_many_robots_knows_who_owns_each_name():
     assert world._lives == dict.fromkeys(names, "one")
 
 
-def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
+def test_centre_with_clock_behind_is_followed():
     experiment = pair(architecture="centralised")
-    agent = Agent(Plan(experiment).assignment(("A",)))
+    robot = Robot(Plan(experiment).assignment("A"))
     with Net().worn() as net:
-        goals = GoalInbox(net.session, KEYS, agent, agent.guidance, reach=(5.0, 5.0, 5.0))
+        goals = GoalInbox(net.session, KEYS, [robot], reach=(5.0, 5.0, 5.0))
 
         def tell(seq: int, t: float, x: float) -> float:
             """The goal that is pursued."""
             goal = messages.Goal("A", seq, UTC + t, (x, 0.0, 0.0), None, UTC + t)
             net.deliver(sent(KEYS.goal("A"), goal)[0])
             goals.receive(t, UTC)
-            return float(agent.guidance.goal[0, 0])
+            return robot.guidance.goal[0]
 
         own(net, KEYS.centre_alive, "one")
         assert tell(NOW, 1.0, 0.1) == 0.1
@@ -85,12 +84,12 @@ def test_a_centre_whose_clock_is_behind_that_of_the_one_before_is_followed():
         assert goals.malformed == 1
 
 
-def test_a_late_goal_does_not_bring_a_dead_centre_back():
-    agent = Agent(Plan(pair(architecture="centralised")).assignment(("A",)))
-    guidance, row, goal = agent.guidance, np.array([0]), np.zeros((1, 3))
-    guidance.receive(row, goal, np.zeros(1), np.array([1.0]))
+def test_late_goal_revives_no_dead_centre():
+    guidance = Robot(Plan(pair(architecture="centralised")).assignment("A")).guidance
+    goal = (0.0, 0.0, 0.0)
+    guidance.receive(goal, 0.0, 1.0)
     guidance.mark_lost(2.0)
-    guidance.receive(row, goal, np.zeros(1), np.array([1.9]))
-    assert guidance.unguided(2.1)[0]
-    guidance.receive(row, goal, np.zeros(1), np.array([2.2]))  # of another one, such as a tool of ROS
-    assert not guidance.unguided(2.3)[0]
+    guidance.receive(goal, 0.0, 1.9)
+    assert guidance.unguided(2.1)
+    guidance.receive(goal, 0.0, 2.2)  # of another one, such as a tool of ROS
+    assert not guidance.unguided(2.3)
