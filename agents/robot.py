@@ -21,16 +21,15 @@ from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, L
 from agents.decision.neighbours import Neighbours
 from agents.decision.perception import Perception
 from agents.decision.position_control import PositionController
-from agents.decision.rehearsal import rehearse
+from agents.decision.situation import ProcessHealth, Situation
 from agents.decision.transmission import Transmitter
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, Status
 from agents.safety.hazards import Cause, Hazards, Outcome
 from agents.safety.landing import Landing
 from agents.safety.positions import Continuity, ExternalPositions
-from agents.safety.preflight import Preflight
+from agents.safety.preflight import Preflight, rehearse
 from agents.safety.setpoint_filter import SetpointFilter
-from agents.safety.situation import ProcessHealth, Situation
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Pose, Setpoint, Vector, is_finite
 
 CENTRE: Final = "centre"  # missing neighbour of a guided robot without guidance
@@ -320,11 +319,11 @@ class Robot:
             held = life.phase == RUNNING and self.hazards.held
             self._stay(held or self.keeping.held or life.phase == AIRBORNE)
         if self.guidance is not None:
-            self._follow()
+            self._follow(self.guidance)
         goal = landing.place if landing.aside else self.goal
         self.avoided = False
         if self._perception is not None:
-            setpoint = self._avoid(t, goal)
+            setpoint = self._avoid(t, goal, self._perception)
         else:
             setpoint = self._controller.setpoint(goal, self.goal_yaw, now.position, now.yaw)
             setpoint = self._filter.limit(setpoint, now)
@@ -337,9 +336,9 @@ class Robot:
             self.interventions += self.changed
             self.evasions += self.avoided
 
-    def _avoid(self, t: float, goal: Vector) -> Setpoint:
+    def _avoid(self, t: float, goal: Vector, perception: Perception) -> Setpoint:
         """Setpoint toward a goal, with avoidance."""
-        now, perception = self.now, self._perception
+        now = self.now
         perception.sense(t, now, self.neighbours)
         own, near, avoidance = perception.own, perception.near, perception.avoidance
         x, y, z = avoidance.deviate(goal, own, near, self._dt)
@@ -409,9 +408,9 @@ class Robot:
         """Whether a running robot must stay: for its safety, or because no link of the law is active."""
         return self.hazards.held or self.goals.without_neighbours()
 
-    def _follow(self) -> None:
+    def _follow(self, guidance: Guidance) -> None:
         """A guided robot takes its received goal, on the tick of reception."""
-        guidance, running = self.guidance, self.lifecycle.phase == RUNNING
+        running = self.lifecycle.phase == RUNNING
         held = (running and self._holds()) or self.lifecycle.phase == AIRBORNE
         if held != self.keeping.held:
             self._stay(held)

@@ -10,7 +10,7 @@ from agents.decision.neighbours import Incoming
 from agents.formation.anchors import Anchor
 from agents.formation.changes import Change
 from agents.plugins.avoidance import Avoidance
-from agents.plugins.laws import Law
+from agents.plugins.laws import Gradient
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
@@ -24,7 +24,7 @@ class Assignment:
     kind: Kind
     hover: float  # height that a flying robot holds [m]; NaN on wheels
     neighbours: tuple[Incoming, ...]  # links on which it receives, those of its law first
-    law: Law
+    law: Gradient
     trigger: Trigger  # of transmissions
     clamp: float  # largest step of a goal per axis and decision [m]
     tracking_gain: float  # k of (7) [1/(m² decision)]

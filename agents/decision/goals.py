@@ -14,7 +14,7 @@ from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Neighbours
 from agents.formation.changes import change_target, exists, planned_at
 from agents.formation.link import Link
-from agents.plugins.laws import Law, goal_position, tracking_offset
+from agents.plugins.laws import Gradient, goal_position, tracking_offset
 from agents.plugins.planners import Itinerary, Leg, Waypoints
 from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite, norm
 
@@ -43,7 +43,7 @@ class GoalComputer:
     def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
         """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
         links = assignment.neighbours
-        self.law: Law = assignment.law
+        self.law: Gradient = assignment.law
         self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
         self.neighbours = Neighbours(links, assignment.limits.link_silence_s)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain

@@ -8,9 +8,9 @@ from typing import ClassVar, Final, NamedTuple
 from agents.body.interface import RangeScan
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbour, Neighbours
+from agents.decision.situation import Situation
 from agents.network.validation import MAX_SPEED
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.safety.situation import Situation
 from agents.vectors import Vector, clamp, is_finite
 
 REACH: Final = 3.0  # [m] between axes; farther things are ignored

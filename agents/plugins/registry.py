@@ -18,6 +18,10 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from agents.errors import ExplainedError
+from agents.plugins.avoidance import Avoidance
+from agents.plugins.laws import Gradient
+from agents.plugins.predictors import Predictor
+from agents.plugins.triggers import Trigger
 
 BODIES: Final = "zenpark.bodies"
 TRIGGERS: Final = "zenpark.triggers"
@@ -27,6 +31,7 @@ PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
 STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
+BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Gradient, AVOIDANCES: Avoidance}
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
 
@@ -92,10 +97,16 @@ def unusable(use: Callable[[str, str], object]) -> list[str]:
 
 
 def struct(group: str, name: str) -> type[msgspec.Struct]:
-    """The struct of parameters registered under a name; raises as `load`, and PluginError if it is no frozen struct."""
+    """The struct of parameters registered under a name.
+
+    Raises as `load`, and PluginError if it is no frozen struct, or inherits from another base than its group's.
+    """
     plugin, entry = load(group, name), _registered(group)[name][0]
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
         raise PluginError(f"{_origin(entry)} is no msgspec.Struct; its parameters must be its fields")
+    base = BASES.get(group, msgspec.Struct)
+    if not issubclass(plugin, base):
+        raise PluginError(f"{_origin(entry)} must inherit from {base.__module__}.{base.__qualname__}")
     if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
             f"{_origin(entry)} can be changed, and would mix what it keeps of different robots and runs; declare it "

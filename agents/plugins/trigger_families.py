@@ -97,7 +97,7 @@ class Dynamic(Trigger, frozen=True):
             w -= gap * gap
         step = view.t - memory.computed_at
         kept = 1.0 if isnan(step) else exp(-self.decay * step)
-        eta = kept * memory.eta + (1.0 - kept) / self.decay * w
+        eta: float = kept * memory.eta + (1.0 - kept) / self.decay * w
         eta = max(eta, 0.0)
         memory.computed_at = view.t
         if not known:
@@ -126,7 +126,8 @@ class Integral(Trigger, frozen=True):
         if isfinite(view.deviation) and isfinite(memory.until):
             memory.area += view.deviation * (view.t - memory.until)
         memory.until = view.t
-        return memory.area > self.area
+        area: float = memory.area
+        return area > self.area
 
 
 class Predictive(SendOnDelta, frozen=True):

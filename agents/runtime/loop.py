@@ -25,6 +25,7 @@ from agents.body.measured_positions import MeasuredPositions
 from agents.clock import Clock, uptime
 from agents.decision.assignment import Assignment
 from agents.decision.lifecycle import TOLD_TO_END, Phase
+from agents.decision.situation import ProcessHealth
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
 from agents.network.access_control import Rights
@@ -46,7 +47,6 @@ from agents.runtime.range_inbox import RangeInbox
 from agents.runtime.telemetry import Counts, Telemetry
 from agents.runtime.watchdog import AGAIN_S, DOWN_S, SILENCE_S, Watchdog
 from agents.safety.detection import SLOWEST
-from agents.safety.situation import ProcessHealth
 from agents.ticks import Ticks
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors

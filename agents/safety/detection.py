@@ -15,12 +15,12 @@ from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.perception import SCAN_S
+from agents.decision.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
 from agents.plugins.predictors import Predictor
 from agents.safety.hazards import Cause
 from agents.safety.landing import LOW, SLOW
 from agents.safety.obedience import RUSH_S, Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M
-from agents.safety.situation import LATE_SHARE, SILENT_S, ProcessHealth, Situation
 from agents.vectors import NO_SETPOINT, UNKNOWN, Setpoint, Vector, is_finite, norm, planar
 
 SUNK: Final = 0.15  # [m] below its goal

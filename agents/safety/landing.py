@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbours
-from agents.safety.situation import ProcessHealth, Situation
+from agents.decision.situation import ProcessHealth, Situation
 from agents.vectors import UNKNOWN, Vector, clamp, is_finite, norm, planar
 
 NEAR: Final = 0.05  # [m] between surfaces, seen from above: with less a robot does not land in place

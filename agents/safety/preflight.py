@@ -1,18 +1,28 @@
-"""Preflight checks: conditions for take-off, with the reason where one fails. None of it runs on quiet ticks."""
+"""Preflight checks: conditions for take-off, with the reason where one fails. None of it runs on quiet ticks.
+
+The plug-ins of a robot are rehearsed: called before take-off, and their results are checked.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from copy import deepcopy
 from itertools import chain
 from math import degrees, hypot, inf, isnan
+from numbers import Real
 from typing import Final
 
 from agents.body.interface import BodyState
 from agents.decision.assignment import Assignment
+from agents.decision.goals import GoalComputer
 from agents.decision.neighbours import Neighbour, Neighbours
+from agents.decision.perception import Perception
+from agents.decision.situation import ProcessHealth, Situation
+from agents.decision.transmission import Transmitter
+from agents.plugins.calls import wrong
+from agents.plugins.triggers import LastEvent, Trigger, View
 from agents.safety.detection import clock_off, clock_text, nearest_robot, tilt_angle, tilted
-from agents.safety.situation import ProcessHealth, Situation
-from agents.vectors import is_finite, norm, planar
+from agents.vectors import NO_SETPOINT, ZERO, Vector, is_finite, norm, planar
 
 LOST_S: Final = 0.5  # a ready robot whose check failed for this long is not ready any more
 FLOOR_M: Final = 0.5  # largest height of a standing drone: positioning systems differ about the floor
@@ -21,6 +31,7 @@ LEVEL: Final = 0.35  # [rad] and largest tilt
 WALL_M: Final = 0.05  # a place measured this far outside the arena may be inside
 ABOVE_M: Final = 0.1  # [m] a robot higher than this is above one that stands,
 BESIDE_M: Final = 0.1  # [m] unless there is more than this between the two, seen from above
+NUMBERS: Final = {1: "a number", 3: "three numbers", 4: "four numbers"}  # of a result
 
 
 class Preflight:
@@ -127,3 +138,41 @@ class Preflight:
                 if sender.position[2] - now.position[2] > ABOVE_M and planar(sender.position, now.position) < beside:
                     return sender
         return None
+
+
+def rehearse(
+    assignment: Assignment, goals: GoalComputer, transmitter: Transmitter, perception: Perception | None,
+    *, position: Vector, t: float,
+) -> None:  # fmt: skip
+    """Call each plug-in of a robot at `position` [m]; raises PluginError where a result is not what it must be."""
+    predictor, law, sent = transmitter.predictor, goals.law, LastEvent()
+    sent.position = position
+    _expect("predictor", predictor, "position", predictor.position(sent, 0.0), 3)
+    _expect("predictor", predictor, "velocity", predictor.velocity(sent, 0.0), 3)
+    for sender in goals.neighbours.all:
+        if sender.active:
+            apart = sender.apart(position, predictor, t)
+            _expect("law", law, "pull", law.pull(apart, sender.link), 3)
+            _expect("law", law, "error", law.error(apart, sender.link), 1)
+    trigger, update = transmitter.asking.trigger, assignment.update
+    _expect_bool(trigger, trigger.fires(deepcopy(transmitter.asking.view)))
+    if update is not None:
+        _expect_bool(update, update.fires(View(update.MEMORY)))
+    for leg in assignment.legs:
+        _expect("planner", leg.planner, "target", leg.planner.target(0.0, position, 0.0), 4)
+    if perception is not None:
+        avoidance, own, near = perception.avoidance, perception.own, perception.near
+        _expect("avoidance", avoidance, "deviate", avoidance.deviate(ZERO, own, near, 1.0), 3)
+        _expect("avoidance", avoidance, "restrain", avoidance.restrain(NO_SETPOINT, own, near), 4)
+
+
+def _expect(what: str, plugin: object, method: str, result: object, count: int) -> None:
+    numbers = [result] if count == 1 else list(result) if isinstance(result, Iterable) else []
+    if len(numbers) != count or not all(isinstance(each, Real) for each in numbers):
+        raise wrong(what, plugin, method, result, NUMBERS[count])
+
+
+def _expect_bool(trigger: Trigger, result: object) -> None:
+    plain = result.item() if hasattr(result, "item") else result  # comparisons of numpy's numbers give its own kind
+    if not isinstance(plain, bool):
+        raise wrong("trigger", trigger, "fires", result, "True or False")

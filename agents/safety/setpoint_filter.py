@@ -10,8 +10,8 @@ from typing import Final
 
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
+from agents.decision.situation import Situation
 from agents.plugins.avoidance import Avoidance, Nearby, OwnState
-from agents.safety.situation import Situation
 from agents.vectors import NO_SETPOINT, Setpoint, Vector, clamp
 
 FLOOR_M: Final = 0.05  # [m] least height of a goal above the floor, or the robot's own: a descent overshoots its goal

@@ -46,7 +46,7 @@ class Several(types.Type):  # type: ignore[misc]
 def type_of(kind: Any) -> Any:
     """numba's type of a kind of value."""
     if isinstance(kind, Floats):
-        return types.UniTuple(types.float64, kind.count)
+        return types.UniTuple(types.float64, kind.size)
     if isinstance(kind, Items):
         return Several(kind.item)
     return Thing(kind) if isinstance(kind, Layout) else SIMPLE[kind]
@@ -73,7 +73,7 @@ def _load(context: Any, builder: Any, kind: Any, address: Any, word: int) -> Any
     if kind == FLOAT:
         return builder.load(_place(builder, address, word, ir.DoubleType()))
     if isinstance(kind, Floats):
-        values = [_load(context, builder, FLOAT, address, word + k) for k in range(kind.count)]
+        values = [_load(context, builder, FLOAT, address, word + k) for k in range(kind.size)]
         return context.make_tuple(builder, type_of(kind), values)
     whole = builder.load(_place(builder, address, word))
     if kind == BOOL:
@@ -93,7 +93,7 @@ def _store(builder: Any, kind: Any, address: Any, word: int, value: Any) -> None
     if kind == FLOAT:
         builder.store(value, _place(builder, address, word, ir.DoubleType()))
     elif isinstance(kind, Floats):
-        for k in range(kind.count):
+        for k in range(kind.size):
             _store(builder, FLOAT, address, word + k, builder.extract_value(value, k))
     else:
         builder.store(builder.zext(value, NUMBER) if kind == BOOL else value, _place(builder, address, word))

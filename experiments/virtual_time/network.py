@@ -266,11 +266,11 @@ class VirtualNetwork:
             mine = sent[sent[:, 0] == robot.neighbours.all[k].sender]
             rows.append(mine)
             links.append(np.full(len(mine), float(link)))
-        every, link = np.concatenate(rows), np.concatenate(links)
-        arrival = every[:, 2] + np.array(self.delays)[link.astype(np.intp)] if len(link) else np.zeros(0)
-        order = np.lexsort((link, every[:, 0], every[:, 2], arrival))
+        every, on = np.concatenate(rows), np.concatenate(links)
+        arrival = every[:, 2] + np.array(self.delays)[on.astype(np.intp)] if len(on) else np.zeros(0)
+        order = np.lexsort((on, every[:, 0], every[:, 2], arrival))
         order = order[arrival[order] <= t + ROUNDING_S]
-        self._received.extend(every[order], arrival[order], link[order])
+        self._received.extend(every[order], arrival[order], on[order])
 
 
 def _row(sample: Sample) -> tuple[float, ...]:

@@ -21,9 +21,9 @@ LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # o
 
 
 class Floats(NamedTuple):
-    """Tuple of so many numbers."""
+    """Tuple of numbers."""
 
-    count: int
+    size: int
 
 
 class Items(NamedTuple):
@@ -50,7 +50,7 @@ class Layout:
 def width(kind: Any) -> int:
     """Words that a value takes."""
     if isinstance(kind, Floats):
-        return kind.count
+        return kind.size
     return 2 if isinstance(kind, Items) else 1
 
 
@@ -99,10 +99,8 @@ class Layouts:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""
         if isinstance(value, float):
             return FLOAT
-        if isinstance(value, bool):
-            return BOOL
         if isinstance(value, int):
-            return INT
+            return BOOL if isinstance(value, bool) else INT
         if isinstance(value, array):
             return Items(FLOAT)
         if isinstance(value, list | tuple):
@@ -138,7 +136,8 @@ class Layouts:
         if known is not None:
             return known[1]
         self._of[id(thing)] = (thing, None)
-        owner, fields, fixed = type(thing), dict[str, Any](), dict[str, Any]()
+        owner: type = type(thing)
+        fields, fixed = dict[str, Any](), dict[str, Any]()
         names = getattr(owner, "FIXED", ())
         for name in attributes(owner) or getattr(thing, "__dict__", ()):
             try:
@@ -219,7 +218,7 @@ class Image:
         if kind == FLOAT:
             self._floats[at] = values
         elif isinstance(kind, Floats):
-            for k in range(kind.count):
+            for k in range(kind.size):
                 self._floats[begin + k : begin + k + step * len(values) : step] = [value[k] for value in values]
         elif isinstance(kind, Items):
             self.words[at] = [self.address(value) for value in values]
@@ -247,7 +246,7 @@ class Image:
     def _read(self, count: int, kind: Any, begin: int, step: int) -> list[Any]:
         end = begin + step * count
         if isinstance(kind, Floats):
-            columns = (self._floats[begin + k : end + k : step].tolist() for k in range(kind.count))
+            columns = (self._floats[begin + k : end + k : step].tolist() for k in range(kind.size))
             return list(zip(*columns, strict=True))
         if kind == FLOAT:
             found: list[Any] = self._floats[begin:end:step].tolist()

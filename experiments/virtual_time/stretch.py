@@ -14,20 +14,21 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from agents.decision.lifecycle import READY
-from agents.plugins.planners import Itinerary
+from agents.plugins.planners import NO_TARGET, Itinerary
+from agents.robot import Robot
 from agents.user_folder import cache_folder
+from experiments.definition.experiment import Experiment
 from experiments.recording.version import digest
 from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
+from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import Image, Items, Layout, Layouts
-
-if TYPE_CHECKING:
-    from experiments.virtual_time.simulation import Flight
+from twins.body import TwinBody
 
 TICK_S: Final = 12e-6  # of CPU for a tick of a robot in plain Python, about
 PAYS_S: Final = 3.0  # plain Python is quicker than to load numba for less work in a process than this,
@@ -70,7 +71,28 @@ WORK: Final = [0.0]  # seconds of plain Python that the flights of this process 
 REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
 
 
-def stretches_of(flight: Flight) -> Stretches | None:
+class Flown(Protocol):
+    """A run in virtual time, as stretches take it over and leave it."""
+
+    experiment: Experiment
+    robots: list[Robot]
+    twin: TwinBody
+    network: VirtualNetwork
+    dt: float  # of a tick [s]
+    log_every: int  # ticks from one sample to the next
+    lean: bool  # of samples true positions alone
+
+    @property
+    def lonely(self) -> bool:
+        """Whether each robot moves by itself, and the network does nothing but take its time."""
+        ...
+
+    def note(self, ledger: Ledger) -> None:
+        """Note the samples of a stretch."""
+        ...
+
+
+def stretches_of(flight: Flown) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
     ticks = flight.experiment.duration_s * flight.experiment.rates.body_hz
     WORK[0] += TICK_S * ticks * len(flight.robots)
@@ -84,7 +106,7 @@ def stretches_of(flight: Flight) -> Stretches | None:
 class Stretches:
     """Compiled ticks of the robots of a flight."""
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: Flown) -> None:
         self._flight, self._layouts = flight, Layouts()
         twins = flight.twin.twins
         self._members = [Member(row, *each) for row, each in enumerate(zip(flight.robots, twins, strict=True))]
@@ -180,7 +202,7 @@ class Stretches:
             place, targets = (np.nan, np.nan, np.nan), []
             for number in range(first, first + (end - k) // every + 2):
                 t = (k + number * every - robot.tick) * flight.dt
-                targets.append(itinerary.target(t - begin, place, np.nan) if robot.begun else company.NO_TARGET)
+                targets.append(itinerary.target(t - begin, place, np.nan) if robot.begun else NO_TARGET)
             planned = self._plans.setdefault(row, Planned(hz))
             planned.first, planned.targets = first, targets
             robot.goals.itinerary = planned  # type: ignore[assignment]

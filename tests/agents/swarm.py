@@ -11,8 +11,8 @@ import msgspec
 
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
+from agents.decision.situation import ProcessHealth
 from agents.robot import Robot
-from agents.safety.situation import ProcessHealth
 from agents.vectors import ZERO, Vector
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment

@@ -192,7 +192,7 @@ class Exchange:
     def _obey(self, row: int, command: messages.Command, t: float) -> None:
         population, action = self._population, command.action
         if action == "drive":
-            self._given[row] = command.setpoint
+            self._given[row] = command.setpoint or NO_SETPOINT
             self._quiet[row], self._held[row] = t, False
             return
         self._given[row], self._held[row] = NO_SETPOINT, False

@@ -10,8 +10,8 @@ from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
+from agents.decision.situation import Situation
 from agents.plugins.avoidance import Avoidance
-from agents.safety.situation import Situation
 
 LIMITS = Limits(low=(-5.0, -5.0, 0.0), high=(5.0, 5.0, 2.5), speed=0.5)
 STILL = (0.0, 0.0, 0.0)

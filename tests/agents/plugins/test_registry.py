@@ -140,6 +140,15 @@ def test_did_you_mean(word, known, answer):
     assert registry.did_you_mean(word, known) == answer
 
 
+@pytest.mark.parametrize(
+    ("group", "base"), [(LAWS, "laws.Gradient"), (TRIGGERS, "triggers.Trigger"), (PREDICTORS, "predictors.Predictor")]
+)
+@pytest.mark.usefixtures("foreign")
+def test_plug_in_inherits_from_its_base(group, base):
+    with pytest.raises(registry.PluginError, match=rf"'pulse' .* must inherit from agents\.plugins\.{base}"):
+        registry.build(group, {"kind": "pulse", "width": 1.0})
+
+
 def test_ambiguous_name_is_refused(foreign):
     with pytest.raises(registry.PluginError, match=r"'twice' .* is ambiguous: .*one:A.* and .*two:B.*another name"):
         registry.load(foreign, "twice")

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from agents.body.interface import RangeScan
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.decision.situation import LATE_SHARE, ProcessHealth
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import (
     FOREIGN_S,
@@ -22,7 +23,6 @@ from agents.safety.detection import (
     tilted,
 )
 from agents.safety.hazards import Cause, Outcome
-from agents.safety.situation import LATE_SHARE, ProcessHealth
 from tests.agents.safety.watched import DT, NAN, Watched
 
 UNKNOWN = (NAN, NAN, NAN)

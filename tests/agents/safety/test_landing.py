@@ -11,10 +11,10 @@ from agents.body.interface import BodyState
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.decision.situation import ProcessHealth, Situation
 from agents.plugins.predictors import HOLD
 from agents.safety.landing import NEAR, PATIENCE_S, ROOM, Landing
 from agents.safety.setpoint_filter import SetpointFilter
-from agents.safety.situation import ProcessHealth, Situation
 from agents.vectors import clamp
 
 DT = 0.01

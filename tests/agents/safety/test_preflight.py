@@ -9,10 +9,10 @@ from agents.body.interface import BodyState
 from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.decision.situation import ProcessHealth, Situation
 from agents.plugins.predictors import HOLD
 from agents.safety.preflight import LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter
-from agents.safety.situation import ProcessHealth, Situation
 
 NAN = math.nan
 NOWHERE = (NAN, NAN, NAN)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from agents.body.interface import BodyState
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
+from agents.decision.situation import Situation
 from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
-from agents.safety.situation import Situation
 
 FEW = settings(max_examples=100)
 EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)

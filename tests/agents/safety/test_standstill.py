@@ -5,7 +5,7 @@ import math
 import pytest
 
 from agents.body.kinds import KHEPERA4
-from agents.safety.situation import SILENT_S
+from agents.decision.situation import SILENT_S
 from tests.agents.safety.watched import DT, Watched
 
 

@@ -7,10 +7,10 @@ from agents.body.interface import BodyState
 from agents.body.kinds import CRAZYFLIE
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.decision.situation import ProcessHealth, Situation
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, Status
 from agents.safety.hazards import Cause, Hazards
-from agents.safety.situation import ProcessHealth, Situation
 
 DT = 0.01
 NAN = math.nan
