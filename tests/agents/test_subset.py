@@ -13,7 +13,7 @@ from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
 ROOT = Path(__file__).parents[2]
 # functions of quiet modules that are not quiet themselves, each with the reason
 RARE = {
-    "agents/plugins/avoidance.py": {"Nearby.add"},  # grows its list of things, which a compiler gets ready-made
+    "agents/plugins/avoidance.py": {"Nearby.reserve"},  # grows its list of things, outside of ticks
     "agents/decision/transmission.py": {"Transmitter.replace_trigger"},  # an order
     "agents/decision/control_updates.py": set(),
     "agents/decision/position_control.py": set(),
@@ -27,7 +27,7 @@ RARE = {
     "agents/safety/setpoint_filter.py": set(),
     "agents/vectors.py": set(),
     **{str(path.relative_to(ROOT)): set() for path in sorted((ROOT / "twins" / "models").glob("*.py"))},
-    "twins/models/noise.py": {"stream", "refill"},  # random numbers are drawn in blocks, outside of ticks
+    "twins/models/noise.py": {"stream", "refill", "Noise.refill", "Noise.reserve", "Noise._drawn"},  # random numbers are drawn in blocks, outside of ticks
 }
 BANNED = {
     ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.ListComp: "a comprehension",

@@ -18,6 +18,7 @@ def own(kind, position, *, yaw=0.0, velocity=(0.0, 0.0, 0.0)):
 def near(*places, velocity=(0.0, 0.0), radius=0.0, is_robot=False, lag=0.0):
     """Things at x, y [m] that are alike otherwise."""
     made = Nearby()
+    made.reserve(len(places))
     for x, y in places:
         thing = made.add()
         thing.x, thing.y, thing.radius, thing.lag, thing.is_robot = x, y, radius, lag, is_robot

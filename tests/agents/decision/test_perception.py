@@ -23,8 +23,9 @@ class Sight:
     def __init__(self, kind=KHEPERA4, other=TURTLEBOT3, clearance=0.1):
         self.kind = kind
         avoidance = Avoidance(clearance=clearance)
-        self.perception = Perception(SimpleNamespace(kind=kind, limits=LIMITS, avoidance=avoidance))
-        self.neighbours = Neighbours([Incoming(1, "B", other, 1.0)], 1.0)
+        links = [Incoming(1, "B", other, 1.0)]
+        assignment = SimpleNamespace(kind=kind, limits=LIMITS, avoidance=avoidance, neighbours=links)
+        self.perception, self.neighbours = Perception(assignment), Neighbours(links, 1.0)
         self.sender = self.neighbours.all[0]
 
     def hear(self, position, velocity=STILL, stamp=0.0):
@@ -38,6 +39,7 @@ class Sight:
         now = Situation()
         now.state = BodyState(t if time is None else time, position, velocity, yaw, scan=scan)
         now.begin(t)
+        self.perception.sees = self.perception.sees or scan is not None
         self.perception.sense(t, now, self.neighbours)
         return self.perception.near.things[: self.perception.near.count]
 

@@ -25,6 +25,7 @@ class Watched:
         assignment = SimpleNamespace(
             name="A", kind=kind, hover=hover, limits=limits, predictor=HOLD, avoidance="potential", avoids=avoids
         )
+        self.avoids = avoids
         self.detector, self.hazards = Detector(assignment), Hazards(kind, limits)
         self.neighbours, self.health = Neighbours(incoming, limits.link_silence_s), ProcessHealth()
         self.now, self.status = Situation(), Status()
@@ -51,6 +52,7 @@ class Watched:
             given = {"time": self.t, "heard": self.t, **self.values}
             state = BodyState(position=self.position, velocity=self.velocity, yaw=self.yaw, **given)
             self.now.state = state
+            self.detector.sees = self.detector.sees or (self.avoids and state.scan is not None)
             self.now.begin(self.t)
             self.causes = self.detector.causes(self.now, self.status, self.neighbours, self.health)
             if self.causes or self.hazards.under_way:
