@@ -10,8 +10,8 @@ from math import factorial, pi
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
+from twins.arrays import Array
 from twins.devices.crazyflie.flock import LOST, Estimator
 from twins.devices.crazyflie.planner import ORDER, Planner, evaluate, polynomial
 from twins.engines.engine import Engine, Stage

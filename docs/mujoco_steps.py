@@ -8,9 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE
 from experiments.report.style import CASES, STYLE
+from twins.arrays import Array
 from twins.engines.engine import Engine, Stage
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass

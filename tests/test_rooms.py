@@ -17,7 +17,7 @@ MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one oth
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
 agents.errors agents.vectors
-agents.arrays agents.clock agents.ticks agents.user_folder
+agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body
@@ -25,12 +25,14 @@ agents.decision agents.protocols
 agents.safety
 agents.robot
 agents.runtime
+twins.arrays
 twins.models twins.scene
 twins.engines
 twins.sensing
 twins.body
 bridges twins.devices
-experiments.definition experiments.catalogue
+experiments.arrays experiments.catalogue
+experiments.definition
 experiments.file
 experiments.recording
 experiments.metrics
@@ -103,6 +105,21 @@ def test_no_circle():
         TopologicalSorter(imports()).prepare()
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def outside(file: Path) -> set[str]:
+    """Packages that a module imports, wherever that stands."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        found |= {name.partition(".")[0] for name in names}
+    return found
+
+
+def test_robots_compute_without_arrays():
+    pure = [name for name in modules() if f"{name}.".startswith(("agents.", "twins.models."))]
+    assert {name for name in pure if "numpy" in outside(modules()[name])} <= {"twins.models.noise"}
 
 
 def test_no_folder_is_too_full():

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, norm
 from agents.plugins.planners import Planner
 from agents.vectors import NotNegative, Positive
+from twins.arrays import Array, Index, Mask, norm
 
 Planar = tuple[float, float]
 Pose = tuple[float, float, float]  # x, y [m], yaw [rad]

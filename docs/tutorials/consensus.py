@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.arrays import Array
 from agents.body.kinds import TELLO
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import bearable_factors, closed_shares
@@ -23,6 +22,7 @@ from experiments.file.document import Document, loads
 from experiments.recording.trace import Trace
 from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
 from experiments.run import folder, show, simulate
+from twins.arrays import Array
 
 OUT = folder("docs/tutorials/out")
 N = 6

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.arrays import Array, norm
 from experiments.file.document import load
 from experiments.metrics.signals import belief_errors
 from experiments.recording.trace import Trace
 from experiments.run import folder, show, simulate
 from experiments.sweep.pareto import front
 from experiments.sweep.sweep import sweep
+from twins.arrays import Array, norm
 
 OUT = folder("docs/tutorials/out")
 

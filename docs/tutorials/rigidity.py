@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.arrays import Array, Mask, norm
 from agents.body.kinds import CRAZYFLIE
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import closed_shares
@@ -22,6 +21,7 @@ from experiments.definition.rigidity import rigid_motions, rigidity, rigidity_ma
 from experiments.file.document import Document, load, loads
 from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
 from experiments.run import folder, show, simulate
+from twins.arrays import Array, Mask, norm
 
 OUT = folder("docs/tutorials/out")
 Pairs = list[tuple[int, int]]

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, norm
 from agents.body.kinds import KINDS, Kind
 from agents.plugins.registry import did_you_mean
 from experiments.authoring import layouts
@@ -18,6 +17,7 @@ from experiments.catalogue import index
 from experiments.check.ideal_run import bearable_factors
 from experiments.file import catalogue as entries
 from experiments.file.problems import refusal
+from twins.arrays import Array, norm
 
 PREFIX: Final = {"crazyflie": "CF", "tello": "DT", "khepera4": "KH", "turtlebot3": "TB"}
 LAWS: Final = ("distance", "displacement")

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, norm
+from twins.arrays import Array, Index, norm
 
 GOLDEN: Final = math.pi * (3.0 - math.sqrt(5.0))  # [rad] no two multiples of it fall close together
 RIM: Final = math.cos(math.radians(75.0))  # a hemisphere ends here: below, robots would stand above one another

@@ -11,7 +11,6 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.position_control import REACHED
@@ -47,6 +46,7 @@ from experiments.definition.rigidity import Redundancy, Rigidity
 from experiments.file.problems import Path
 from experiments.metrics.measure import WINDOW_S
 from experiments.metrics.signals import after_last, moving_mean
+from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 
 MANY: Final = 500  # robots of which it is not asked any more what can be lost: the time grows with their third power

@@ -16,7 +16,6 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, norm
 from agents.body.kinds import Kind
 from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
@@ -24,6 +23,7 @@ from experiments.definition.experiment import Experiment, World
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
+from twins.arrays import Array, norm
 from twins.models.quadrotor import RESPONSES, Response
 
 FAR: Final = 1e6  # [m] walls that no robot meets

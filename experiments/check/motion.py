@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
 from agents.decision.position_control import REACHED
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
@@ -21,6 +20,7 @@ from experiments.check.ideal_run import approaches
 from experiments.check.realisation import OFF, mirrored_robots
 from experiments.check.theory import FAR_OFF, GAIN, strength
 from experiments.definition.links import gain_key
+from twins.arrays import Array, Mask, norm
 
 CLEARANCE: Final = 0.1  # [m] between one robot's top and another's bottom
 NEARLY: Final = 0.9  # of its speed: the rest is needed to catch up

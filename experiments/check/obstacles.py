@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
@@ -15,6 +14,7 @@ from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Robot
 from experiments.recording.trace import finds_contacts
 from twins import scene as outlines
+from twins.arrays import Array, Index, Mask
 from twins.scene import Obstacle
 from twins.sensing.range_sensors import OF_KIND
 

@@ -11,13 +11,13 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import Kind
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins.laws import Law, Mixed
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
 from experiments.definition.graph import Links, edges, part_of_rows
 from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity
+from twins.arrays import Array, Index, Mask, norm
 
 TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 TINY: Final = 1e-18  # [m²] no length is zero

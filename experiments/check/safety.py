@@ -7,13 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import norm
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.safety.setpoint_filter import OUTSIDE_M
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition import bodies
+from twins.arrays import norm
 
 BEFORE_START_S: Final = 5.0  # of the battery are spent before the common start
 LISTED: Final = 12  # names

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index, norm
 from agents.formation.link import Link
 from agents.plugins.laws import Gradient
 from agents.vectors import Vector
 from experiments.definition.formation import Anchored, anchor_offsets, law_offsets, unlinked
 from experiments.definition.graph import Links
+from twins.arrays import Array, Index, norm
 
 STEP: Final = 1e-4  # [m] of the differences that stand for the law's derivative
 STANDING: Final = 1e-6  # modes slower than the fastest by this factor do not move at all

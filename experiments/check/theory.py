@@ -9,7 +9,6 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.arrays import Index, Mask, norm
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
@@ -19,6 +18,7 @@ from experiments.definition.formation import law_offsets
 from experiments.definition.graph import components, reachable
 from experiments.definition.links import gain_key
 from experiments.file.problems import Path
+from twins.arrays import Index, Mask, norm
 
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 FEW: Final = 6  # names that are listed

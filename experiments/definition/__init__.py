@@ -1,4 +1,4 @@
 """Definition of an experiment: the structs of its file, and what follows for robots, bodies and network.
 
-May import: agents, twins.
+May import: agents, twins, experiments.arrays.
 """

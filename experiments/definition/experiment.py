@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from agents.arrays import NotNegative, Positive, Share
 from agents.body.interface import Disturbance
 from agents.body.limits import Safety
 from agents.network.channel_model import AtLeastOne, Delay, LinkEffects
+from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
 Rate = Annotated[float, Meta(gt=0, le=2000)]

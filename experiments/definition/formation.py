@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Mask, norm
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
 from agents.formation.link import BY_DISTANCE, Link
@@ -20,6 +19,7 @@ from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
 from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, held_height, link_pairs, link_target
+from twins.arrays import Array, Mask, norm
 
 Anchored = Sequence[tuple[int, anchors.Anchor]]  # anchors, each with the row of its robot
 

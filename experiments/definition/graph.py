@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from agents.arrays import Array, Columns, Index, Mask
+from experiments.arrays import Columns
+from twins.arrays import Array, Index, Mask
 
 
 class Links(Columns, frozen=True):

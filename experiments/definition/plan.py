@@ -10,7 +10,6 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from agents.arrays import Index
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
@@ -28,6 +27,7 @@ from experiments.definition.experiment import Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links
 from experiments.definition.links import OneWay, one_way_links
+from twins.arrays import Index
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
+from twins.arrays import Array, Index, Mask
 
 
 def rigidity_matrix(position: Array, pairs: Index, moves: Mask | None = None) -> Array:

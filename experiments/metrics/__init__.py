@@ -1,4 +1,4 @@
 """From a trace to numbers.
 
-May import: agents, twins, experiments.definition, experiments.recording.
+May import: agents, twins, experiments.arrays, experiments.definition, experiments.recording.
 """

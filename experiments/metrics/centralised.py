@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
 from experiments.metrics.results import Guidance
 from experiments.recording.trace import Trace
+from twins.arrays import Array, Index, Mask
 
 
 def _delays(delay: Array) -> dict[str, float | None]:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.definition import bodies
 from experiments.metrics.results import Approach, Collision
 from experiments.recording.trace import WALL, Trace
 from twins import scene as outlines
+from twins.arrays import Array, Mask, norm
 
 TOUCH_M = 1e-6  # [m] less overlap than this is rounding
 

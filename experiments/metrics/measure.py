@@ -16,7 +16,6 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from agents.arrays import norm
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
 from agents.safety.hazards import UNRESOLVED, failed, is_blind
@@ -45,6 +44,7 @@ from experiments.metrics.signals import (
     transmissions,
 )
 from experiments.recording.trace import ROUNDING_S, Trace
+from twins.arrays import norm
 
 WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
 BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time

@@ -6,9 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm, wrap
+from experiments.arrays import wrap
 from experiments.metrics.results import ShadowMetrics
 from experiments.recording.trace import Trace
+from twins.arrays import Array, Mask, norm
 
 SPEED_S: Final = 0.2  # [s] over which a speed is taken: shorter, and it would be the noise's
 STILL_M: Final = 1e-3  # [m] standard deviation of what hardly moved: it has no correlation

@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, norm
 from agents.plugins.predictors import HOLD, Predictor
 from agents.safety.hazards import OVER, QUIET_S, UNRESOLVED, is_blind
 from agents.vectors import Vector
@@ -22,6 +21,7 @@ from experiments.definition.graph import Links
 from experiments.metrics.results import Passage
 from experiments.recording.losses import count_unrecorded
 from experiments.recording.trace import Trace
+from twins.arrays import Array, Index, Mask, norm
 
 RETURN_S: Final = 3.0  # robots come back one after the other when the network does
 

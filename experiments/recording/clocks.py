@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array
 from agents.clock import SLEW
 from agents.network.messages import HostClock, State, Status
+from twins.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from typing import Final, Literal, Protocol, TypeVar
 
 import numpy as np
 
-from agents.arrays import Index
 from agents.network.messages import Status
 from agents.network.validation import missed, most_poses
 from experiments.definition.plan import Plan
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
+from twins.arrays import Index
 
 STATUS_S: Final = 1.0  # a status at most this much after the end of a run still counts for it
 

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index, PoseTable, known_rows
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
 from agents.network.validation import ABSURD, FUTURE_S, is_count
+from experiments.arrays import PoseTable, known_rows
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
@@ -45,6 +45,7 @@ from experiments.recording.trace import (
     received_in_run,
     sent_in_run,
 )
+from twins.arrays import Array, Index
 
 HOLD_PERIODS: Final = 2.0  # a sample is valid for so many state periods
 EARLY_S: Final = 0.5  # robots that land by their own clocks at the end of the whole run are not that much early

@@ -10,13 +10,14 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, PoseTable
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from agents.plugins import registry
+from experiments.arrays import PoseTable
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.recording.clocks import ClockOffset
+from twins.arrays import Array, Index, Mask
 
 EPOCH: Final = 1_700_000_000.0  # UTC [s] of the common start in virtual time: any, but the same in every run
 ROUNDING_S: Final = 1e-6  # UTC seconds in a float are exact to a quarter of a microsecond

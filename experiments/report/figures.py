@@ -20,7 +20,6 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from agents.arrays import Array
 from experiments.metrics.measure import WINDOW_S, bounds_of
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
@@ -54,6 +53,7 @@ from experiments.report.style import (
     time_axis,
 )
 from experiments.report.trajectories import LOW, formation, has_positions, plan_view
+from twins.arrays import Array
 
 BAND: Final = "#009E73"  # the tolerance
 LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go

@@ -10,9 +10,9 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 
-from agents.arrays import Array
 from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
+from twins.arrays import Array
 
 _NESTED: Final = ("phases", "near", "near_arena", "shadow")
 

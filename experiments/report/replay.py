@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.arrays import Array
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import Trace
 from experiments.report import trajectories
@@ -17,6 +16,7 @@ from experiments.report.page import inline, template
 from experiments.report.style import svg
 from experiments.scene.models import ROUND, circle
 from experiments.scene.stage import FAIR_M, GOOD_M, Stage
+from twins.arrays import Array
 
 CASES: Final = 2  # side by side
 STILL: Final = 0.6  # of the run: when the picture was taken that stands where no script runs, and in print

@@ -19,12 +19,12 @@ from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
-from agents.arrays import Array
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.report.style import INK, PAPER
 from experiments.scene.models import circle
 from twins import scene as outlines
+from twins.arrays import Array
 from twins.scene import Scene
 
 BODY: Final = "#d2d2d2"

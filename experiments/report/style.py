@@ -24,9 +24,9 @@ from matplotlib.path import Path as Outline
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-from agents.arrays import Array
 from experiments.metrics.signals import phase_starts
 from experiments.recording.trace import Trace
+from twins.arrays import Array
 
 P = ParamSpec("P")
 Line = dict[str, Any]  # keyword arguments of a curve

@@ -21,7 +21,6 @@ from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
-from agents.arrays import Array
 from experiments.check.analysis import Analysis
 from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import edges
@@ -51,6 +50,7 @@ from experiments.report.style import (
     thinned,
 )
 from experiments.scene.stage import link_colours
+from twins.arrays import Array
 
 LOW: Final = 0.2  # [m] robots below that are as well seen from above
 OVERLAID: Final = 3  # so many cases are told apart upon each other, from above

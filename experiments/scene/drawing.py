@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask
 from agents.network.messages import Ranges
 from experiments.scene import models
 from experiments.scene import stage as appearance
 from experiments.scene.stage import NOWHERE, Colour, Colours, Moment, Stage, chassis
+from twins.arrays import Array, Index, Mask
 
 if TYPE_CHECKING:
     import viser

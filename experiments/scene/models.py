@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3, Kind
+from twins.arrays import Array
 from twins.scene import Scene
 
 SIDES: Final = 10  # of what looks round

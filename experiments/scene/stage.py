@@ -17,7 +17,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index, Mask, norm
 from agents.body.kinds import KHEPERA4, Kind
 from agents.decision.lifecycle import Phase
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
@@ -27,6 +26,7 @@ from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
+from twins.arrays import Array, Index, Mask, norm
 from twins.scene import Scene
 
 Colours = NDArray[np.uint8]

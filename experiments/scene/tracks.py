@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Index
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Event, HostClock, State, Status, WorldState
 from experiments.definition.experiment import Experiment
@@ -25,6 +24,7 @@ from experiments.recording.reader import HEAD, RecordingError, Records
 from experiments.recording.ros2.cdr import Undecodable, codec
 from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
+from twins.arrays import Array, Index
 
 LOST_S: Final = 1.0  # without a sample for so long a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}

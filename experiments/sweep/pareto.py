@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from agents.arrays import Array
 from experiments.report.style import (
     CASES,
     CORNERS,
@@ -28,6 +27,7 @@ from experiments.report.style import (
     styled,
 )
 from experiments.sweep.table import CellRow, short, words_of
+from twins.arrays import Array
 
 MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be told apart, and are drawn as clouds
 LEGEND_LINE: Final = 0.14  # [in]

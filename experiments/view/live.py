@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import zenoh
 
-from agents.arrays import Array, norm
 from agents.network.keys import Keys
 from agents.network.session import connected
 from experiments.scene.drawing import DARK, LIGHT, SceneDrawing, Shown
@@ -24,6 +23,7 @@ from experiments.view import heartbeat
 from experiments.view.acting import Acting, Watched
 from experiments.view.observer import Observer
 from experiments.view.panel import PLOT_S, Panel, known, robot_row
+from twins.arrays import Array, norm
 
 if TYPE_CHECKING:
     import viser

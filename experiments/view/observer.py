@@ -13,11 +13,11 @@ from typing import Final, TypeVar
 import numpy as np
 import zenoh
 
-from agents.arrays import known_rows
 from agents.clock import Clock
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.session import received
+from experiments.arrays import known_rows
 from experiments.file import document
 from experiments.file.problems import DocumentError
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail, condition

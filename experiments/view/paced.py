@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import RUNNING
 from agents.network.messages import Event
@@ -21,6 +20,7 @@ from experiments.view.live import FRAME_S, Page
 from experiments.view.panel import PLOT_S, Row, known
 from experiments.view.replay import CONDITION_OF, Clock, add_transport
 from experiments.virtual_time.simulation import Instant
+from twins.arrays import Array
 
 if TYPE_CHECKING:
     import viser

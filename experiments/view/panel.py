@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.network.messages import Event, Status
 from experiments.file.document import UNNAMED
 from experiments.scene.stage import (
@@ -26,6 +25,7 @@ from experiments.scene.stage import (
     Condition,
     Stage,
 )
+from twins.arrays import Array
 
 if TYPE_CHECKING:
     import viser

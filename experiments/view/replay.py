@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
 from agents.network.messages import EMERGENCY, Status, WorldState
 from experiments.definition.formation import errors_over_time
@@ -21,6 +20,7 @@ from experiments.scene.stage import TRAIL, TRAIL_S, Condition, LinkTracker, Mome
 from experiments.scene.tracks import LOST_S, Track, Tracks
 from experiments.view.live import FRAME_S, IDLE_S, TABLE_S, Page
 from experiments.view.panel import HISTORY_S, PLOT_S, History, Row, known, robot_row
+from twins.arrays import Array
 
 if TYPE_CHECKING:
     import viser

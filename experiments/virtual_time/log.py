@@ -13,11 +13,11 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from agents.arrays import Array, Index, PoseTable
 from agents.decision.lifecycle import FINISHED, Phase
 from agents.network import messages
 from agents.plugins import registry
 from agents.safety.hazards import Outcome
+from experiments.arrays import PoseTable
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.graph import Links
@@ -40,6 +40,7 @@ from experiments.recording.writer import Recording
 from experiments.scene import markers
 from experiments.virtual_time.network import CentreLog
 from experiments.virtual_time.simulation import OPTIONAL, Log
+from twins.arrays import Array, Index
 
 SAMPLED: Final = ("position", "yaw", "true_position", "goal", "setpoint")  # columns of a log that a trace has as well
 

@@ -10,17 +10,18 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from agents.arrays import Array, Index, PoseTable
 from agents.decision.centralised import Centre
 from agents.network import messages
 from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
 from agents.vectors import UNKNOWN, Vector
+from experiments.arrays import PoseTable
 from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
 from experiments.virtual_time.company import SENT, Ledger, Member, Way
+from twins.arrays import Array, Index
 
 NOTHING: Final[Vector] = UNKNOWN
 

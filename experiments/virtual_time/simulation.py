@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, PoseTable
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import Incident
+from experiments.arrays import PoseTable
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -26,6 +26,7 @@ from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, W
 from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
 from experiments.virtual_time.stretch import stretches_of
+from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
 

@@ -27,7 +27,13 @@ RARE = {
     "agents/safety/setpoint_filter.py": set(),
     "agents/vectors.py": set(),
     **{str(path.relative_to(ROOT)): set() for path in sorted((ROOT / "twins" / "models").glob("*.py"))},
-    "twins/models/noise.py": {"stream", "refill", "Noise.refill", "Noise.reserve", "Noise._drawn"},  # random numbers are drawn in blocks, outside of ticks
+    "twins/models/noise.py": {
+        "stream",
+        "refill",
+        "Noise.refill",
+        "Noise.reserve",
+        "Noise._drawn",
+    },  # random numbers are drawn in blocks, outside of ticks
 }
 BANNED = {
     ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.ListComp: "a comprehension",

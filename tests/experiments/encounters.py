@@ -14,12 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
 from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, Experiment, Leg, Rates, Robot, Start
 from experiments.virtual_time.simulation import Log, simulate
+from twins.arrays import Array, Mask, norm
 
 CIRCLE: Final = 0.8  # [m] robots begin about here and want to go to the other side
 SCATTER: Final = 0.35  # [m] on each axis

@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.arrays import norm
 from experiments.check import check
 from experiments.definition.experiment import Channel, Experiment, Formation, Hybrid, Leg, Robot
 from experiments.definition.plan import Plan
@@ -19,6 +18,7 @@ from experiments.report.tables import architecture_table
 from experiments.report.verdict import findings
 from experiments.virtual_time import simulation
 from experiments.virtual_time.log import Logbook
+from twins.arrays import norm
 
 pytestmark = pytest.mark.slow  # runs and reports, whole
 

@@ -8,14 +8,15 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from agents.arrays import Array, PoseTable, norm
 from agents.network.messages import Event
 from agents.plugins.laws import Distance
+from experiments.arrays import PoseTable
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.definition.formation import law_offsets
 from experiments.definition.graph import links
 from experiments.definition.plan import Plan
 from experiments.recording.trace import Trace
+from twins.arrays import Array, norm
 
 STEP = 0.02
 TIMED = ("position", "yaw", "true_position", "goal", "setpoint")

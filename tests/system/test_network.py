@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.arrays import Index
 from experiments.definition.experiment import Experiment
 from experiments.file.document import load
 from experiments.recording import playback
@@ -17,6 +16,7 @@ from experiments.run import reopen
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
 from tests.system.lab import Flight, transmits_at_50_hz
+from twins.arrays import Index
 
 pytestmark = pytest.mark.system
 

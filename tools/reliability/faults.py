@@ -15,10 +15,10 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from agents.arrays import Array
 from agents.network import messages
 from tools.reliability.observer import Observer
 from tools.reliability.spoilt_run import MOCAP_CLOCK, SpoiltRun, Stage
+from twins.arrays import Array
 
 HELD_M: Final = 0.25  # largest distance of a robot that no process steers
 NOTICE_S: Final = 1.0  # after which it must have stopped

@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from agents.arrays import Array, norm
 from agents.body.kinds import KINDS
 from agents.network import messages, pubsub
 from agents.network import session as network
@@ -18,6 +17,7 @@ from agents.network.messages import Command
 from experiments.definition.experiment import Experiment
 from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
+from twins.arrays import Array, norm
 
 TOUCH_M: Final = 1e-3  # [m] less overlap than this is rounding and the age of poses
 OUT_M: Final = 0.01  # [m] so far outside a place is outside

@@ -17,9 +17,9 @@ from typing import Final, Generic, Literal, Protocol, TypeVar, get_args
 import msgspec
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyRequest
 from agents.ticks import Ticks
+from twins.arrays import Array
 
 # what motion capture tells wrongly: the same poses in new frames, the same frame again, two subjects exchanged, and one
 # under another name

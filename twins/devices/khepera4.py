@@ -13,10 +13,10 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import KHEPERA4
 from agents.protocols import khepera4 as protocol
+from twins.arrays import Array
 from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.differential import Differential

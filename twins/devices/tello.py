@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import TELLO
 from agents.protocols import tello as protocol
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, difference, norm
+from twins.arrays import Array
 from twins.body import instants
 from twins.devices.device import DeviceRequest, Faults, FaultyLink
 from twins.models.disturbance import HoverJitter, Latency

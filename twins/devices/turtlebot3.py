@@ -16,7 +16,6 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from agents.arrays import Array
 from agents.body.interface import BodyError, BodyRequest, settings
 from agents.body.kinds import TURTLEBOT3
 from agents.network import session as network
@@ -25,6 +24,7 @@ from agents.protocols.ros2 import Message
 from agents.protocols.ros2_node import Participant, Publisher, Subscriber
 from agents.protocols.turtlebot3 import Address, TurtleBot3Settings
 from agents.vectors import clamp
+from twins.arrays import Array
 from twins.body import instants
 from twins.devices.device import DeviceRequest, FaultyLink
 from twins.models.differential import Differential

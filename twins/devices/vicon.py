@@ -17,7 +17,6 @@ import numpy as np
 import zenoh
 from msgspec import Meta
 
-from agents.arrays import Array
 from agents.clock import Clock, uptime
 from agents.network import messages, pubsub, validation
 from agents.network import session as network
@@ -29,6 +28,7 @@ from agents.runtime import command_line
 from agents.runtime.command_line import NetworkLaunch, on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
+from twins.arrays import Array
 from twins.devices.device import CaptureFault, Faults, FaultyLink, serve_until_next
 
 BACKLOG: Final = 1 << 18  # [bytes] largest queue of a client; a slower client misses frames

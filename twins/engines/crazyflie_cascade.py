@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, clamp, some
+from twins.arrays import Array, Index, Mask, clamp, some
 
 RATE_HZ: Final = 500.0  # of the attitude and rate loops
 OUTER: Final = 5  # divisor of the rate for the position and velocity loops: 100 Hz

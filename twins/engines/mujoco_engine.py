@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from agents.arrays import Array, Index, Mask, clamp, norm, some
 from agents.body.interface import Attitude, BodyError
 from agents.body.kinds import Kind
 from agents.vectors import ZERO, Vector
+from twins.arrays import Array, Index, Mask, clamp, norm, some
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
 from twins.engines.engine import Mirrored, Planar, Pose, Stage, Touch
 from twins.engines.mujoco_model import AIRFRAMES, mjcf

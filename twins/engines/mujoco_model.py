@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
+from twins.arrays import Array
 from twins.scene import Scene
 
 WALL: Final = 0.005  # [m] half the thickness of thin walls

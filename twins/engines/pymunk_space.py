@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import pymunk
 
-from agents.arrays import Array
 from agents.body.kinds import Kind
+from twins.arrays import Array
 from twins.models.differential import DRIVES
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene

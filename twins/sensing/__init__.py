@@ -1,4 +1,4 @@
 """Range sensors of twins, and ray casting.
 
-May import: agents, twins.models, twins.scene, twins.engines.
+May import: agents, twins.arrays, twins.models, twins.scene, twins.engines.
 """

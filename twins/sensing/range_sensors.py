@@ -17,9 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index
 from agents.body.interface import BodyError, BodyRequest, RangeScan
 from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
+from twins.arrays import Array, Index
 from twins.engines.engine import Engine
 from twins.models.noise import stream
 from twins.scene import World

@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, clamp
 from agents.body.kinds import Kind
+from twins.arrays import Array, Index, clamp
 from twins.scene import Scene
 
 STRIDE: Final = 16.0  # between the bearings of two fans in one sorted array: more than two turns

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, norm
 from agents.body.kinds import KINDS
 from agents.formation.anchors import Anchor
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
@@ -17,6 +16,7 @@ from experiments.check.motion import CLEARANCE
 from experiments.check.realisation import Shape, Solids, find_shapes
 from experiments.definition.formation import Anchored
 from experiments.definition.graph import Links
+from twins.arrays import Array, Mask, norm
 
 BULGE: Final = 1.05  # radius of the dome, as a multiple of the farthest robot's distance from the middle
 ATTEMPTS: Final = 40  # random beginnings

@@ -12,7 +12,6 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import settings
 from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
@@ -23,6 +22,7 @@ from agents.safety.detection import clock_off, clock_text
 from experiments.definition.bodies import DRIVES, WORLD
 from experiments.definition.experiment import Robot
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
+from twins.arrays import Array
 
 Verdict = Literal["ok", "warn", "bad", "unknown"]
 

@@ -15,10 +15,10 @@ import numpy as np
 import psutil
 import pytest
 
-from agents.arrays import Index
 from agents.runtime.watchdog import HUNG, Watchdog
 from tests.conftest import ROOT
 from tests.waiting import until
+from twins.arrays import Index
 
 SILENCE_S = 0.1
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.arrays import norm
 from agents.body.kinds import KINDS
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
@@ -13,6 +12,7 @@ from experiments.file.document import read
 from experiments.virtual_time import simulation
 from tests.experiments.traces import link_errors
 from twins import scene as outlines
+from twins.arrays import norm
 
 RADIUS = KINDS["turtlebot3"].radius
 

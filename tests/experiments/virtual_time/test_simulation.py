@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from agents.arrays import PoseTable
 from agents.body.interface import Disturbance
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
+from experiments.arrays import PoseTable
 from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, Start
 from experiments.file import document
 from experiments.virtual_time.conductor import LEAD_S, Stuck

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Mask
+from twins.arrays import Array, Mask
 from twins.models.quadrotor import GRAVITY
 
 STEEPEST: Final = np.radians(20.0)  # the firmware's default limit of roll and pitch

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.body.interface import BodyError
 from agents.body.kinds import CRAZYFLIE
 from agents.protocols import crazyradio
 from agents.protocols.crtp import Port, header
+from twins.arrays import Array
 from twins.devices.crazyflie.drone import Drone
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.radio import HOST, Air, RadioLink

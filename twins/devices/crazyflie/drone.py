@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.protocols import crtp
 from agents.protocols.crtp import (
     HighLevel,
@@ -24,6 +23,7 @@ from agents.protocols.crtp import (
     Status,
     Toc,
 )
+from twins.arrays import Array
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.logs import LogBlocks
 from twins.devices.crazyflie.memory import ANCHORS

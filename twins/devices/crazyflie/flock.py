@@ -6,12 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Index, Mask, some
 from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
 from agents.body.kinds import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
+from twins.arrays import Array, Index, Mask, some
 from twins.body import instants
 from twins.devices.crazyflie.commander import Commander
 from twins.devices.crazyflie.memory import Memories

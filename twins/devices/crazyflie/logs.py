@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.protocols import crtp
 from agents.protocols.crtp import Info, Log, Status
+from twins.arrays import Array
 from twins.devices.crazyflie.flock import Flock
 from twins.devices.crazyflie.tables import LOG_TYPES, PACKINGS, Table, pack
 from twins.models.quadrotor import GRAVITY

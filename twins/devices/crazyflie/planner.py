@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Mask
 from agents.protocols.crtp import Status
+from twins.arrays import Array, Mask
 
 SHORTEST: Final = 0.01  # [s]
 ORDER: Final = 7  # of the polynomials

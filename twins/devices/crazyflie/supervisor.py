@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.arrays import Array, Mask
 from agents.protocols.crtp import Info
+from twins.arrays import Array, Mask
 
 LEVEL_S: Final = 0.5  # an older low-level setpoint is ignored: the drone levels out
 LOCK_S: Final = 2.0  # without setpoints for so long, the drone locks

@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array
 from agents.protocols import crtp
 from agents.protocols.crtp import COMPRESSED, IN_MEMORY, Memory, Status
+from twins.arrays import Array
 from twins.devices.crazyflie.memory import Memories
 from twins.devices.crazyflie.planner import ORDER, Piece, evaluate, wrap
 

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from agents.arrays import Array, Mask, clamp
+from twins.arrays import Array, Mask, clamp
 from twins.engines.crazyflie_cascade import BASE, FULL, LEAST, POSITION, SPEED, THRUST_SCALE, VELOCITY
 from twins.models.quadrotor import GRAVITY
 

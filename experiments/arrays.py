@@ -1,62 +1,20 @@
-"""Types of arrays and numbers, and the table of poses: the first axis is robots (N), links (E) or poses (M)."""
+"""Tables of arrays, that of poses among them: the first axis is robots (N), links (E) or poses (M)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import nan, pi, tau
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
-from msgspec import Meta
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-Rows = Index | slice  # what selects rows: numbers, or a run of them
-
-# of settings
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
-
-
-def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
-    """`value` between `low` and `high`; NaN stays NaN. A third of the cost of `numpy.clip` on a few rows."""
-    clamped: Array = np.minimum(np.maximum(value, low), high)
-    return clamped
-
-
-def norm(vectors: Array) -> Array:
-    """Euclidean length of each row of (..., k) -> (...,).
-
-    `numpy.linalg.norm` costs twice as much on the few rows that a robot process has.
-    """
-    length: Array = np.sqrt(np.vecdot(vectors, vectors))
-    return length
+from twins.arrays import Array, Index, Mask
 
 
 def wrap(angle: Array) -> Array:
     """Angles in (−π, π]."""
     return np.asarray(pi - np.mod(pi - angle, tau))
-
-
-def some(mask: Mask) -> bool:
-    """True if any entry of `mask` is true. A tenth of the cost of `mask.any()` on a few rows."""
-    return 1 in mask.tobytes()
-
-
-def every(mask: Mask) -> bool:
-    """True if all entries of `mask` are true. A tenth of the cost of `mask.all()` on a few rows."""
-    return 0 not in mask.tobytes()
-
-
-def span(rows: Index) -> Rows:
-    """`rows` as a slice if they follow one another: a view costs a tenth of the copy that row numbers make."""
-    if len(rows) and (np.diff(rows) == 1).all():
-        return slice(int(rows[0]), int(rows[-1]) + 1)
-    return rows
 
 
 def known_rows(values: Iterable[Sequence[float] | float | None], width: int = 1) -> Array:
@@ -107,8 +65,3 @@ class PoseTable(Columns, frozen=True):
         """Rows of the links from `first` to before `end`, which then count from 0."""
         kept = self.take((self.link >= first) & (self.link < end))
         return msgspec.structs.replace(kept, link=kept.link - first)
-
-
-def no_poses() -> PoseTable:
-    none, rows = np.zeros(0), np.zeros(0, dtype=np.intp)
-    return PoseTable(rows, rows, none, none, np.zeros((0, 3)), np.zeros((0, 3)), none, rows)
