@@ -337,7 +337,7 @@ def test_a_curve_too_fast_for_the_wheels_stays_that_curve():
 
 
 def test_ranges_in_metres_from_the_centre():
-    sound = protocol.sound_distance(np.array([0.0, 25.0, 250.0, 1000.0, 2000.0]))
+    sound = [protocol.sound_distance(each) for each in (0.0, 25.0, 250.0, 1000.0, 2000.0)]
     assert sound == pytest.approx([0.32, 0.32, 2.57, np.nan, np.nan], nan_ok=True)
-    light = protocol.light_distance(np.array([1023.0, 1000.0, 250.0, 101.0, 100.0, 0.0]))
+    light = [protocol.light_distance(each) for each in (1023.0, 1000.0, 250.0, 101.0, 100.0, 0.0)]
     assert light == pytest.approx([0.07, 0.07, 0.1625, 0.2686, np.nan, np.nan], abs=0.001, nan_ok=True)

@@ -85,7 +85,7 @@ def test_no_disturbance_needs_no_noise():
     for disturbed in (jitter, drift, measurement):
         assert not disturbed.present
         refill(disturbed.noise)
-        assert disturbed.noise.ahead == []
+        assert len(disturbed.noise.ahead) == 0
 
 
 @pytest.mark.parametrize(
