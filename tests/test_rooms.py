@@ -122,6 +122,11 @@ def test_robots_compute_without_arrays():
     assert {name for name in pure if "numpy" in outside(modules()[name])} <= {"twins.models.noise"}
 
 
+def test_one_module_knows_the_compiler():
+    knowing = {name for name in modules() if outside(modules()[name]) & {"numba", "llvmlite"}}
+    assert knowing == {"experiments.virtual_time.compiler"}
+
+
 def test_no_folder_is_too_full():
     folders: dict[Path, list[str]] = {}
     for name, file in modules().items():

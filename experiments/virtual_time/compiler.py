@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import config, njit, types
 from numba.core import cgutils
 from numba.core.datamodel import models
+from numba.core.errors import NumbaError
 from numba.core.imputils import lower_builtin, lower_getattr_generic, lower_setattr_generic
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_getattr, infer_global, signature
 from numba.extending import intrinsic, register_model
@@ -117,6 +119,17 @@ def compiled(function: Callable[..., Any], layout: Layout | None = None) -> Any:
         value = function.__globals__.get(name)
         if value is not None and name not in space:
             space[name] = compiled(value) if inspect.isfunction(value) else value
+    return made
+
+
+def kept(function: Callable[..., Any], kinds: Sequence[str], folder: Path) -> Any:
+    """Function of values of these kinds, compiled and kept in a folder; raises TypeError where it cannot be."""
+    config.CACHE_DIR = str(folder)
+    made = njit(function, cache=True, nogil=True)
+    try:
+        made.compile(tuple(SIMPLE[kind] for kind in kinds))
+    except NumbaError as error:
+        raise TypeError(str(error)) from error
     return made
 
 

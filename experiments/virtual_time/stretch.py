@@ -27,7 +27,7 @@ from experiments.recording.version import digest
 from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
-from experiments.virtual_time.records import Image, Items, Layout, Layouts
+from experiments.virtual_time.records import BOOL, FLOAT, INT, Image, Items, Layout, Layouts
 from twins.body import TwinBody
 
 TICK_S: Final = 12e-6  # of CPU for a tick of a robot in plain Python, about
@@ -228,11 +228,8 @@ def driver(kinds: tuple[Items, ...], of_ledger: Layout) -> Any:
 
 
 def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
-    import numba  # noqa: PLC0415 - half a second, and a level of its own
+    from experiments.virtual_time.compiler import compiled, kept, opened  # noqa: PLC0415 - half a second, and a level
 
-    from experiments.virtual_time.compiler import compiled, opened  # noqa: PLC0415
-
-    numba.config.CACHE_DIR = str(folder)
     count = range(len(kinds))
 
     def each(text: str) -> str:
@@ -255,15 +252,11 @@ def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path
     space |= {f"open{k}": opened(kind) for k, kind in enumerate(kinds)}
     space["open_ledger"] = opened(of_ledger)
     exec(compile(source, __file__, "exec"), space)
-    integer = numba.types.int64
-    signature = (*(integer,) * (2 * len(kinds) + 4), numba.types.float64, integer, numba.types.boolean)
-    made = numba.njit(space[name], cache=True, nogil=True)
     try:
-        made.compile(signature)
-    except (numba.core.errors.NumbaError, SyntaxError, OSError) as error:
+        return kept(space[name], (*(INT,) * (2 * len(kinds) + 4), FLOAT, INT, BOOL), folder)
+    except (TypeError, SyntaxError, OSError) as error:
         REFUSED[name] = str(error)
         return None
-    return made
 
 
 def _layouts(kinds: Sequence[Any]) -> Iterator[Layout]:
