@@ -27,7 +27,6 @@ ARRIVED: Final = 0.05  # [m] nearer than this to its goal at the end a robot has
 SPEED: Final = {"twist": 0.2, "velocity": 0.4, "position": 0.4}  # [m/s] of the plans
 PATIENCE: Final = 3.0  # times the time that the way would take alone; avoiding each other takes up to 2.6 of them
 IN_THE_AIR: Final = 0.5  # [m] height of drones among themselves
-BATCH: Final = 100  # encounters that are flown side by side
 ANGLES: Final = (math.pi, 0.5 * math.pi)  # head-on, and across
 PAIRS: Final = tuple(itertools.combinations_with_replacement(KINDS, 2))
 
@@ -122,8 +121,7 @@ def meet(experiment: Experiment, seeds: Sequence[int]) -> Outcome:
     Raises:
         experiments.virtual_time.conductor.Stuck: If robots do not take off or land.
     """
-    batches = (seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH))
-    return Outcome.joined(_outcome(experiment, simulate(experiment, batch)) for batch in batches)
+    return Outcome.joined(_outcome(experiment, simulate(experiment, seed)) for seed in seeds)
 
 
 def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: Any) -> dict[str, Outcome]:
@@ -142,19 +140,14 @@ def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: 
 
 
 def _outcome(experiment: Experiment, log: Log) -> Outcome:
-    names, copies = log.names, len(log.seeds)
     kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
-    radius, height = np.array([kind.radius for kind in kinds]), np.array([kind.height for kind in kinds])
-    going = (log.phase == RUNNING).all(axis=1)
-    place = log.true_position[going].reshape(-1, copies, len(names), 3)
-    gap = np.full(copies, np.inf)
-    for i, j in itertools.combinations(range(len(names)), 2):
-        apart = place[:, :, i] - place[:, :, j]
-        over = norm(apart[..., :2]) - radius[i] - radius[j]
-        up = apart[..., 2]
-        beside = (up < height[j]) & (up > -height[i])
-        gap = np.minimum(gap, np.where(beside, over, np.inf).min(axis=0))
+    place = log.true_position[(log.phase == RUNNING).all(axis=1)]
+    gap = np.inf
+    for (i, first), (j, second) in itertools.combinations(enumerate(kinds), 2):
+        apart = place[:, i] - place[:, j]
+        over, up = norm(apart[:, :2]) - first.radius - second.radius, apart[:, 2]
+        beside = (up < second.height) & (up > -first.height)
+        gap = min(gap, np.where(beside, over, np.inf).min())
     goals = {leg.robot: leg.plan["points"][-1] for leg in experiment.timeline if isinstance(leg.plan, dict)}
-    missed = norm(place[-1, :, :, :2] - np.array([goals[name] for name in names])).max(axis=1)
-    acted = log.avoided.reshape(copies, len(names)).max(axis=1)
-    return Outcome(gap, missed, acted / log.ticks)
+    missed = norm(place[-1, :, :2] - np.array([goals[name] for name in log.names])).max()
+    return Outcome(*(np.array([each]) for each in (gap, missed, log.avoided.max() / log.ticks)))

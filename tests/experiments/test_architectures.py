@@ -1,7 +1,5 @@
 """Architectures in virtual time: the same decision wherever it is made, and what the way to it costs."""
 
-from dataclasses import fields
-
 import msgspec
 import numpy as np
 import pytest
@@ -42,7 +40,7 @@ def with_delay(experiment, delay_s, architecture="distributed", **more):
 
 
 def measured(experiment, seed=1):
-    log = simulation.simulate(experiment, [seed])
+    log = simulation.simulate(experiment, seed)
     return measure.measure(Logbook(log, experiment, str(experiment.architecture)[:11]).trace())
 
 
@@ -66,14 +64,14 @@ def test_without_delay_the_reference_experiment_moves_the_same_wherever_it_is_de
     assert_same_motion(first, simulation.simulate(with_delay(park, 0.0, architecture), 1))
 
 
-@pytest.mark.parametrize("update", [None, "relative-control"])
-def test_so_it_does_when_the_law_is_computed_on_events_and_for_several_seeds(cases, update):
+@pytest.mark.parametrize(("update", "seed"), [(None, 1), ("relative-control", 2)])
+def test_motion_is_alike_when_updates_have_events(cases, update, seed):
     formation = msgspec.structs.replace(cases["periodic"].formation, update=update)
     park = short(cases["periodic"], duration_s=4.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=LINE)],
                  formation=formation)  # fmt: skip
-    first = simulation.simulate(with_delay(park, 0.0), [1, 2])
+    first = simulation.simulate(with_delay(park, 0.0), seed)
     for architecture in ("centralised", HYBRID):
-        second = simulation.simulate(with_delay(park, 0.0, architecture), [1, 2])
+        second = simulation.simulate(with_delay(park, 0.0, architecture), seed)
         assert_same_motion(first, second)
         np.testing.assert_array_equal(second.updates >= first.updates, True)  # goals are said again now and then
 
@@ -112,21 +110,7 @@ def test_the_default_network_is_one_tick(cases):
     assert late.delay_mean_s == pytest.approx(0.02 + 0.01, abs=1e-9)
 
 
-# ---------------------------------------------------------------- rows, losses
-
-
-def test_seeds_side_by_side_are_as_alone(cases):
-    park = with_delay(short(cases["event"], duration_s=3.0, timeline=[]), 0.03, HYBRID, jitter_s=0.01, loss=0.1)
-    many, alone = simulation.simulate(park, [4, 5]), simulation.simulate(park, 5)
-    np.testing.assert_array_equal(many.true_position[:, 7:], alone.true_position)
-    both, one = Logbook(many, park, "", 1).trace().goals, Logbook(alone, park, "").trace().goals
-    for field in fields(one):
-        got, want = getattr(both, field.name), getattr(one, field.name)
-        if field.name == "sent":
-            got, want = msgspec.structs.astuple(got), msgspec.structs.astuple(want)
-        for each, other in zip(got, want, strict=True):
-            np.testing.assert_array_equal(each, other)
-    assert one.dropped.sum() > 0
+# ---------------------------------------------------------------- losses
 
 
 def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(cases):

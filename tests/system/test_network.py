@@ -37,7 +37,7 @@ def virtual(duration_s: float) -> Trace:
     experiment: Experiment = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()[
         "periodic"
     ]
-    return Logbook(simulate(experiment, [experiment.seed]), experiment, "periodic").trace()
+    return Logbook(simulate(experiment, experiment.seed), experiment, "periodic").trace()
 
 
 @pytest.mark.mechanism("modelled channel in real time")

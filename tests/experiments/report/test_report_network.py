@@ -25,10 +25,10 @@ BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0
 def run():
     park = load("robotic-park").cases()["periodic"]
     park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
-    return Logbook(simulate(park, 1), park, "bad", 0)
+    return Logbook(simulate(park, 1), park, "bad")
 
 
-def test_what_was_dropped_is_told_apart_from_what_was_lost(run):
+def test_dropped_differs_from_lost(run):
     measured = measure(run.trace())
     assert measured.modelled
     assert measured.lost == 0
@@ -48,7 +48,7 @@ def test_what_was_dropped_is_told_apart_from_what_was_lost(run):
     assert sum(of.values()) == measured.dropped
 
 
-def test_the_verdict_and_the_tables_say_so(run):
+def test_verdict_and_tables_have_dropped_poses(run):
     measured = measure(run.trace())
     said = [each.text for each in findings([measured])]
     assert any(text.startswith("No pose was lost") for text in said)
@@ -64,13 +64,13 @@ def test_the_verdict_and_the_tables_say_so(run):
     assert dropped in [row.cells for table in whole_tables([measured]) for row in table.rows]
 
 
-def test_a_report_has_a_section_for_it(tmp_path, run):
+def test_report_has_network_section(tmp_path, run):
     text = report.write(tmp_path, [run.trace()]).read_text(encoding="utf-8")
     assert "Network model" in text
     assert "TB01 &gt; KH01" in text
 
 
-def test_without_a_modelled_network_nothing_is_said_of_it():
+def test_plain_network_has_no_section():
     measured = measure(pair(np.ones(100)))
     assert not measured.modelled
     assert measured.dropped == 0
@@ -79,7 +79,7 @@ def test_without_a_modelled_network_nothing_is_said_of_it():
     assert not any("modelled" in each.text for each in findings([measured]))
 
 
-def test_a_recording_keeps_it(tmp_path, run):
+def test_recording_keeps_dropped_poses(tmp_path, run):
     run.record(tmp_path / "bad.mcap", "")
     read, trace = playback.read(tmp_path / "bad.mcap").trace, run.trace()
     assert trace.dropped.sum() > 500

@@ -139,10 +139,10 @@ def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
 
     real = runs.simulate
 
-    def stuck(experiment, seeds, *, lean):
-        if isinstance(experiment.trigger, dict) and experiment.trigger.get("threshold") == 0.02 and 2 in seeds:
+    def stuck(experiment, seed, *, lean):
+        if isinstance(experiment.trigger, dict) and experiment.trigger.get("threshold") == 0.02 and seed == 2:
             raise Stuck("not airborne after 60 s: CF01")
-        return real(experiment, seeds, lean=lean)
+        return real(experiment, seed, lean=lean)
 
     monkeypatch.setattr(runs, "simulate", stuck)
     found = swept(tmp_path)

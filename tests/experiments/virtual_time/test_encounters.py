@@ -22,7 +22,7 @@ def met(kinds, avoidance, each, **settings):
     return Outcome.joined(parts)
 
 
-def test_without_avoidance_they_run_into_each_other():
+def test_without_avoidance_robots_collide():
     outcome = met(("turtlebot3", "turtlebot3"), None, 6, duration_s=12.0)
     assert outcome.collided.sum() >= 6
     assert outcome.gap.min() < -0.1
@@ -30,14 +30,14 @@ def test_without_avoidance_they_run_into_each_other():
     assert not outcome.avoided.any()
 
 
-def test_with_the_barrier_they_keep_clear_and_arrive():
+def test_barrier_keeps_robots_apart_until_arrival():
     outcome = met(("khepera4", "tello"), BARRIER, 5, duration_s=20.0)
     assert outcome.gap.min() > 0.01
     assert outcome.arrived.all()
     assert (outcome.avoided > 0.0).any()
 
 
-def test_the_gap_is_that_between_true_surfaces_and_only_beside_each_other():
+def test_gap_is_between_true_surfaces():
     experiment = encounter(("khepera4", "tello"), None, duration_s=10.0)
     log = simulate(experiment, 3)
     place = log.true_position[(log.phase == RUNNING).all(axis=1)]
@@ -47,19 +47,9 @@ def test_the_gap_is_that_between_true_surfaces_and_only_beside_each_other():
     assert np.isinf(meet(msgspec.structs.replace(experiment, robots=robots), [3]).gap[0])
 
 
-def test_an_encounter_is_the_same_alone_and_beside_others():
-    experiment = encounter(("crazyflie", "turtlebot3"), BARRIER, duration_s=12.0)
-    together = meet(experiment, range(1, 6))
-    for number in (0, 3):
-        single = meet(experiment, [1 + number])
-        assert single.gap[0] == together.gap[number]
-        assert single.missed[0] == together.missed[number]
-        assert single.avoided[0] == together.avoided[number]
-
-
 @pytest.mark.timeout(600)
 @pytest.mark.nightly
-def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
+def test_thousand_random_encounters_without_collision():
     outcomes = random_pairs(BARRIER, 50)
     whole = Outcome.joined(outcomes.values())
     assert len(whole.gap) == 1000
@@ -70,13 +60,13 @@ def test_a_thousand_random_encounters_with_the_barrier_and_no_collision():
 
 @pytest.mark.timeout(300)
 @pytest.mark.nightly
-def test_the_potential_keeps_pairs_apart_as_well():
+def test_potential_keeps_pairs_apart():
     whole = Outcome.joined([met(kinds, POTENTIAL, 10) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
 
-def test_on_wheels_nobody_waits_for_ever_at_the_edge_of_the_potential():
+def test_wheels_pass_edge_of_the_potential():
     # these did, as long as the push jumped to its full size there
     for between, seed in ((np.pi, 7), (0.5 * np.pi, 23)):
         outcome = meet(encounter(("turtlebot3", "turtlebot3"), POTENTIAL, between=between), [seed])
@@ -85,7 +75,7 @@ def test_on_wheels_nobody_waits_for_ever_at_the_edge_of_the_potential():
 
 
 @pytest.mark.parametrize("kinds", [("khepera4", "khepera4"), ("tello", "turtlebot3"), ("crazyflie", "crazyflie")])
-def test_two_that_meet_exactly_head_on_pass_each_other(kinds):
+def test_head_on_encounters_pass(kinds):
     experiment = msgspec.structs.replace(encounter(kinds, POTENTIAL), disturbance={}, start=Start())
     outcome = meet(experiment, [1])
     assert outcome.arrived.all()
@@ -94,13 +84,13 @@ def test_two_that_meet_exactly_head_on_pass_each_other(kinds):
 
 @pytest.mark.timeout(300)
 @pytest.mark.nightly
-def test_one_that_does_not_avoid_is_avoided():
+def test_robot_without_avoidance_is_avoided():
     whole = Outcome.joined([met(kinds, BARRIER, 10, stubborn=1) for kinds in SOME])
     assert whole.collided.sum() == 0
     assert whole.arrived.all()
 
 
-def test_four_of_all_kinds_change_sides():
+def test_four_kinds_change_sides():
     outcome = meet(encounter(FOUR, BARRIER), range(1, 21))
     assert outcome.collided.sum() == 0
     assert outcome.arrived.mean() >= 0.95
@@ -113,13 +103,13 @@ def test_four_of_all_kinds_change_sides():
         ("khepera4", ["infrared", "ultrasonic"]),
     ],
 )
-def test_two_that_only_see_each_other_keep_clear(kind, sensors):
+def test_robots_with_sensors_alone_keep_clear(kind, sensors):
     outcome = met((kind, kind), {"kind": "barrier"}, 4, sensors=sensors)
     assert outcome.collided.sum() == 0
     assert outcome.arrived.all()
 
 
-def test_a_network_that_loses_and_delays_does_not_bring_them_together():
+def test_bad_network_causes_no_collision():
     bad = Channel(delay_s=0.02, jitter_s=0.02, loss=0.2)
     for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):
         outcome = meet(msgspec.structs.replace(encounter(kinds, BARRIER), channel=bad), range(1, 21))

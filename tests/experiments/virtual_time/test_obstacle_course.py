@@ -30,7 +30,7 @@ def test_the_gap_is_narrower_than_the_formation():
 @pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
 def test_it_passes_without_contact_and_recovers(case):
     experiment = read("obstacle-course").cases()[case]
-    log = simulation.simulate(experiment, [experiment.seed])
+    log = simulation.simulate(experiment, experiment.seed)
     run = (log.time >= 0.0) & (log.time <= experiment.duration_s)
     time, place = log.time[run], log.true_position[run]
     scene = bodies.scene(experiment)

@@ -59,28 +59,6 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
     assert not np.array_equal(first.position[-1], other.position[-1])
 
 
-@pytest.mark.slow
-def test_seeds_side_by_side_are_what_each_is_alone(park):
-    seeds = [3, 9, 4]
-    batch = simulate(park, seeds)
-    for copy, seed in enumerate(seeds):
-        alone = simulate(park, [seed])
-        rows, samples = slice(7 * copy, 7 * copy + 7), len(alone.time)
-        np.testing.assert_array_equal(batch.time[:samples], alone.time)
-        for what in ("phase", "position", "velocity", "yaw", "true_position", "true_yaw", "goal", "setpoint", "error"):
-            mine = getattr(batch, what)[:samples, rows]
-            np.testing.assert_array_equal(mine, getattr(alone, what), err_msg=f"{what} of seed {seed}")
-        links = len(alone.lost)
-        np.testing.assert_array_equal(batch.lost[links * copy : links * (copy + 1)], alone.lost)
-        for what, per in (("sent", 7), ("received", links)):
-            mine, expected = getattr(batch, what).between(per * copy, per * (copy + 1)), getattr(alone, what)
-            mine, expected = (each.take(each.arrival <= alone.ended - 0.05) for each in (mine, expected))
-            for got, want in zip(msgspec.structs.astuple(mine), msgspec.structs.astuple(expected), strict=True):
-                np.testing.assert_array_equal(got, want, err_msg=what)
-        assert batch.interventions[rows].tolist() == alone.interventions.tolist()
-    assert (batch.decisions, batch.ticks) == (alone.decisions, alone.ticks) == (40, 400)
-
-
 def test_the_common_start_is_time_zero():
     log = simulate(ground(), 1)
     k = int(np.argmin(np.abs(log.time)))
@@ -202,7 +180,7 @@ def test_who_cannot_get_up_is_named(monkeypatch):
         "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
     }
     with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
-        simulate(Experiment(title="Stuck", duration_s=1.0, robots=robots), [1, 2])
+        simulate(Experiment(title="Stuck", duration_s=1.0, robots=robots), 1)
 
 
 def test_going_on_without_a_neighbour_that_is_never_heard():

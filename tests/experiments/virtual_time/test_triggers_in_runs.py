@@ -157,18 +157,6 @@ def test_updates_are_counted_for_each_robot(park):
     assert [robot.updates for robot in measure.measure(trace).robots] == trace.decisions.tolist()
 
 
-def test_repetitions_side_by_side_are_what_each_is_alone_with_all_of_it(park):
-    noisy = Channel(delay_s=0.05, jitter_s=0.01, loss=0.1)
-    experiment = changed(updating(park, "self-triggered"), trigger=CHOSEN, duration_s=4.0, timeline=[], channel=noisy)
-    both = simulation.simulate(experiment, [5, 6])
-    for copy, seed in enumerate((5, 6)):
-        alone = simulation.simulate(experiment, [seed])
-        if len(alone.time) == len(both.time) and not both.waited.any():
-            rows = slice(7 * copy, 7 * copy + 7)
-            np.testing.assert_array_equal(both.true_position[:, rows], alone.true_position)
-            np.testing.assert_array_equal(both.updates[rows], alone.updates)
-
-
 # ---------------------------------------------------------------- what it is good for
 
 SEEDS = range(1, 5)  # parameters were chosen on 1001 to 1010

@@ -65,7 +65,7 @@ def test_experiment_runs_as_on_point_masses():
     logs = []
     for engine in ("point-mass", "pymunk"):
         read = load("robotic-park", f"world.engine={engine}", "timeline.0.at_s=3", "duration_s=7")
-        logs.append(simulation.simulate(chosen(read, ["event"])["event"], [7]))
+        logs.append(simulation.simulate(chosen(read, ["event"])["event"], 7))
     one, other = logs
     np.testing.assert_allclose(other.true_position, one.true_position, atol=1e-5)
     np.testing.assert_allclose(other.error, one.error, atol=1e-5)

@@ -6,6 +6,7 @@ import pytest
 from experiments.authoring.robotic_park.convert import convert, convert_text
 from experiments.authoring.robotic_park.file import Trigger, _Threshold, starts_from
 from experiments.check.check import check, figures
+from experiments.definition.formation import law_errors
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
@@ -45,16 +46,15 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", FILES)
-def test_they_run(tmp_path, count):
+def test_converted_formations_settle(tmp_path, count):
     experiment = converted(tmp_path, FILES[count]())[0].experiment
     log = simulation.simulate(experiment, 1)
-    law = Plan(experiment).assignment(tuple(experiment.robots)).law
-    net = Plan(experiment).links
+    plan = Plan(experiment)
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
     if count == 20:  # hunts
         allowed = 0.1
-    assert law.error(last, last[net.sender], net).max() < allowed
+    assert law_errors(plan.law, last, last[plan.links.sender], plan.links).max() < allowed
 
 
 def test_a_distance_task(tmp_path):
