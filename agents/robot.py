@@ -265,7 +265,7 @@ class Robot:
         begins, self._blind = blind and not self._blind, blind
         if not blind:
             self._place = now.position
-        if not (begins and not self.assignment.kind.flies and is_finite(self._place)):
+        if not (begins and not self._flies and is_finite(self._place)):
             return False
         self.sent_position, self.sent_velocity = self._place, ZERO
         return True

@@ -66,7 +66,7 @@ class View:
         self.t = self.since_start = self.error = self.energy = self.drift = 0.0
         self.deviation = self.since_event = self.reach_s = inf
         self.position = self.velocity = self.offset = ZERO
-        self.last, self.memory = LastEvent(), SimpleNamespace(**memory)
+        self.last, self.memory = LastEvent(), SimpleNamespace(**{name: float(first) for name, first in memory.items()})
 
 
 class Trigger(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -5,14 +5,18 @@
 
 from __future__ import annotations
 
+import ctypes
+import enum
 import inspect
+import math
 import operator
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, Final
 
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import config, njit, types
 from numba.core import cgutils
 from numba.core.datamodel import models
@@ -22,10 +26,15 @@ from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, inf
 from numba.extending import intrinsic, register_model
 
 from experiments.virtual_time.records import BOOL, FLOAT, INT, WORD, Floats, Items, Layout, width
-from experiments.virtual_time.source import PREFIX, specialised
+from experiments.virtual_time.source import BUILTINS, POWER, PREFIX, SAFE, STRICT, is_foreign, place, specialised
 
+config.LOOP_VECTORIZE = 0  # a tenth of the time of compilation, and of no use here
+config.USING_SVML = False  # functions of the C library, as Python has them
+LIBRARY_POWER: Final = "zenpark_pow"  # `pow` of the C library under a name of which a compiler knows nothing
+binding.add_symbol(LIBRARY_POWER, ctypes.cast(ctypes.CDLL(None).pow, ctypes.c_void_p).value)
 NUMBER = ir.IntType(64)
 SIMPLE = {FLOAT: types.float64, INT: types.int64, BOOL: types.boolean}
+CONSTANTS = {float: types.float64, int: types.int64, bool: types.boolean}  # of a class
 
 
 class Thing(types.Type):  # type: ignore[misc]
@@ -33,7 +42,7 @@ class Thing(types.Type):  # type: ignore[misc]
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
-        super().__init__(name=layout.name)
+        super().__init__(name=f"{layout.name}.{id(layout)}")  # layouts are kept for ever
 
 
 class Several(types.Type):  # type: ignore[misc]
@@ -110,15 +119,19 @@ def method(layout: Layout, name: str) -> Any:
 
 @cache
 def compiled(function: Callable[..., Any], layout: Layout | None = None) -> Any:
-    """Function, compiled; a method for objects of a layout."""
+    """Function, compiled; a method for objects of a layout. Raises SyntaxError outside of the subset."""
     code, names = specialised(function, {} if layout is None else layout.fixed)
     space: dict[str, Any] = {"__name__": function.__module__}
     exec(code, space)
-    made = njit(space[function.__name__])
-    for name in names:
+    made = _njit(space[function.__name__])
+    for name in names - {function.__name__, *space[function.__name__].__code__.co_varnames}:
         value = function.__globals__.get(name)
-        if value is not None and name not in space:
-            space[name] = compiled(value) if inspect.isfunction(value) else value
+        if is_foreign(function):
+            value = _strict(function, name, value)
+        elif inspect.isfunction(value):
+            value = compiled(value)
+        if value is not None:
+            space[name] = value
     return made
 
 
@@ -133,6 +146,58 @@ def kept(function: Callable[..., Any], kinds: Sequence[str], folder: Path) -> An
     return made
 
 
+def _njit(function: Callable[..., Any]) -> Any:
+    return njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)  # called by compiled ones alone
+
+
+def _strict(function: Callable[..., Any], name: str, value: Any) -> Any:
+    """What a name of a function of others stands for, None for what the compiler knows; raises SyntaxError."""
+    if name == POWER:
+        return _njit(_power)
+    if value is None and name in BUILTINS:
+        return compiled(STRICT[name]) if name in STRICT else None
+    if inspect.isfunction(value):
+        return compiled(value)
+    if value is math:
+        return _strict_math()
+    if inspect.isbuiltin(value) and value.__module__ == math.__name__:
+        value = getattr(_strict_math(), value.__name__, None)
+    elif not (isinstance(value, bool | int | float | enum.EnumMeta) or _is_numbers(value)):
+        value = None
+    if value is None:
+        raise SyntaxError(f"{place(function)}: {function.__qualname__} uses {name}, which may not be the same compiled")
+    return value
+
+
+def _is_numbers(value: Any) -> bool:
+    return isinstance(value, tuple) and all(isinstance(each, int | float) or _is_numbers(each) for each in value)
+
+
+@cache
+def _strict_math() -> ModuleType:
+    """What plug-ins of others have of `math`."""
+    made = ModuleType("strict_math")
+    for name, function in STRICT.items():
+        setattr(made, name, compiled(function))
+    for name in SAFE:
+        setattr(made, name, getattr(math, name))
+    return made
+
+
+_library_power = types.ExternalFunction(LIBRARY_POWER, signature(types.float64, types.float64, types.float64))
+
+
+def _power(x: float, y: float) -> float:
+    """x ** y; of whole numbers it is one with a fraction of 0."""
+    x, y = float(x), float(y)
+    if (x < 0.0 and math.floor(y) != y) or (x == 0.0 and y < 0.0):
+        raise ValueError("no power, or a complex one")
+    found: float = _library_power(x, y)
+    if abs(found) == math.inf and abs(x) < math.inf and abs(y) < math.inf:
+        raise OverflowError("result too large")
+    return found
+
+
 @infer_getattr
 class _Attributes(AttributeTemplate):  # type: ignore[misc]
     key = Thing
@@ -142,7 +207,7 @@ class _Attributes(AttributeTemplate):  # type: ignore[misc]
         if name in layout.fields:
             return type_of(layout.fields[name])
         if (found := method(layout, name)) is None:
-            return None
+            return CONSTANTS.get(type(getattr(layout.owner, name, None)))
         _lower_method(name)
         of_method = types.Dispatcher(found)
 
@@ -167,8 +232,9 @@ def _lower_method(name: str) -> None:
 @lower_getattr_generic(Thing)  # type: ignore[untyped-decorator]
 def _get(context: Any, builder: Any, kind: Any, value: Any, name: str) -> Any:
     layout, name = kind.layout, name.removeprefix(PREFIX)
-    if name not in layout.fields:  # a method
-        return value
+    if name not in layout.fields:
+        found = getattr(layout.owner, name)
+        return value if callable(found) else context.get_constant(CONSTANTS[type(found)], found)
     return _load(context, builder, layout.fields[name], value, layout.offset[name])
 
 

@@ -254,6 +254,7 @@ class VirtualNetwork:
         for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
         sent = np.array(ledger.sent[: ledger.count * SENT]).reshape(-1, SENT)
+        sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
         self._sent.extend(sent, sent[:, 2], sent[:, 0])
         if not self._lean:
             self._receive_all(sent, before, t)

@@ -17,6 +17,7 @@ import numpy as np
 
 WORD: Final = 8  # bytes
 FLOAT, INT, BOOL = "float", "int", "bool"
+NUMBERS: Final[dict[type, str]] = {float: FLOAT, int: INT, bool: BOOL}
 LEFT_OUT: Final = {"assignment", "_assignment", "_generator", "_preflight"}  # of no use to a quiet function
 
 
@@ -70,7 +71,7 @@ def is_frozen(owner: type) -> bool:
     return (struct is not None and struct.frozen) or (data is not None and data.frozen)
 
 
-LAYOUTS: Final[dict[str, Layout]] = {}
+LAYOUTS: Final[dict[tuple[Any, ...], Layout]] = {}  # a class that was defined anew is another one
 
 
 class Layouts:
@@ -97,10 +98,10 @@ class Layouts:
 
     def kind(self, value: Any, where: tuple[type, str] | None = None) -> Any:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""
-        if isinstance(value, float):
-            return FLOAT
-        if isinstance(value, int):
-            return BOOL if isinstance(value, bool) else INT
+        if (number := NUMBERS.get(type(value))) is not None:
+            return number
+        if isinstance(value, int):  # of an enumeration
+            return INT
         if isinstance(value, array):
             return Items(FLOAT)
         if isinstance(value, list | tuple):
@@ -144,16 +145,20 @@ class Layouts:
                 value = getattr(thing, name)
             except AttributeError:  # never set
                 continue
-            kind = None if value is None or name in names else self.kind(value, (owner, name))
+            if name in names:
+                kind = None
+            elif (kind := NUMBERS.get(type(value))) is None and value is not None:
+                kind = self.kind(value, (owner, name))
             if kind is not None:
                 fields[name] = kind
             elif value is None or name in names or (isinstance(value, list | tuple) and not value):
                 fixed[name] = value
-        text = f"{owner.__module__}.{owner.__qualname__} {fields} {fixed}"
-        layout = LAYOUTS.get(text)
+        key = (owner, tuple(fields.items()), repr(fixed) if fixed else "")
+        layout = LAYOUTS.get(key)
         if layout is None:
+            text = f"{owner.__module__}.{owner.__qualname__} {fields} {fixed}"
             name = f"{owner.__name__}-{hashlib.sha256(text.encode()).hexdigest()[:20]}"
-            layout = LAYOUTS[text] = Layout(owner, fields, fixed, name)
+            layout = LAYOUTS[key] = Layout(owner, fields, fixed, name)
         self._of[id(thing)] = (thing, layout)
         return layout
 
@@ -207,7 +212,10 @@ class Image:
             begin = self._word[id(things[0])]
             for name, kind in layout.fields.items():
                 values = list(map(attrgetter(name), things))
-                self._write(values, kind, begin + layout.offset[name], layout.words)
+                try:
+                    self._write(values, kind, begin + layout.offset[name], layout.words)
+                except (KeyError, TypeError) as error:
+                    raise TypeError(f"{name} of {layout.owner.__name__} has changed its type: {error}") from error
         for items, kind in self._lists:
             if len(items):
                 self._write(items, kind, self._word[id(items)], width(kind))
@@ -226,7 +234,10 @@ class Image:
         elif isinstance(kind, Layout):
             self.words[at] = [self.address(value) for value in values]
         else:
-            self.words[at] = values
+            found = np.array(values)
+            if found.dtype.kind not in "ib":
+                raise TypeError(f"whole numbers or truths were expected, not {values[:3]}")
+            self.words[at] = found
 
     def load(self) -> None:
         """Read the values of all objects that can change back."""

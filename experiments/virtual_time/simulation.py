@@ -25,7 +25,7 @@ from experiments.definition.plan import Plan
 from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from experiments.virtual_time.conductor import VirtualConductor
 from experiments.virtual_time.network import CentreLog, VirtualNetwork
-from experiments.virtual_time.stretch import stretches_of
+from experiments.virtual_time.stretch import Stretches, stretches_of
 from twins.arrays import Array, Index
 from twins.body import TwinBody
 from twins.engines.engine import Engine, Touch
@@ -133,6 +133,7 @@ class Flight:
         rates = experiment.rates
         self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
         self._tick = 0
+        self.stretches: Stretches | None = None  # compiled ones, where they pay
         self._samples: list[dict[str, Any]] = []
         self._columns: dict[str, list[Array]] = {}
         self._touches: list[Touch] = []
@@ -151,7 +152,7 @@ class Flight:
     ) -> None:
         """Flies until all robots are done, or to the end of the run without `landing`."""
         conductor, dt, first = self._conductor, self.dt, self.robots[0]
-        stretches = stretches_of(self) if watch is None else None
+        self.stretches = stretches = stretches_of(self) if watch is None else None
         while not conductor.over:
             reason = AT_END
             if stretches is not None:

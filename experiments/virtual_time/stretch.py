@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import os
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.util import find_spec
+from inspect import isfunction
 from pathlib import Path
+from time import time
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -28,11 +32,12 @@ from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
 from experiments.virtual_time.network import VirtualNetwork
 from experiments.virtual_time.records import BOOL, FLOAT, INT, Image, Items, Layout, Layouts
+from experiments.virtual_time.source import OURS
 from twins.body import TwinBody
 
-TICK_S: Final = 12e-6  # of CPU for a tick of a robot in plain Python, about
-PAYS_S: Final = 3.0  # plain Python is quicker than to load numba for less work in a process than this,
-COMPILES_S: Final = 30.0  # or to compile
+TICK_S: Final = 15e-6  # of CPU for a tick of a robot in plain Python: 10 to 20 µs
+PAYS_S: Final = 1.0  # for less work in a process plain Python is quicker than to load numba and a loop (0.6 s),
+COMPILES_S: Final = 20.0  # or to compile (15 to 20 s), which is kept
 LONGEST: Final = 2000  # ticks of a stretch: noise is drawn for all of them beforehand
 LEAST: Final = 20  # after a stretch of fewer ticks
 PAUSE: Final = 100  # so many are flown in plain Python
@@ -68,7 +73,10 @@ def {name}({parameters}, at, rows, k, end, dt, log_every, instant):
     return k
 """
 WORK: Final = [0.0]  # seconds of plain Python that the flights of this process take, about
+COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")  # of a compiler's messages
 REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
+DRIVERS: Final[dict[tuple[Any, ...], Any]] = {}  # compiled loops of this process; None: it cannot be compiled
+STEADY: Final = frozenset({"numpy", "msgspec"})  # of others, but no plug-ins
 
 
 class Flown(Protocol):
@@ -106,6 +114,8 @@ def stretches_of(flight: Flown) -> Stretches | None:
 class Stretches:
     """Compiled ticks of the robots of a flight."""
 
+    flown: int  # ticks so far
+
     def __init__(self, flight: Flown) -> None:
         self._flight, self._layouts = flight, Layouts()
         twins = flight.twin.twins
@@ -118,7 +128,7 @@ class Stretches:
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
-        self._paused_until = 0
+        self._paused_until, self._refused, self.flown = 0, False, 0
 
     def fly(self, k: int, end: int) -> tuple[int, int]:
         """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
@@ -128,7 +138,7 @@ class Stretches:
         flight = self._flight
         end = min(end, k + LONGEST, self._next_leg())
         waits = any(robot.lifecycle.phase <= READY and not robot.lifecycle.climbing for robot in flight.robots)
-        if k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
+        if self._refused or k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
             return k, AT_END
         ticks, rows, rates = end - k, len(self._members), flight.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
@@ -140,11 +150,12 @@ class Stretches:
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
-            self._paused_until = sys.maxsize  # it cannot be compiled, or others do that now
+            self._paused_until = k + LONGEST
             flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
             return k, AT_END
         if last - k < LEAST:
             self._paused_until = last + PAUSE
+        self.flown += last - k
         done = last - 1 if ledger.reason == AT_END else last
         flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
         flight.note(ledger)
@@ -165,16 +176,25 @@ class Stretches:
         kinds = tuple(Items(layouts.of(group[0])) for group in groups.values())
         of_ledger = Layouts().of(ledger)
         assert of_ledger is not None
-        run = driver(kinds, of_ledger)
+        try:
+            run = driver(kinds, of_ledger)
+        except LookupError:
+            self._refused = True
+            return -1
         if run is None:
             return -1
         flight = self._flight
-        image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (ledger, of_ledger)])
+        try:
+            image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (ledger, of_ledger)])
+        except TypeError as error:
+            REFUSED[str(of_ledger)], self._refused = str(error), True
+            return -1
         numbers = [number for group in groups.values() for number in (image.address(group), len(group))]
         instant = flight.network.instant
         try:
             found = run(*numbers, image.address(ledger), 1, k, end, flight.dt, flight.log_every, instant)
         except (ArithmeticError, LookupError, ValueError):  # of a plug-in: flown plain, the error tells where
+            self._refused = True
             return -1
         image.load()
         return int(found)
@@ -213,21 +233,58 @@ class Stretches:
                 flight.robots[row].goals.itinerary = itinerary
 
 
-@cache
 def driver(kinds: tuple[Items, ...], of_ledger: Layout) -> Any:
-    """Compiled loop over ticks, for groups of robots of these kinds; None if there is none, or another makes it now."""
-    owners = {layout.owner for layout in _layouts((*kinds, of_ledger))}
-    files = sorted({_digest(Path(str(sys.modules[owner.__module__].__file__))) for owner in owners})
-    name = "fly_" + hashlib.sha256(f"{kinds} {of_ledger} {files} {digest()}".encode()).hexdigest()[:24]
-    folder = cache_folder() / "compiled"
-    known = any(folder.glob(f"*/*{name}*.nbi")) if folder.is_dir() else False
-    if not known and WORK[0] < COMPILES_S:
-        return None
-    with _alone(folder, name) as alone:
-        return _compiled(name, kinds, of_ledger, folder) if known or alone else None
+    """Compiled loop over ticks for groups of robots of these kinds; None without one, and as long as it does not pay.
+
+    Raises LookupError if there will be none.
+    """
+    key = (*kinds, of_ledger)
+    if key not in DRIVERS:
+        owners = {layout.owner for layout in _layouts(key)}
+        text = f"{kinds} {of_ledger} {code_of(owners)} {digest()}"
+        name, folder = "fly_" + hashlib.sha256(text.encode()).hexdigest()[:24], cache_folder() / "compiled"
+        known = any(folder.glob(f"*/*{name}*.nbi"))
+        if not known and WORK[0] < COMPILES_S:
+            return None
+        with _alone(folder, name) as alone:
+            if not (known or alone):  # another process makes it
+                return None
+            DRIVERS[key] = _compiled(name, kinds, of_ledger, folder)
+    if DRIVERS[key] is None:
+        raise LookupError
+    return DRIVERS[key]
+
+
+def code_of(owners: Iterable[type]) -> str:
+    """Digest of the modules of plug-ins of others, with functions and numbers that they have from elsewhere."""
+    waiting, known, total = {base.__module__ for owner in owners for base in owner.__mro__}, set[str](), []
+    while waiting:
+        name = waiting.pop()
+        top = name.partition(".")[0]
+        if name in known or top in OURS or top in STEADY or top in sys.stdlib_module_names:
+            continue
+        known.add(name)
+        module = sys.modules[name]
+        file = getattr(module, "__file__", None)
+        values = vars(module)
+        numbers = {key: each for key, each in values.items() if isinstance(each, int | float | tuple)}
+        total.append(f"{name} {_digest(Path(file)) if file else time()} {numbers}")  # of a notebook: never the same
+        waiting |= {str(each.__module__) for each in values.values() if isfunction(each)}
+    return " ".join(sorted(total))
 
 
 def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
+    """Loop of that name, from the cache folder or new; None if it cannot be had, and then `REFUSED` says why."""
+    try:
+        return _loop(name, kinds, of_ledger, folder)
+    except Exception as error:  # noqa: BLE001 - of a compiler, its cache and plug-ins: the run is flown without them
+        REFUSED[name] = COLOUR.sub("", f"{type(error).__name__}: {error}")
+        return None
+
+
+def _loop(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path) -> Any:
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise OSError(f"nothing can be kept in {folder}")
     from experiments.virtual_time.compiler import compiled, kept, opened  # noqa: PLC0415 - half a second, and a level
 
     count = range(len(kinds))
@@ -252,11 +309,7 @@ def _compiled(name: str, kinds: Sequence[Items], of_ledger: Layout, folder: Path
     space |= {f"open{k}": opened(kind) for k, kind in enumerate(kinds)}
     space["open_ledger"] = opened(of_ledger)
     exec(compile(source, __file__, "exec"), space)
-    try:
-        return kept(space[name], (*(INT,) * (2 * len(kinds) + 4), FLOAT, INT, BOOL), folder)
-    except (TypeError, SyntaxError, OSError) as error:
-        REFUSED[name] = str(error)
-        return None
+    return kept(space[name], (*(INT,) * (2 * len(kinds) + 4), FLOAT, INT, BOOL), folder)
 
 
 def _layouts(kinds: Sequence[Any]) -> Iterator[Layout]:

@@ -9,6 +9,7 @@ import pytest
 
 from agents.plugins import registry
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
+from experiments.virtual_time.source import faults
 
 ROOT = Path(__file__).parents[2]
 # functions of quiet modules that are not quiet themselves, each with the reason
@@ -27,6 +28,7 @@ RARE = {
     "agents/safety/setpoint_filter.py": set(),
     "agents/vectors.py": set(),
     **{str(path.relative_to(ROOT)): set() for path in sorted((ROOT / "twins" / "models").glob("*.py"))},
+    "twins/models/quadrotor.py": {"Quadrotor.place"},  # puts a robot somewhere
     "twins/models/noise.py": {
         "stream",
         "refill",
@@ -35,38 +37,6 @@ RARE = {
         "Noise._drawn",
     },  # random numbers are drawn in blocks, outside of ticks
 }
-BANNED = {
-    ast.JoinedStr: "an f-string", ast.Dict: "a dictionary", ast.Set: "a set", ast.ListComp: "a comprehension",
-    ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.GeneratorExp: "a generator",
-    ast.Lambda: "a lambda", ast.Try: "try", ast.With: "with", ast.Yield: "yield", ast.YieldFrom: "yield",
-    ast.Await: "await", ast.Raise: "raise", ast.Assert: "assert", ast.Starred: "*args", ast.Delete: "del",
-    ast.Global: "global", ast.Nonlocal: "nonlocal", ast.Import: "an import", ast.ImportFrom: "an import",
-}  # fmt: skip
-CALLS = {"isinstance", "getattr", "setattr", "hasattr", "str", "repr", "print", "sum", "any", "all", "map", "zip",
-         "sorted", "enumerate", "dict", "set", "list", "type"}  # fmt: skip
-
-
-def faults(function: ast.FunctionDef):
-    """What a function has that is outside of the subset, each with its line."""
-    body = [each for each in function.body if not is_text(each)]
-    if len(body) == 1 and isinstance(body[0], ast.Raise):
-        return  # a method that must be defined
-    if function.args.vararg or function.args.kwarg:
-        yield function.lineno, "*args"
-    for statement in body:
-        for node in ast.walk(statement):
-            if type(node) in BANNED:
-                yield node.lineno, BANNED[type(node)]
-            elif isinstance(node, ast.Constant) and (node.value is None or isinstance(node.value, str)):
-                yield node.lineno, "None" if node.value is None else f"the text {node.value[:20]!r}"
-            elif isinstance(node, ast.Name) and node.id in {"np", "numpy"}:
-                yield node.lineno, "numpy"
-            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CALLS:
-                yield node.lineno, f"a call of {node.func.id}"
-
-
-def is_text(statement: ast.stmt) -> bool:
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
 
 def functions(tree: ast.AST, prefix=""):

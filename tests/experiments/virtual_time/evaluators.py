@@ -1,0 +1,39 @@
+"""Runs flown in plain Python and by compiled functions, which must be the same in every bit."""
+
+from dataclasses import fields
+from math import isnan
+
+import msgspec
+import numpy as np
+
+from experiments.virtual_time import stretch
+from experiments.virtual_time.simulation import Flight
+
+
+def flown(experiment, *, compiled, seed=1, lean=False):
+    """Log of a run, and the ticks of it that were compiled."""
+    stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
+    try:
+        flight = Flight(experiment, seed, quiet=False, lean=lean)
+        flight.fly(landing=True, progress=lambda _: None, watch=None)
+    finally:
+        stretch.WORK[0] = 0.0
+    assert compiled or flight.stretches is None
+    return flight.log(), 0 if flight.stretches is None else flight.stretches.flown
+
+
+def same(experiment, *, seed=1, lean=False):
+    """Log of a plain run, the same as the compiled one in every bit, and the number of ticks that were compiled."""
+    plain, _ = flown(experiment, compiled=False, seed=seed, lean=lean)
+    other, ticks = flown(experiment, compiled=True, seed=seed, lean=lean)
+    for field in fields(plain):
+        assert alike(getattr(plain, field.name), getattr(other, field.name)), field.name
+    return plain, ticks
+
+
+def alike(one, other):
+    if isinstance(one, msgspec.Struct):
+        return all(map(alike, msgspec.structs.astuple(one), msgspec.structs.astuple(other)))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    return one == other or (isinstance(one, float) and isnan(one) and isnan(other))

@@ -1,0 +1,254 @@
+"""Compiled stretches: the same as plain runs in every bit, for every registered plug-in, a user's too."""
+
+import math
+import os
+import tempfile
+from dataclasses import replace
+from math import sqrt
+from pathlib import Path
+from typing import ClassVar
+
+import msgspec
+import pytest
+
+from agents.body.interface import Disturbance, Jitter
+from agents.body.limits import Safety
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.plugins import registry
+from agents.plugins.laws import Gradient
+from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS, PluginError
+from agents.plugins.triggers import Trigger
+from agents.vectors import UNKNOWN
+from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, World
+from experiments.definition.plan import Plan
+from experiments.virtual_time import simulation, stretch
+from tests.agents.plugins.test_every_plugin import made
+from tests.experiments.virtual_time.evaluators import flown, same
+
+pytest.importorskip("numba")
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+KINDS = ("crazyflie", "khepera4", "tello", "turtlebot3")
+WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+NATURE = {
+    "all": Disturbance(position_sigma=0.0005, yaw_sigma=0.002),
+    "crazyflie": Disturbance(position_sigma=0.0005, hover_jitter=Jitter(0.01)),
+    "khepera4": Disturbance(odometry_drift=0.002),
+    "turtlebot3": Disturbance(latency_s=0.04),
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kept():
+    """A cache folder that survives the tests, so that later ones need not compile again."""
+    before = os.environ["ZENPARK_CACHE_DIR"]
+    os.environ["ZENPARK_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / f"zenpark-compiled-{os.getuid()}")
+    yield
+    os.environ["ZENPARK_CACHE_DIR"] = before
+
+
+@pytest.fixture(autouse=True)
+def heard():
+    """Nothing is refused, or the test takes it out."""
+    stretch.REFUSED.clear()
+    yield
+    assert not stretch.REFUSED
+
+
+def pair(**parts):
+    """Two ground robots, of which B follows A."""
+    given = {
+        "title": "A pair",
+        "duration_s": 4.0,
+        "robots": {"A": Robot(kind="khepera4", start=[-0.4, 0.0]), "B": Robot(kind="khepera4", start=[0.4, 0.1])},
+        "formation": Formation(links={"A > B": 0.5}),
+        "disturbance": {"all": Disturbance(position_sigma=0.0005)},
+        **parts,
+    }
+    return Experiment(**given)
+
+
+@pytest.fixture
+def assigned(monkeypatch):
+    """A function that makes runs use changed assignments."""
+
+    def use(change):
+        class Changed(Plan):
+            def assignment(self, name):
+                return change(super().assignment(name))
+
+        monkeypatch.setattr(simulation, "Plan", Changed)
+
+    return use
+
+
+def plugins(group, place=""):
+    every = [made(group, name) for name in registry.names(group)]
+    return [each for each in every if not place or place in each.PLACES]
+
+
+def test_every_plugin_and_model(assigned):
+    """Each robot has the next law, trigger, predictor, avoidance and kind: one compilation covers all."""
+    sending, updating = plugins(TRIGGERS, "communication"), plugins(TRIGGERS, "control")
+    laws, predictors, avoidances = plugins(LAWS), plugins(PREDICTORS), plugins(AVOIDANCES)
+    count = max(map(len, (sending, updating, laws, predictors, avoidances, KINDS)))
+
+    def change(given):
+        k = int(given.name[1:])
+        law = laws[k % len(laws)]
+        links = tuple(
+            msgspec.structs.replace(
+                link, relative=(0.4, 0.3, 0.0), bearing=(0.6, 0.8, math.nan), wants=WANTS[law.NEEDS]
+            )
+            for link in given.neighbours
+        )
+        avoidance = (None, *avoidances)[k % (1 + len(avoidances))]
+        return replace(
+            given, law=law, neighbours=links, trigger=sending[k % len(sending)], update=updating[k % len(updating)],
+            predictor=predictors[k % len(predictors)], avoidance=avoidance, avoids=avoidance is not None,
+        )  # fmt: skip
+
+    robots = {
+        f"R{k}": Robot(
+            kind=KINDS[k % 4],
+            sensors=[],
+            hover=0.5 if k % 2 == 0 else None,
+            start=[0.7 * (k % 4 - 1.5), 0.7 * (k // 4 - 1.0)],
+        )
+        for k in range(count)
+    }
+    links = {f"R{k} - R{(k + 1) % count}": 0.6 for k in range(count)}
+    experiment = pair(
+        robots=robots, formation=Formation(links=links), disturbance=NATURE, duration_s=5.0,
+        avoidance={"kind": "potential"}, channel=Channel(delay_s=0.03),
+    )  # fmt: skip
+    assigned(change)
+    _, ticks = same(experiment)
+    assert ticks > 500
+
+
+@pytest.mark.parametrize("lean", [False, True])
+def test_legs_and_several_stretches(lean):
+    line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
+    legs = [
+        Leg(at_s=2.0, robot="A", plan=line),
+        Leg(at_s=11.3, robot="A", plan={"kind": "circle", "radius": 0.3, "period_s": 9.0}),
+    ]
+    _, ticks = same(pair(duration_s=25.0, timeline=legs), lean=lean)
+    assert ticks > stretch.LONGEST
+
+
+def test_hazard_in_mid_run():
+    robots = {
+        "A": Robot(kind="crazyflie", hover=0.5, start=[-0.4, 0.0]),
+        "B": Robot(kind="crazyflie", hover=0.5, start=[0.4, 0.1]),
+    }
+    log, ticks = same(pair(robots=robots, duration_s=8.0, safety=Safety(battery_low=0.985)))
+    found = [(row, incident.cause.name) for row, incident in log.incidents if 0.0 < incident.time < 8.0]
+    assert {(0, "BATTERY"), (1, "BATTERY")} <= set(found), found
+    assert ticks > 500
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_other_seeds_of_one_process(seed):
+    _, ticks = same(pair(), seed=seed)
+    assert ticks > 300
+
+
+GAIN = 0.2
+
+
+class Foreign(Gradient, frozen=True):
+    """A law within the subset, with what compilers like to change."""
+
+    POWER: ClassVar[float] = 2.0
+
+    def pull(self, apart, link):
+        x, y, z = apart
+        length: float = max(sqrt(x**2 + y**2.0 + z**self.POWER), 0.1)
+        gain = GAIN * math.exp(-(length**3)) * (link.distance - length) / length
+        return gain * x, gain * y, gain * z
+
+    def error(self, apart, link):
+        return abs(link.distance - math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2))
+
+
+class Trying(Foreign, frozen=True):
+    """A law outside of the subset."""
+
+    def pull(self, apart, link):
+        try:
+            return super().pull(apart, link)
+        except ValueError:
+            return UNKNOWN
+
+
+class Rounding(Foreign, frozen=True):
+    """A law with a function that compilers have in another way."""
+
+    def error(self, apart, link):
+        return abs(link.distance - math.hypot(apart[0], apart[1]))
+
+
+class Failing(Foreign, frozen=True):
+    """A law that fails when its robot has come near."""
+
+    def pull(self, apart, link):
+        x, y, z = apart
+        far = sqrt(x * x + y * y)
+        return 0.3 * x / sqrt(0.6 - far), 0.0 * y, z if far < 0.0 else 0.0
+
+
+class Counting(Trigger, frozen=True):
+    """A trigger that remembers, with a first value that is no float."""
+
+    MEMORY: ClassVar = {"sum": 0}
+
+    def fires(self, view):
+        view.memory.sum += 0.3
+        return view.memory.sum % 1.0 < 0.2
+
+
+def test_law_of_a_user_with_powers(assigned):
+    assigned(lambda given: replace(given, law=Foreign(), trigger=Counting()))
+    _, ticks = same(pair())
+    assert ticks > 300
+
+
+@pytest.mark.parametrize(("law", "fault"), [(Trying, "try"), (Rounding, "hypot")])
+def test_law_outside_of_the_subset_is_flown_plain(assigned, law, fault):
+    assigned(lambda given: replace(given, law=law()))
+    _, ticks = same(pair(duration_s=1.0))
+    assert ticks == 0
+    reasons = [*stretch.REFUSED.values()]
+    assert len(reasons) == 1
+    assert fault in reasons[0]
+    assert f"{Path(__file__).name}:" in reasons[0]
+    stretch.REFUSED.clear()
+
+
+def test_law_that_fails_in_mid_run(assigned):
+    assigned(lambda given: replace(given, law=Failing()))
+    apart = pair(robots={"A": Robot(kind="khepera4", start=[0.0, 0.0]), "B": Robot(kind="khepera4", start=[0.3, 0.0])})
+    told = []
+    for compiled in (False, True):
+        with pytest.raises((PluginError, ValueError)) as caught:
+            flown(apart, compiled=compiled)
+        told.append(str(caught.value))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("parts", [{"channel": Channel(loss=0.1)}, {"world": World(engine="pymunk")}])
+def test_what_is_not_compiled(parts):
+    _, ticks = same(pair(duration_s=1.0, **parts))
+    assert ticks == 0
+
+
+def test_cache_folder_that_cannot_be_made(monkeypatch, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("", encoding="utf-8")
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(file / "folder"))
+    stretch.DRIVERS.clear()
+    _, ticks = same(pair(duration_s=1.0))
+    assert ticks == 0
+    stretch.DRIVERS.clear()
+    stretch.REFUSED.clear()

@@ -1,0 +1,148 @@
+"""Objects as records: layouts, aliases, empty lists, constants, and the same values after store and load."""
+
+from array import array
+from math import inf, isnan, nan
+from typing import ClassVar
+
+import msgspec
+import pytest
+
+from experiments.virtual_time.records import BOOL, FLOAT, INT, Floats, Image, Items, Layouts
+
+
+class Part:
+    __slots__ = ("at", "size")
+
+    def __init__(self, size):
+        self.size, self.at = size, (size, 0.0, nan)
+
+
+class Whole:
+    FIXED: ClassVar = ("fast",)
+    __slots__ = ("count", "fast", "first", "late", "name", "numbers", "ok", "other", "parts", "second", "times")
+
+    def __init__(self, parts=()):
+        self.count, self.ok, self.fast, self.name, self.other = 7, True, True, "text", None
+        self.first = self.second = Part(1.5)
+        self.parts, self.numbers, self.times = list(parts), [1.0, inf], array("d", [1.0, 2.0])
+
+
+class Frozen(msgspec.Struct, frozen=True):
+    gain: float = 0.5
+    only: bool = True
+
+
+def stored(*things):
+    layouts = Layouts()
+    kinds = [layouts.of(thing) for thing in things]
+    return Image(layouts, list(zip(things, kinds, strict=True))), kinds
+
+
+def test_kinds_of_attributes():
+    kind = Layouts().of(Whole([Part(1.0)]))
+    fields = kind.fields
+    assert (fields["count"], fields["ok"]) == (INT, BOOL)
+    assert fields["first"].fields == {"at": Floats(3), "size": FLOAT}
+    assert fields["parts"] == Items(fields["first"])
+    assert fields["numbers"] == fields["times"] == Items(FLOAT)
+    assert kind.fixed == {"fast": True, "other": None}
+    assert not {"name", "late", "other", "fast"} & set(fields)
+    assert kind.words == 4 + 2 * 3  # two words for each list
+
+
+def test_same_attributes_same_layout():
+    layouts = Layouts()
+    assert layouts.of(Part(1.0)) is layouts.of(Part(2.0)) is Layouts().of(Part(3.0))
+
+
+def test_classes_of_one_name_differ():
+    def defined():
+        class Local(msgspec.Struct, frozen=True):
+            gain: float = 1.0
+
+        return Local
+
+    one, other = defined(), defined()
+    assert Layouts().of(one()) is not Layouts().of(other())
+    assert Layouts().of(one()).owner is one
+
+
+def test_empty_list_takes_the_kind_of_others():
+    layouts, empty, full = Layouts(), Whole(), Whole([Part(1.0)])
+    assert "parts" not in layouts.of(empty).fields
+    layouts.of(full)
+    assert layouts.guessed
+    layouts.forget()
+    assert layouts.of(empty) is layouts.of(full)
+    assert layouts.of(empty).fields["parts"] == Items(layouts.of(full.first))
+
+
+def test_list_that_is_always_empty_is_constant():
+    assert Layouts().of(Whole()).fixed["parts"] == []
+
+
+def test_changed_constants_are_found():
+    layouts, whole = Layouts(), Whole()
+    layouts.of(whole)
+    assert layouts.hold()
+    whole.fast = False
+    assert not layouts.hold()
+    whole.fast, whole.other = True, 3.0
+    assert not layouts.hold()
+
+
+def test_one_object_is_one_record():
+    shared = Part(2.0)
+    one, other = Whole([shared]), Whole([shared, Part(3.0)])
+    other.first = other.second = one.first
+    image, _ = stored(one, other)
+    assert image.address(one.first) == image.address(other.second)
+    assert len({image.address(each) for each in (shared, one.first, other.parts[1], one, other)}) == 5
+
+
+def test_load_gives_what_was_stored():
+    whole = Whole([Part(1.0), Part(2.0)])
+    kept = whole.first
+    image, _ = stored(whole)
+    image.load()
+    assert (whole.count, whole.ok, whole.fast, whole.name, whole.other) == (7, True, True, "text", None)
+    assert type(whole.count) is int
+    assert type(whole.ok) is bool
+    assert whole.first is whole.second is kept
+    assert kept.at[:2] == (1.5, 0.0)
+    assert isnan(kept.at[2])
+    assert whole.numbers == [1.0, inf]
+    assert [part.size for part in whole.parts] == [1.0, 2.0]
+
+
+def test_load_takes_what_was_written():
+    whole = Whole([Part(1.0)])
+    image, (kind,) = stored(whole)
+    word = (image.address(whole) - image.address(whole)) // 8 + kind.offset["count"]
+    image.words[word] = 9
+    image.load()
+    assert whole.count == 9
+
+
+def test_frozen_structs_are_not_written():
+    given = Frozen()
+    image, (kind,) = stored(given)
+    assert kind.fields == {"gain": FLOAT, "only": BOOL}
+    image.words[:] = 0
+    image.load()
+    assert given == Frozen()
+
+
+def test_attribute_that_changed_its_type():
+    whole = Whole([Part(1.0)])
+    layouts = Layouts()
+    kind = layouts.of(whole)
+    whole.count = 0.5
+    with pytest.raises(TypeError, match="count"):
+        Image(layouts, [(whole, kind)])
+
+
+def test_circle_of_objects():
+    one = Part(1.0)
+    one.at = one
+    assert Layouts().of(one).fields == {"size": FLOAT}

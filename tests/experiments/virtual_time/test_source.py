@@ -1,0 +1,137 @@
+"""Source of quiet functions as a compiler gets it: constants decided, branches left out, loops that count."""
+
+import math
+from math import inf, isnan, nan
+from pathlib import Path
+
+import pytest
+
+from experiments.virtual_time import source
+from experiments.virtual_time.source import specialised
+
+
+class Thing:
+    def __init__(self, part, steps):
+        self.part, self.steps, self.lean = part, steps, False
+
+    def without_part(self):
+        return 1 if self.part is None else self.part.value
+
+    def counted(self):
+        total = 0
+        for step in self.steps:
+            total += step
+        return total
+
+    def branches(self, x):
+        if self.lean and x > 0:
+            return 1
+        if not self.lean or x > 0:
+            x += 10
+        if self.part is not None:
+            x += self.part
+        return x
+
+    def squared(self, x):
+        y: float = x
+        y **= 2
+        return y**3
+
+    def asks(self, what):
+        return isinstance(what, float)
+
+    def rounds(self, x):
+        return round(x, 2)
+
+    def far(self, x):
+        return math.hypot(x, x)
+
+    def words(self):
+        return f"{self.part}"
+
+
+def made(function, fixed):
+    code, names = specialised(function, fixed)
+    space = dict(function.__globals__)
+    exec(code, space)
+    return space[function.__name__], names
+
+
+def test_constants_are_decided():
+    function, names = made(Thing.without_part, {"part": None})
+    assert function.__code__.co_names == ()
+    assert function(None) == 1
+    assert names == set()
+
+
+def test_other_attributes_are_not_none():
+    function, _ = made(Thing.without_part, {})
+    assert function.__code__.co_names == ("part", "value")
+
+
+def test_branches_are_left_out():
+    function, _ = made(Thing.branches, {"lean": False, "part": None})
+    assert function.__code__.co_names == ()
+    assert function(None, 1) == Thing(None, []).branches(1) == 11
+
+
+def test_constants_stand_for_attributes():
+    function, _ = made(Thing.branches, {"lean": True})
+    assert function(Thing(5, []), -1) == 4
+    assert function(None, 1) == 1
+
+
+def test_loops_over_lists_count():
+    function, names = made(Thing.counted, {})
+    assert {"range", "len"} <= names
+    assert function(Thing(None, [1, 2, 4])) == 7
+
+
+def test_loops_over_nothing_are_left_out():
+    function, _ = made(Thing.counted, {"steps": []})
+    assert function(None) == 0
+
+
+def test_powers_of_others_are_calls():
+    code, names = specialised(Thing.squared, {})
+    space = {source.POWER: lambda x, y: ("power", x, y)}
+    exec(code, space)
+    assert space["squared"](None, 3) == ("power", ("power", 3, 2), 3)
+    assert source.POWER in names
+
+
+@pytest.mark.parametrize(
+    ("method", "fault"),
+    [(Thing.asks, "a call of isinstance"), (Thing.rounds, "round to digits"), (Thing.far, "math.hypot"),
+     (Thing.words, "an f-string")],
+)  # fmt: skip
+def test_faults_of_others_have_file_and_line(method, fault):
+    line = method.__code__.co_firstlineno + 1
+    with pytest.raises(SyntaxError, match=fault) as caught:
+        specialised(method, {})
+    assert f"{Path(__file__).name}:{line}:" in str(caught.value)
+
+
+def test_what_is_no_function_of_its_own():
+    with pytest.raises((SyntaxError, OSError, TypeError)):
+        specialised(lambda thing: thing, {})
+    with pytest.raises((SyntaxError, OSError, TypeError)):
+        specialised(len, {})
+
+
+NUMBERS = (-inf, -1e300, -2.5, -1.0, -0.5, -0.0, 0.0, 0.5, 1.0, 2.5, 710.0, 1e300, inf, nan)
+
+
+@pytest.mark.parametrize("name", sorted(source.STRICT))
+def test_strict_functions_are_those_of_python(name):
+    ours, pythons = source.STRICT[name], getattr(math, name, {"int": int, "round": round}.get(name))
+    for x in NUMBERS:
+        try:
+            expected = pythons(x)
+        except (ValueError, OverflowError):
+            with pytest.raises((ValueError, OverflowError)):
+                ours(x)
+            continue
+        if abs(x) > 2.0**62 and name in {"floor", "ceil", "int", "trunc", "round"}:
+            continue  # it has no place in a word
+        assert ours(x) == expected or (isnan(ours(x)) and isnan(expected))
