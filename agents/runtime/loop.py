@@ -1,6 +1,7 @@
 """The robot process: a deadline loop around the decision. Here is the I/O; `agents.robot` decides.
 
-One plain loop on the clock `uptime`, no asyncio, no callbacks: received samples wait in ring channels and are polled.
+One plain loop on the clock `uptime`, no asyncio: received samples wait in queues and are polled on each tick. Poses of
+neighbours can wake the loop between two ticks: then they are known at once, while decisions keep their ticks.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ class Setup:
     rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
     # [s] without a tick after which the watchdog lands the robots
     loop_silence_s: float = SILENCE_S
+    wake: bool = False  # a pose of a neighbour wakes the loop
     lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
 
 
@@ -105,6 +107,7 @@ class Runtime:
         self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._opened = self._joined = False
         self._ticks = Ticks(common.body_hz, clock=uptime)
+        self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
         self._ownership = OwnershipCheck([setup.keys.alive(name) for name in self._names], network.ROBOT_LEASE_S)
         self._hands_off = False  # another process drives the bodies, or may do so
@@ -302,7 +305,7 @@ class Runtime:
         seen_by_world = [row for row, source in enumerate(ranging) if source == "world"]
         self._ranges = RangeInbox(session, keys, names, seen_by_world) if seen_by_world else None
         self._neighbours = neighbours = PoseInbox(
-            session, keys, self.robots, reach=self._reach, conditions=self._setup.conditions
+            session, keys, self.robots, reach=self._reach, conditions=self._setup.conditions, bell=self._bell
         )
         self._goals = None
         if any(robot.guidance is not None for robot in self.robots):
@@ -464,7 +467,7 @@ class Runtime:
             self._watchdog.beat()
             if self._watchdog.tripped:
                 self._recover(self._watchdog.forgive())
-            time.sleep(ticks.until_next())
+            self._wait(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
             if self._await_ownership():
@@ -488,6 +491,22 @@ class Runtime:
             ):
                 self._telemetry.send_statuses(t, everything=True)
                 return
+
+    def _wait(self, ahead: float) -> None:
+        """Waits until the next tick, `ahead` [s] from now; each pose that arrives meanwhile is received at once.
+
+        A robot only knows more by that: it decides, sends and moves on its ticks.
+        """
+        ticks, bell = self._ticks, self._bell
+        if bell is None or ahead <= 0.0:
+            time.sleep(ahead)
+            return
+        while ahead > 0.0 and bell.wait(ahead):
+            now = ticks.elapsed()
+            if now < ticks.next and not self._cut_off:  # after a stop other processes need the CPU
+                self._neighbours.deliver(now, self._utc)
+            # not by `until_next`: a wait that lasts too long delays its tick and skips none
+            ahead = ticks.next - ticks.elapsed()
 
     def _yield_after_stop(self) -> None:
         """Sleeps, so that other processes get the CPU to stop their motors."""

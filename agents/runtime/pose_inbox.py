@@ -55,14 +55,21 @@ class NeighbourSubscription:
         reach: messages.Vector,
         rate: float,
         depth: int = pubsub.POSES,
+        bell: pubsub.Bell | None = None,
     ) -> None:
         """Subscribes to the robot `name`, the sender on `links`.
 
-        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s], and
-        `depth` of them may wait.
+        `reach` has the largest |x|, |y|, |z| of a valid pose [m], `rate` is the largest rate of its poses [1/s],
+        `depth` of them may wait, and each rings the `bell`, if there is one.
         """
         self.name, self.links, self._reach, self._rate = name, links, reach, rate
-        self._poses = pubsub.Inbox(pubsub.pose_subscriber(session, keys.pose(name), depth), messages.Pose, keys=keys)
+        key = keys.pose(name)
+        subscription: pubsub.Subscription = (
+            pubsub.pose_subscriber(session, key, depth)
+            if bell is None
+            else pubsub.RingingSubscriber(session, key, bell, depth)
+        )
+        self._poses = pubsub.Inbox(subscription, messages.Pose, keys=keys)
         self._token = keys.alive(name)
         self._alive = pubsub.AliveWatch(session, keys.lives(self._token))
         self.tokens = self._alive.waiting  # queued for `token_changes`, nearly always none
@@ -182,6 +189,7 @@ class ModelledInbox:
         reach: messages.Vector,
         rate: float,
         depth: int = pubsub.POSES,
+        bell: pubsub.Bell | None = None,
         counted: Callable[[float], bool] = lambda _: True,
     ) -> None:
         """Subscribes to all senders; see `NeighbourSubscription`.
@@ -190,7 +198,7 @@ class ModelledInbox:
         """
         self._knowledge, self._channel, self._counted = knowledge, Channel(conditions), counted
         self.senders = [
-            NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth)
+            NeighbourSubscription(session, keys, name, mine, reach=reach, rate=rate, depth=depth, bell=bell)
             for name, mine in links.items()
         ]
         self.arrived = 0  # poses before the modelled channel, without those of robots of this process
@@ -278,10 +286,12 @@ class PoseInbox(ModelledInbox):
         *,
         reach: messages.Vector,
         conditions: Sequence[Sequence[Conditions]] = (),
+        bell: pubsub.Bell | None = None,
     ) -> None:
         """Subscribes to the neighbours of `robots`, which get poses and losses.
 
-        `reach` as of `NeighbourSubscription`; `conditions` of each link of each robot, empty: an ideal network.
+        `reach` and `bell` as of `NeighbourSubscription`; `conditions` of each link of each robot, empty: an ideal
+        network.
         """
         self._robots = robots
         self._own = {robot.assignment.name for robot in robots}
@@ -294,7 +304,7 @@ class PoseInbox(ModelledInbox):
         first = robots[0].assignment
         super().__init__(
             session, keys, links, [each for own in conditions for each in own] or ideal, self,
-            reach=reach, rate=first.body_hz / first.pose_every,
+            reach=reach, rate=first.body_hz / first.pose_every, bell=bell,
         )  # fmt: skip
         # (n) newest received poses of each robot, for telemetry, which empties them
         self.news = [deque[messages.PoseReceipt](maxlen=NEWS) for _ in robots]

@@ -64,6 +64,13 @@ class Rates(Part, frozen=True):
     pose_hz: Annotated[Rate, Meta(description="how often the trigger is asked [1/s]")] = 50.0
     coordination_hz: Annotated[Rate, Meta(description="how often a new goal is decided [1/s]")] = 10.0
     state_hz: Annotated[Rate, Meta(description="telemetry for recorder and viewers [1/s]")] = 50.0
+    wake: Annotated[
+        bool | None,
+        Meta(
+            description="in real time, receive poses on arrival, not on the next tick of body_hz; left out: unless the "
+            "trigger is timed"
+        ),
+    ] = None
 
 
 class Robot(Part, frozen=True):

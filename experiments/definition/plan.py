@@ -62,6 +62,12 @@ class Plan:
         built: Trigger = registry.build(registry.TRIGGERS, self.experiment.trigger)
         return built
 
+    @property
+    def wakes(self) -> bool:
+        """Whether poses of neighbours wake a robot's process: each costs CPU time, and timed triggers send many."""
+        chosen = self.experiment.rates.wake
+        return not self.trigger.TIMED if chosen is None else chosen
+
     @cached_property
     def update(self) -> Trigger | None:
         """The control trigger; None: the law is computed at every decision."""

@@ -220,11 +220,17 @@ class Net:
         def heard(_session: object, key: str, *_: object, **__: object) -> Channel:
             return self.listen(key)
 
+        def ringing(_session: object, key: str, bell: pubsub.Bell, *_: object, **__: object) -> Channel:
+            made = self.listen(key)
+            made.obey = lambda _sample: bell.ring()
+            return made
+
         def mute(*_: object, **__: object) -> Mute:
             return Mute()
 
         declared: dict[str, Any] = {
             "pose_subscriber": heard,
+            "RingingSubscriber": ringing,
             "subscriber": heard,
             "Orders": lambda _session, key, kind: typed_orders(self.listen(key, asked=True), kind),
             "pose_publisher": mute,

@@ -28,7 +28,7 @@ from agents.plugins.triggers import Trigger
 
 class Hangs(Trigger, frozen=True):
     file: str = ""
-    def fires(self, view, memory):
+    def fires(self, view):
         if Path(self.file).exists():
             threading.Event().wait()
         return view.error > 1e9

@@ -126,7 +126,7 @@ def test_orders_are_answered_and_refused_with_a_reason(router: RouterProcess, wa
             if reply.ok is not None
         ]
         assert sorted((answer.robot, answer.value, answer.reason) for answer in answers if answer.ok) == [
-            ("CF01", 0.05, ""), ("KH01", 0.05, ""), ("KH02", 0.05, "")
+            ("CF01", 0.05, ""), ("KH01", 0.1, ""), ("KH02", 0.1, "")
         ]  # fmt: skip
         assert {answer.reason for answer in answers if not answer.ok} == {"cannot hold while ready"}
         for name in TRIANGLE:

@@ -118,6 +118,7 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         once=launch.once,
         rights=mesh.member_rights(experiment, endpoints),
         loop_silence_s=experiment.safety.loop_silence_s,
+        wake=plan.wakes,
     )
     return Runtime(assignments, body, setup).run()
 
