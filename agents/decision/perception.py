@@ -91,13 +91,14 @@ class Perception:
             vz if abs(vz) <= MAX_SPEED else 0.0,
         )
         own.position, own.yaw = now.position, now.yaw
-        near.count = 0
+        before, near.count = near.count, 0
         aware = isfinite(now.yaw) and t - state.time <= self._own_silence_s
         if aware:
             for sender in neighbours.all:
                 self._add_robot(t, now.position, sender)
         if self.sees:
             self._look(t, now, neighbours, aware)
+        near.clear_rest(before)
 
     def _look(self, t: float, now: Situation, neighbours: Neighbours, aware: bool) -> None:
         """Add what the newest range readings saw; rare."""

@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from agents.vectors import ZERO, NotNegative, Positive, Setpoint, Vector
 
+FAR: Final = 1e6  # [m] from 0 on both axes: what is not there
 COINCIDENT: Final = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING: Final = 1e-3  # [m] smallest gap in a force: forces stay finite
 LAYER: Final = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
@@ -24,12 +25,11 @@ ASIDE: Final = 0.1  # of the pull against a push: the step aside
 class Thing:
     """Thing near a robot: an upright cylinder, a robot whose pose was received or the end of a range reading.
 
-    What follows `lag` is for avoidances to write on.
+    What follows `lag` is set by `measure`.
     """
 
     __slots__ = (
-        "away_x", "away_y", "bound", "counts", "excess", "gap", "high", "is_robot", "lag", "low", "radius",
-        "velocity_x", "velocity_y", "x", "y",
+        "away_x", "away_y", "gap", "high", "is_robot", "lag", "low", "radius", "velocity_x", "velocity_y", "x", "y",
     )  # fmt: skip
 
     x: float  # believed now [m]
@@ -44,14 +44,16 @@ class Thing:
     away_x: float  # unit vector from the thing to the robot
     away_y: float
     gap: float  # between surfaces once both have stopped closing in [m]
-    bound: float  # [m/s]
-    excess: float  # [m/s]
-    counts: bool
 
     def __init__(self) -> None:
-        self.x = self.y = self.velocity_x = self.velocity_y = self.radius = self.low = self.high = self.lag = 0.0
-        self.away_x = self.away_y = self.gap = self.bound = self.excess = 0.0
-        self.is_robot = self.counts = False
+        self.away_x = self.away_y = self.gap = 0.0
+        self.vanish()
+
+    def vanish(self) -> None:
+        """Be a point at rest, out of reach of everything."""
+        self.x = self.y = FAR
+        self.velocity_x = self.velocity_y = self.radius = self.low = self.high = self.lag = 0.0
+        self.is_robot = False
 
 
 class Plane:
@@ -68,25 +70,33 @@ class Plane:
 
 
 class Nearby:
-    """Things near a robot: the first `count` of `things`."""
+    """Things near a robot: the first `count` of `things`. The list has room for more, which stand `FAR` away."""
 
     __slots__ = ("count", "planes", "things")
 
     count: int
     things: list[Thing]
-    planes: list[Plane]  # for avoidances to write on
+    planes: list[Plane]  # for an avoidance to write on, as many as things
 
-    def __init__(self, planes: int = 9) -> None:
-        self.count, self.things, self.planes = 0, [], [Plane() for _ in range(planes)]
+    def __init__(self) -> None:
+        self.count, self.things, self.planes = 0, [], []
+        self.reserve(1)  # a compiler wants to see what is in a list
 
     def reserve(self, count: int) -> None:
         """Make room for so many things; rare."""
-        self.things += [Thing() for _ in range(count - len(self.things))]
+        while len(self.things) < count:
+            self.things.append(Thing())
+            self.planes.append(Plane())
 
     def add(self) -> Thing:
         """One more thing, to be filled in; there is room for it."""
         self.count += 1
         return self.things[self.count - 1]
+
+    def clear_rest(self, before: int) -> None:
+        """Let those that are not among the things any more vanish; there were `before`."""
+        for k in range(self.count, before):
+            self.things[k].vanish()
 
 
 class OwnState:

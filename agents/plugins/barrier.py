@@ -5,22 +5,22 @@ All of it is quiet.
 
 from __future__ import annotations
 
-from math import atan2, copysign, cos, floor, inf, pi, sin, sqrt
+from math import copysign, cos, inf, sin, sqrt
 from typing import Annotated, Final
 
 from msgspec import Meta
 
-from agents.plugins.avoidance import Avoidance, Nearby, OwnState, Thing, measure
+from agents.plugins.avoidance import Avoidance, Nearby, OwnState, Plane, Thing, measure
 from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
-SECTORS: Final = 8  # of what surrounds a robot; the tightest half-plane of each takes part in the exact solution
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
+ROUNDS: Final = 32  # of raising bounds that clash; at most 9 were seen among 100,000 scenes
 PARALLEL: Final = 1e-9  # sine of the angle below which two half-planes have no corner
 SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (its cosine) from broadside
 LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
 
 Planar = tuple[float, float]  # x, y
-Candidate = tuple[float, float, float]  # x, y, and the square of the distance from what is wanted; infinite: none
+Solution = tuple[float, float, float]  # x, y, and by how much bounds clash, or -1: not at all [m/s]
 
 
 class Barrier(Avoidance, frozen=True):
@@ -38,8 +38,12 @@ class Barrier(Avoidance, frozen=True):
     and is the one nearest to the wanted velocity w (‖u − w‖² least, a quadratic program in two variables). At the last,
     the speed of robots on wheels along their heading is limited by the same inequalities, of which none forbids turning
     on the spot; before that their goal is shifted to where u points, so that they drive around things rather than stop,
-    and by a smaller α (`steering`), so that they have turned in time. Where not all inequalities can be kept, the
-    largest violation is made as small as it can be.
+    and by a smaller α (`steering`), so that they have turned in time.
+
+    All inequalities are kept wherever some velocity within the limit of speed does so. Those that standing still obeys
+    are always kept. Where only a velocity beyond the limit would obey the others (something comes faster than the
+    robot can flee), u points where that one does, at the limit. Where none would, the largest violation of the others
+    is made as small as it can be.
 
     For u that obeys, s' ≥ −α s: s stays positive once it is, and h ≥ s, so that no two robots touch under the
     conditions that docs/plugins.md names. Arrival is not guaranteed. Against deadlocks of robots that meet head-on, the
@@ -77,21 +81,17 @@ class Barrier(Avoidance, frozen=True):
         wanted_x, wanted_y = own.response * (goal[0] - here_x), own.response * (goal[1] - here_y)
         share = min(1.0, own.speed / max(sqrt(wanted_x * wanted_x + wanted_y * wanted_y), SLACK))
         wanted_x, wanted_y = wanted_x * share, wanted_y * share
-        for k in range(near.count):
-            thing = near.things[k]
-            measure(own, thing)
-            thing.bound = self.bound(thing, self.steering if thing.is_robot else 1.0)
-        if not barred(wanted_x, wanted_y, near):
+        self.set_planes(own, near, self.steering)
+        worst = most_violated(wanted_x, wanted_y, near)
+        if worst < 0:
             return goal
-        x, y = self.nearest(wanted_x, wanted_y, own, near)
+        x, y = self.nearest(wanted_x, wanted_y, worst, own, near)
         return here_x + x / own.response, here_y + y / own.response, goal[2]
 
     def restrain(self, setpoint: Setpoint, own: OwnState, near: Nearby) -> Setpoint:
         if near.count == 0:
             return setpoint
-        for k in range(near.count):
-            measure(own, near.things[k])
-            near.things[k].bound = self.bound(near.things[k], 1.0)
+        self.set_planes(own, near, 1.0)
         a, b, c, d = setpoint
         if own.by_twist:
             return along_heading(a, own, near), b, c, d
@@ -99,27 +99,28 @@ class Barrier(Avoidance, frozen=True):
         wanted_x, wanted_y = a, b
         if own.by_position:
             wanted_x, wanted_y = own.response * (a - here_x), own.response * (b - here_y)
-        if not barred(wanted_x, wanted_y, near):
+        worst = most_violated(wanted_x, wanted_y, near)
+        if worst < 0:
             return setpoint
-        x, y = self.nearest(wanted_x, wanted_y, own, near)
+        x, y = self.nearest(wanted_x, wanted_y, worst, own, near)
         if own.by_position:
             x, y = here_x + x / own.response, here_y + y / own.response
         return x, y, c, d
 
-    def nearest(self, x: float, y: float, own: OwnState, near: Nearby) -> Planar:
-        """The velocity nearest to a wanted one x, y [m/s] that the half-planes of the things allow, which bar it."""
-        worst = -1
+    def set_planes(self, own: OwnState, near: Nearby, share: float) -> None:
+        """Measure all things, and set their half-planes; this `share` of α is used toward robots."""
         for k in range(near.count):
-            thing = near.things[k]
-            thing.counts = thing.bound < own.speed or thing.excess > SLACK
-            if thing.counts and (worst < 0 or thing.excess > near.things[worst].excess):
-                worst = k
-        thing = near.things[worst]  # what bars most
-        side_x, side_y = self.evasion(thing, own)
-        give = clamp(thing.excess, 0.0, own.speed)
-        x, y = x + give * side_x, y + give * side_y
-        x, y = closest(x, y, near, tightest(near))
-        return scaled(x, y, own.speed, near)
+            thing, plane = near.things[k], near.planes[k]
+            measure(own, thing)
+            plane.x, plane.y = -thing.away_x, -thing.away_y
+            plane.b = self.bound(thing, share if thing.is_robot else 1.0)
+
+    def nearest(self, x: float, y: float, worst: int, own: OwnState, near: Nearby) -> Planar:
+        """The velocity nearest to a wanted one x, y [m/s] that the half-planes allow, of which `worst` bars it most."""
+        plane = near.planes[worst]
+        side_x, side_y = self.evasion(near.things[worst], own)
+        give = clamp(plane.x * x + plane.y * y - plane.b, 0.0, own.speed)
+        return closest(x + give * side_x, y + give * side_y, own.speed, near)
 
     def evasion(self, thing: Thing, own: OwnState) -> Planar:
         """Evasion per m/s that a thing bars: to the right, seen toward the thing.
@@ -137,14 +138,15 @@ class Barrier(Avoidance, frozen=True):
         return share * y, -share * x
 
 
-def barred(x: float, y: float, near: Nearby) -> bool:
-    """Whether a half-plane bars the velocity x, y [m/s]; sets `excess` of the things."""
-    any_bars = False
+def most_violated(x: float, y: float, near: Nearby) -> int:
+    """The half-plane that bars the velocity x, y [m/s] most; -1: none does."""
+    worst, most, planes = -1, SLACK, near.planes
     for k in range(near.count):
-        thing = near.things[k]
-        thing.excess = -(thing.away_x * x + thing.away_y * y) - thing.bound
-        any_bars = any_bars or thing.excess > SLACK
-    return any_bars
+        plane = planes[k]
+        over = plane.x * x + plane.y * y - plane.b
+        if over > most:
+            worst, most = k, over
+    return worst
 
 
 def along_heading(v: float, own: OwnState, near: Nearby) -> float:
@@ -152,8 +154,8 @@ def along_heading(v: float, own: OwnState, near: Nearby) -> float:
     head_x, head_y = cos(own.yaw), sin(own.yaw)
     high, low, any_bars = inf, -inf, False
     for k in range(near.count):
-        thing = near.things[k]
-        bound, gain = thing.bound, -(thing.away_x * head_x + thing.away_y * head_y)
+        plane = near.planes[k]
+        bound, gain = plane.b, plane.x * head_x + plane.y * head_y
         any_bars = any_bars or gain * v > bound + SLACK
         # where standing still is allowed the limit is exact; where it is not, a robot that stands broadside to what it
         # should flee from must not be driven at full speed for next to nothing
@@ -171,105 +173,84 @@ def along_heading(v: float, own: OwnState, near: Nearby) -> float:
     return clamp(clamp(v, low, high), -own.speed, own.speed)
 
 
-def tightest(near: Nearby) -> int:
-    """Set `planes` to the half-plane of the smallest bound in each sector; returns how many there are."""
-    count = 0
-    for sector in range(SECTORS + 1):  # exactly π falls into a sector of its own
-        best = -1
-        for k in range(near.count):
-            thing = near.things[k]
-            if thing.counts and sector_of(thing) == sector and (best < 0 or thing.bound < near.things[best].bound):
-                best = k
-        if best >= 0:
-            plane, thing = near.planes[count], near.things[best]
-            plane.x, plane.y, plane.b = -thing.away_x, -thing.away_y, thing.bound
-            count += 1
-    return count
+def closest(x: float, y: float, speed: float, near: Nearby) -> Planar:
+    """The velocity nearest to x, y [m/s] among those within `speed` that obey all half-planes.
 
-
-def sector_of(thing: Thing) -> int:
-    return floor((atan2(-thing.away_y, -thing.away_x) / pi + 1.0) * (0.5 * SECTORS))
-
-
-def closest(x: float, y: float, near: Nearby, count: int) -> Planar:
-    """The point nearest to x, y with a·u ≤ b for the first `count` planes.
-
-    The solution of this quadratic program is x, y itself, or its projection onto one line, or a corner of two: all are
-    tried. Where no point obeys all, the bounds are raised together by as little as makes one do.
+    If none obeys them, the one nearest among all velocities that do is made so much smaller that it keeps to `speed`.
+    If there is none at all, bounds below 0 are raised together by as little as makes one obey; the other half-planes
+    have standing still in common.
     """
-    found = candidate(x, y, near, count, 0.0)
-    if found[2] < inf:
-        return found[0], found[1]
-    found = candidate(x, y, near, count, least_violation(near, count) + SLACK)
-    if found[2] < inf:
-        return found[0], found[1]
-    return 0.0, 0.0  # two that nearly face each other may have no corner in reach
+    found_x, found_y, clash = solution(x, y, speed, near, 0.0)
+    if clash < 0.0:
+        return found_x, found_y
+    raised, rounds = 0.0, 0
+    found_x, found_y, clash = solution(x, y, inf, near, 0.0)
+    while clash >= 0.0:
+        raised, rounds = raised + clash + SLACK, rounds + 1
+        if rounds > ROUNDS:
+            return 0.0, 0.0  # absurd velocities, beyond the accuracy of numbers
+        found_x, found_y, clash = solution(x, y, inf, near, raised)
+    if raised > 0.0:
+        within_x, within_y, clash = solution(x, y, speed, near, raised)
+        if clash < 0.0:
+            return within_x, within_y
+    share = min(1.0, speed / max(sqrt(found_x * found_x + found_y * found_y), SLACK))
+    return found_x * share, found_y * share
 
 
-def candidate(x: float, y: float, near: Nearby, count: int, raised: float) -> Candidate:
-    """As `closest`, with all bounds `raised` [m/s]."""
-    planes = near.planes
-    best = better((x, y, inf), x, y, x, y, near, count, raised)
-    for k in range(count):
-        plane = planes[k]
-        over = max(plane.x * x + plane.y * y - (plane.b + raised), 0.0)
-        best = better(best, x - over * plane.x, y - over * plane.y, x, y, near, count, raised)
-    for i in range(count):
-        for j in range(i + 1, count):
-            first, second = planes[i], planes[j]
-            sine = first.x * second.y - first.y * second.x
-            if abs(sine) > PARALLEL:
-                b, c = first.b + raised, second.b + raised
-                corner_x, corner_y = (b * second.y - c * first.y) / sine, (first.x * c - second.x * b) / sine
-                best = better(best, corner_x, corner_y, x, y, near, count, raised)
-    return best
+def solution(x: float, y: float, speed: float, near: Nearby, raised: float) -> Solution:
+    """As `closest`, with bounds below 0 `raised` [m/s], or how much farther those that clash must be raised.
 
-
-def better(  # noqa: PLR0917 - numbers alone
-    best: Candidate, x: float, y: float, wanted_x: float, wanted_y: float, near: Nearby, count: int, raised: float
-) -> Candidate:
-    """The point x, y in place of the `best` so far if it obeys all planes and is nearer to what is wanted."""
-    off_x, off_y = x - wanted_x, y - wanted_y
-    cost = off_x * off_x + off_y * off_y
-    if not cost < best[2]:
-        return best
-    for k in range(count):
-        plane = near.planes[k]
-        if not x * plane.x + y * plane.y <= plane.b + raised + SLACK:
-            return best
-    return x, y, cost
-
-
-def least_violation(near: Nearby, count: int) -> float:
-    """How far all bounds must be raised so that a point obeys all of the first `count` planes [m/s].
-
-    By Helly's theorem three half-planes settle that: by −Σ λ b, where λ ≥ 0 are the weights (Σ λ = 1) with which their
-    normals cancel out; or two that face each other.
+    One half-plane after the other is added. If the nearest point so far does not obey it, then the new one lies on its
+    border, in the interval that those before it leave there (Seidel, Discrete & Computational Geometry 6, 1991).
     """
-    raised, planes = 0.0, near.planes
-    for i in range(count):
-        for j in range(i + 1, count):
-            p, q = planes[i], planes[j]
-            sine, cosine = p.x * q.y - p.y * q.x, p.x * q.x + p.y * q.y
-            if abs(sine) <= PARALLEL and cosine < 0.0:
-                raised = max(raised, -0.5 * (p.b + q.b))
-            for k in range(j + 1, count):
-                r = planes[k]
-                first, second = q.x * r.y - q.y * r.x, r.x * p.y - r.y * p.x
-                total = first + second + sine
-                agree = first >= 0.0 and second >= 0.0 and sine >= 0.0
-                agree = agree or (first <= 0.0 and second <= 0.0 and sine <= 0.0)
-                if agree and abs(total) > PARALLEL:
-                    raised = max(raised, -(first * p.b + second * q.b + sine * r.b) / total)
-    return raised
-
-
-def scaled(x: float, y: float, speed: float, near: Nearby) -> Planar:
-    """Velocity made so much smaller that it breaks no limit, and no half-plane that standing still obeys."""
-    share = least = min(1.0, speed / max(sqrt(x * x + y * y), SLACK))
+    planes, slack = near.planes, min(raised, SLACK)
+    share = min(1.0, speed / max(sqrt(x * x + y * y), SLACK))
+    u, v = x * share, y * share
     for k in range(near.count):
-        thing = near.things[k]
-        reached = -(thing.away_x * x + thing.away_y * y) * share
-        if thing.counts and reached > thing.bound + SLACK and thing.bound >= 0.0:
-            least = min(least, share * thing.bound / reached)
-    return x * least, y * least
+        plane = planes[k]
+        p, q = plane.x, plane.y
+        b = plane.b + (raised if plane.b < 0.0 else slack)
+        if not p * u + q * v > b + SLACK:
+            continue
+        if not abs(b) <= speed:
+            return u, v, 0.0
+        high = inf if speed == inf else sqrt((speed - b) * (speed + b))
+        low, above, below = -high, k, k
+        for j in range(k):
+            other = planes[j]
+            sine = p * other.y - q * other.x
+            # along the border of the new one, from the point nearest to 0
+            room = other.b + (raised if other.b < 0.0 else slack) - b * (p * other.x + q * other.y)
+            if sine > PARALLEL:
+                if room < high * sine:
+                    high, above = room / sine, j
+            elif sine < -PARALLEL:
+                if room < low * sine:
+                    low, below = room / sine, j
+            elif room < 0.0 and p * other.x + q * other.y < 0.0:
+                low, high, above, below = inf, -inf, j, j
+                break
+        if low > high:
+            return u, v, clash_of(plane, planes[below], planes[above], raised, slack)
+        along = clamp(p * y - q * x, low, high)
+        u, v = b * p - along * q, b * q + along * p
+    return u, v, -1.0
+
+
+def clash_of(first: Plane, second: Plane, third: Plane, raised: float, slack: float) -> float:
+    """How much farther the bounds below 0 must be raised so that three half-planes have a common point [m/s].
+
+    They have none if −Σ λ b > 0, where λ ≥ 0 are the weights with which their normals cancel out. Two that face each
+    other come as three, of which two are one.
+    """
+    a, b, c = 0.5, 0.25, 0.25
+    if second is not third:
+        a = max(third.x * second.y - third.y * second.x, 0.0)
+        b = max(first.x * third.y - first.y * third.x, 0.0)
+        c = max(second.x * first.y - second.y * first.x, 0.0)
+    over = -a * (first.b + (raised if first.b < 0.0 else slack))
+    over -= b * (second.b + (raised if second.b < 0.0 else slack))
+    over -= c * (third.b + (raised if third.b < 0.0 else slack))
+    soft = (a if first.b < 0.0 else 0.0) + (b if second.b < 0.0 else 0.0) + (c if third.b < 0.0 else 0.0)
+    return over / soft if over > 0.0 and soft > PARALLEL else 0.0

@@ -147,7 +147,7 @@ def _outcome(experiment: Experiment, log: Log) -> Outcome:
         apart = place[:, i] - place[:, j]
         over, up = norm(apart[:, :2]) - first.radius - second.radius, apart[:, 2]
         beside = (up < second.height) & (up > -first.height)
-        gap = min(gap, np.where(beside, over, np.inf).min())
+        gap = min(gap, over[beside].min(initial=np.inf))
     goals = {leg.robot: leg.plan["points"][-1] for leg in experiment.timeline if isinstance(leg.plan, dict)}
     missed = norm(place[-1, :, :2] - np.array([goals[name] for name in log.names])).max()
     return Outcome(*(np.array([each]) for each in (gap, missed, log.avoided.max() / log.ticks)))

@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
 from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
-from agents.plugins.avoidance import Nearby, measure
+from agents.plugins.avoidance import Nearby, Plane, measure
 from agents.plugins.barrier import Barrier, closest
 from tests.agents.things import NOTHING, near, own
 
-FEW = settings(max_examples=50)
+FEW, MANY = settings(max_examples=50), settings(max_examples=400, deadline=None)
+ROUNDING = 1e-7  # [m/s]
 BARRIER = Barrier()
-NUMBER, PLANE = st.floats(-1.5, 1.5), st.tuples(st.floats(-pi, pi), st.floats(-0.5, 1.0))
+# bearings that face each other or are alike, or differ enough for a test to know whether there is a common point
+BEARING = st.integers(-720, 720).map(lambda number: number * pi / 720)
+NUMBER, PLANE = st.floats(-1.5, 1.5), st.tuples(BEARING, st.floats(-0.5, 1.0))
 STILL = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -26,39 +30,135 @@ def planar(speeds):
 def all_of(*groups):
     """Things of several groups together."""
     together = near()
-    together.things = [thing for group in groups for thing in group.things]
+    together.things = [thing for group in groups for thing in group.things[: group.count]]
     together.count = len(together.things)
+    together.planes = [Plane() for _ in together.things]
     return together
 
 
 # ---------------------------------------------------------------- the quadratic program
 
 
-def nearest(wanted, planes):
+def nearest(wanted, planes, speed=inf):
     """Result of the program for half-planes, each an angle and a bound."""
     space = Nearby()
+    space.reserve(len(planes))
+    space.count = len(planes)
     for plane, (angle, bound) in zip(space.planes, planes, strict=False):
         plane.x, plane.y, plane.b = cos(angle), sin(angle), bound
-    return closest(*wanted, space, len(planes))
+    return closest(*wanted, speed, space)
 
 
 def violation(point, planes):
     return max(cos(angle) * point[0] + sin(angle) * point[1] - bound for angle, bound in planes)
 
 
-@FEW
-@given(st.lists(PLANE, min_size=1, max_size=8), st.tuples(st.floats(-1, 1), st.floats(-1, 1)))
-def test_nearest_point_obeys_all_half_planes(planes, wanted):
-    found = nearest(wanted, planes)
+def half_planes(planes):
     angle, bound = (np.array(column) for column in zip(*planes, strict=True))
-    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    grid = np.stack(np.meshgrid(*[np.linspace(-2, 2, 101)] * 2), axis=-1).reshape(-1, 2)
-    over = (grid @ normal.T - bound).max(axis=1)
-    if violation(found, planes) <= 1e-7:
-        allowed = grid[over <= 0.0]
-        assert not len(allowed) or dist(found, wanted) <= np.linalg.norm(allowed - wanted, axis=1).min() + 1e-9
-    else:  # not all can be kept: no point violates less
-        assert over.min() >= violation(found, planes) - 1e-6
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1), bound
+
+
+def least_speed(planes):
+    """Norm of the slowest velocity that obeys half-planes, by trying all corners and feet; infinite: there is none."""
+    normal, bound = half_planes(planes)
+    i, j = np.triu_indices(len(planes), 1)
+    sine = normal[i, 0] * normal[j, 1] - normal[i, 1] * normal[j, 0]
+    known = np.abs(sine) > 1e-6
+    i, j, sine = i[known], j[known], sine[known]
+    corner = np.stack([bound[i] * normal[j, 1] - bound[j] * normal[i, 1],
+                       bound[j] * normal[i, 0] - bound[i] * normal[j, 0]], axis=1) / sine[:, None]  # fmt: skip
+    points = np.concatenate([np.zeros((1, 2)), bound[:, None] * normal, corner])
+    allowed = (points @ normal.T <= bound + 1e-12 * (1.0 + np.abs(points).max(axis=1, keepdims=True))).all(axis=1)
+    return np.linalg.norm(points[allowed], axis=1).min(initial=inf)
+
+
+def least_violation(planes):
+    """Least of the largest violation of bounds below 0, while the others are obeyed [m/s]."""
+    normal, bound = half_planes(planes)
+    shared = -(bound < 0.0).astype(float)
+    found = linprog([0, 0, 1], np.column_stack([normal, shared]), bound, bounds=[(None, None)] * 2 + [(0, None)])
+    assert found.success
+    return found.fun
+
+
+def holds(found, planes, speed):
+    """What is promised of a velocity for half-planes and a limit of speed."""
+    assert hypot(*found) <= speed * (1.0 + 1e-12)
+    standing = [plane for plane in planes if plane[1] >= 0.0]
+    assert not standing or violation(found, standing) <= ROUNDING
+    slowest = least_speed(planes)
+    if slowest <= speed - ROUNDING:
+        assert violation(found, planes) <= ROUNDING
+    elif ROUNDING + speed < slowest < inf:  # too quick to flee from: every bound below 0 is kept by the same share
+        free = nearest(found, planes)
+        assert violation(free, planes) <= ROUNDING
+    elif slowest == inf and hypot(*found) < speed - ROUNDING:
+        assert violation(found, planes) <= least_violation(planes) + ROUNDING
+
+
+WANTED = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+
+
+@MANY
+@given(st.lists(PLANE, min_size=1, max_size=12), WANTED, st.floats(0.05, 2.0))
+def test_half_planes_are_obeyed_if_possible(planes, wanted, speed):
+    holds(nearest(wanted, planes, speed), planes, speed)
+
+
+@MANY
+@given(st.lists(PLANE, min_size=1, max_size=12), WANTED)
+def test_no_allowed_velocity_is_nearer(planes, wanted):
+    found = nearest(wanted, planes, 1.5)
+    normal, bound = half_planes(planes)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.5, 1.5, 101)] * 2), axis=-1).reshape(-1, 2)
+    grid = grid[(np.linalg.norm(grid, axis=1) <= 1.5) & (grid @ normal.T <= bound).all(axis=1)]
+    assert not len(grid) or dist(found, wanted) <= np.linalg.norm(grid - wanted, axis=1).min() + ROUNDING
+
+
+@MANY
+@given(st.lists(PLANE, min_size=1, max_size=12), WANTED)
+def test_least_violation_if_none_is_allowed(planes, wanted):
+    if least_speed(planes) == inf:
+        assert violation(nearest(wanted, planes), planes) <= least_violation(planes) + ROUNDING
+
+
+@given(st.floats(0.1, 1.0), st.floats(0.0, 3.0), st.floats(-pi, pi), WANTED)
+def test_fleeing_keeps_the_direction_at_full_speed(speed, beyond, angle, wanted):
+    """Something comes faster than the robot can flee: the share of the bound that its speed allows is kept."""
+    planes = [(angle, -speed - 0.01 - beyond)]
+    free, found = nearest(wanted, planes), nearest(wanted, planes, speed)
+    share = speed / hypot(*free)
+    assert found == pytest.approx((share * free[0], share * free[1]), abs=ROUNDING)
+    assert violation(found, [(angle, share * planes[0][1])]) <= ROUNDING
+
+
+MOVING = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+
+
+@MANY
+@given(st.lists(st.tuples(BEARING, st.floats(-0.05, 1.0), st.booleans(), MOVING), min_size=1, max_size=12), WANTED)
+def test_things_all_around_are_obeyed(scene, wanted):
+    here, reach = own(TELLO, (3.0, -2.0), velocity=(0.1, 0.2, 0.0)), TELLO.radius
+    things = all_of(
+        *(near((3.0 + (reach + gap) * cos(a), -2.0 + (reach + gap) * sin(a)),
+               velocity=velocity if robot else (0.0, 0.0), is_robot=robot, lag=0.3 * robot)
+          for a, gap, robot, velocity in scene)
+    )  # fmt: skip
+    u = BARRIER.restrain((*wanted, 0.0, 0.0), here, things)
+    planes = [(math.atan2(-thing.away_y, -thing.away_x), BARRIER.bound(thing, 1.0)) for thing in things.things]
+    if violation(wanted, planes) > 1e-9:
+        holds(u[:2], planes, TELLO.speed)
+    else:
+        assert u[:2] == wanted
+
+
+def test_two_in_one_sector_and_one_opposite():
+    reach = TELLO.radius
+    around = [(0.0, 0.0), (0.125, 0.0), (2.75, 0.125)]
+    things = near(*(((reach + gap) * cos(a), (reach + gap) * sin(a)) for a, gap in around))
+    u = BARRIER.restrain(STILL, own(TELLO, (0.0, 0.0)), things)
+    bounds = [BARRIER.bound(thing, 1.0) for thing in things.things]
+    assert violation(u[:2], [(angle, b) for (angle, _), b in zip(around, bounds, strict=True)]) <= ROUNDING
 
 
 def test_allowed_velocity_is_taken():
@@ -137,7 +237,6 @@ def test_wheels_back_off_and_stand_where_torn():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_things_in_all_directions_are_obeyed(seed):
-    """Of each sector the tightest half-plane counts: among many things around, it stands for the others."""
     rng, reach, here = np.random.default_rng(seed), TELLO.radius + 0.05, own(TELLO, (3.0, -2.0))
     for _ in range(10):
         around = zip(rng.uniform(-pi, pi, 30).tolist(), rng.uniform(0.0, 0.5, 30).tolist(), strict=True)

@@ -277,7 +277,9 @@ def test_predictor_and_planner_of_the_docs():
 def test_avoidance_of_the_docs_stops_short():
     own, near, avoidance = OwnState(), Nearby(), made("StopShort", gap=0.2)
     near.reserve(1)
-    near.add().x = 0.15
+    thing = near.add()
+    thing.x, thing.y = 0.15, 0.0
     assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (0.0, 0.0, 0.5)
-    near.count = 0  # what stands behind it is not near
+    near.count = 0
+    near.clear_rest(1)
     assert avoidance.deviate((1.0, 0.0, 0.5), own, near, 0.1) == (1.0, 0.0, 0.5)
