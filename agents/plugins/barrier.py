@@ -14,7 +14,7 @@ from agents.plugins.avoidance import Avoidance, Nearby, OwnState, Plane, Thing, 
 from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
-ROUNDS: Final = 32  # of raising bounds that clash; at most 9 were seen among 100,000 scenes
+ROUNDS: Final = 64  # of raising bounds that clash; 60,000 random scenes of up to 30 half-planes took 18 at most
 PARALLEL: Final = 1e-9  # sine of the angle below which two half-planes have no corner
 SKEW: Final = 0.2  # a robot on wheels hardly flees along a heading this far (its cosine) from broadside
 LEAST: Final = 1e-100  # to divide by: beyond any speed, and still a number
