@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, inf, isfinite, sin
+from math import cos, hypot, inf, isfinite, sin
 from typing import ClassVar, Final, NamedTuple
 
 from agents.body.interface import RangeScan
@@ -10,7 +10,7 @@ from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.situation import Situation
 from agents.network.validation import MAX_SPEED
-from agents.plugins.avoidance import Avoidance, Nearby, OwnState
+from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState
 from agents.vectors import Vector, clamp, is_finite
 
 REACH: Final = 3.0  # [m] between axes; farther things are ignored
@@ -40,6 +40,8 @@ class Perception:
     __slots__ = (
         "_clearance",
         "_height",
+        "_horizon",
+        "_in_time",
         "_link_silence_s",
         "_links",
         "_own_silence_s",
@@ -73,6 +75,8 @@ class Perception:
         own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
+        self._horizon = kind.radius + self.avoidance.horizon(own)  # from the own axis [m]
+        self._in_time = self._horizon + HURRY * own.speed * SCAN_S  # what comes within the horizon before it is old
         self._scan: RangeScan | None = None
         self.sees = False
         self._points: list[Point] = []
@@ -112,11 +116,15 @@ class Perception:
 
     def _add_robot(self, t: float, here: Vector, sender: Neighbour) -> None:
         """Add a received robot that is near; a lost one stays at its last received place."""
-        age = max(t - sender.stamp, 0.0)
-        ahead = min(age, AHEAD_S)
+        age = t - sender.stamp
+        ahead = 0.0 if age < 0.0 else AHEAD_S if age > AHEAD_S else age
         (x, y, z), (vx, vy, vz) = sender.position, sender.velocity
-        x, y, z = x + vx * ahead, y + vy * ahead, z + vz * ahead
-        off_x, off_y, up = here[0] - x, here[1] - y, here[2] - z
+        x = x + vx * ahead
+        off_x = here[0] - x
+        if not abs(off_x) <= REACH:  # most of a large company
+            return
+        y, z = y + vy * ahead, z + vz * ahead
+        off_y, up = here[1] - y, here[2] - z
         if not off_x * off_x + off_y * off_y <= REACH * REACH:
             return
         # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
@@ -141,34 +149,41 @@ class Perception:
         then = clamp(now.state.time - scan.time, 0.0, SCAN_S)
         vx, vy, vz = (each if isfinite(each) else 0.0 for each in now.velocity)
         x, y, z = now.position[0] - vx * then, now.position[1] - vy * then, now.position[2] - vz * then
+        # those of which a point can be; never received: NaN
+        close = [each for each in neighbours.all if _apart(each, now.position) <= REACH + 1.0]
+        farthest = min(REACH, self._in_time)
         for bearing, elevation, far in zip(scan.bearing, scan.elevation, scan.distance, strict=True):
             # NaN: nothing was hit; nothing is inside the robot either
             if not (INSIDE * self._radius < far <= REACH and isfinite(bearing) and isfinite(elevation)):
                 continue
             flat = cos(elevation)
-            if flat > STEEP:
+            if flat > STEEP and far * flat <= farthest:
                 out, toward = far * flat, now.yaw + bearing
                 height = z + 0.5 * self._height + far * sin(elevation)
                 point = Point(x + out * cos(toward), y + out * sin(toward), height, far)
-                if not any(_lies_on(point, sender, scan.time, now.position) for sender in neighbours.all):
+                if not any(_lies_on(point, sender, scan.time) for sender in close):
                     self._points.append(point)
 
     def _add_points(self, here: Vector) -> None:
+        low, high, near_x, near_y = -self._clearance, self._height + self._clearance, here[0], here[1]
+        squared = self._horizon * self._horizon
         for point in self._points:
-            up = point.height - here[2]
-            if up < self._height + self._clearance and up > -self._clearance:
+            off_x, off_y, up = point.x - near_x, point.y - near_y, point.height - here[2]
+            if low < up < high and off_x * off_x + off_y * off_y <= squared:
                 thing = self.near.add()
                 thing.x, thing.y, thing.low, thing.high = point.x, point.y, point.height, point.height
                 thing.velocity_x = thing.velocity_y = thing.radius = thing.lag = 0.0
                 thing.is_robot = False
 
 
-def _lies_on(point: Point, sender: Neighbour, time: float, here: Vector) -> bool:
-    """Whether a point that was measured at `time` [s] by a robot at `here` [m] lies on a received robot."""
+def _apart(sender: Neighbour, here: Vector) -> float:
+    """Horizontal distance from the last received place of a robot [m]; NaN before the first."""
+    return hypot(sender.position[0] - here[0], sender.position[1] - here[1])
+
+
+def _lies_on(point: Point, sender: Neighbour, time: float) -> bool:
+    """Whether a point that was measured at `time` [s] lies on a received robot."""
     (x, y, z), (vx, vy, vz) = sender.position, sender.velocity
-    off_x, off_y = x - here[0], y - here[1]
-    if not off_x * off_x + off_y * off_y <= (REACH + 1.0) * (REACH + 1.0):  # never received: NaN
-        return False
     late = clamp(time - sender.stamp, 0.0, AHEAD_S)
     off_x, off_y, up = point.x - (x + vx * late), point.y - (y + vy * late), point.height - (z + vz * late)
     outline = sender.radius + OUTLINE + OUTLINE_SHARE * point.distance

@@ -20,6 +20,7 @@ COINCIDENT: Final = 1e-6  # [m] axes nearer than this have no direction
 TOUCHING: Final = 1e-3  # [m] smallest gap in a force: forces stay finite
 LAYER: Final = 0.05  # [m] depth within d0 in which the push of a thing grows to its full size
 ASIDE: Final = 0.1  # of the pull against a push: the step aside
+HURRY: Final = 2.0  # times its limit of speed: no robot is faster, not along the diagonal of limits per axis either
 
 
 class Thing:
@@ -138,8 +139,9 @@ def measure(own: OwnState, thing: Thing) -> None:
     if not apart > COINCIDENT:
         x, y, apart = COINCIDENT, 0.0, max(apart, COINCIDENT)
     x, y = x / apart, y / apart
-    coming = max(x * thing.velocity_x + y * thing.velocity_y, 0.0)
-    going = max(-(x * own.velocity[0] + y * own.velocity[1]), 0.0)
+    going, coming = -(x * own.velocity[0] + y * own.velocity[1]), x * thing.velocity_x + y * thing.velocity_y
+    going = max(going, 0.0)
+    coming = max(coming, 0.0)
     thing.away_x, thing.away_y = x, y
     thing.gap = apart - own.radius - thing.radius - (own.lag * going + thing.lag * coming)
 
@@ -155,6 +157,13 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         NotNegative,
         Meta(description="things farther above or below than this are ignored [m]; more against downwash"),
     ] = 0.1
+
+    def horizon(self, own: OwnState) -> float:
+        """Distance between surfaces beyond which a thing at rest changes nothing [m]; its range readings are left out.
+
+        Asked once, with the properties of the robot; infinite unless an avoidance says less.
+        """
+        return inf
 
     def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
         """Goal [m] to pursue in place of `goal` [m]; called every `period` [s]."""
@@ -183,6 +192,9 @@ class Potential(Avoidance, frozen=True):
     strength: Annotated[Positive, Meta(description="η [N m³], of all forces alike")] = 1.5e-4
     velocity: Annotated[Positive, Meta(description="v [m/s]; left out: the robot's limit of speed")] = inf
     period_s: Annotated[NotNegative, Meta(description="h [s]; 0: 1/response of the robot's kind")] = 0.0
+
+    def horizon(self, own: OwnState) -> float:
+        return self.reach + own.lag * HURRY * own.speed
 
     def push(self, gap: float) -> float:
         """Force of a thing at a distance of `gap` [m] between surfaces [N]."""

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
-from agents.plugins.avoidance import Avoidance, Nearby, OwnState, Plane, Thing, measure
+from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState, Plane, Thing, measure
 from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
@@ -66,12 +66,17 @@ class Barrier(Avoidance, frozen=True):
         NotNegative, Meta(description="share of the barred velocity that is driven to the right instead")
     ] = 1.0
 
+    def horizon(self, own: OwnState) -> float:
+        """Beyond it b is greater than any speed."""
+        return self.margin + (own.lag + 2.0 / self.alpha) * HURRY * own.speed
+
     def bound(self, thing: Thing, share: float) -> float:
         """b [m/s] of the half-plane −n·u ≤ b that a measured thing asks for, if this `share` of α is used."""
         left = thing.gap - self.margin
-        coming = max(thing.away_x * thing.velocity_x + thing.away_y * thing.velocity_y, 0.0)
         used = self.alpha * share * left
-        return min(0.5 * used if left > 0.0 else used, used - coming)
+        half = 0.5 * used if left > 0.0 else used
+        coming = thing.away_x * thing.velocity_x + thing.away_y * thing.velocity_y
+        return used - coming if coming > 0.0 and used - coming < half else half
 
     def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
         """Steer a robot that cannot move sideways."""
@@ -108,12 +113,16 @@ class Barrier(Avoidance, frozen=True):
         return x, y, c, d
 
     def set_planes(self, own: OwnState, near: Nearby, share: float) -> None:
-        """Measure all things, and set their half-planes; this `share` of α is used toward robots."""
+        """Measure all things, and set their half-planes; this `share` of α is used toward robots.
+
+        A bound that no speed of the robot reaches is none.
+        """
         for k in range(near.count):
             thing, plane = near.things[k], near.planes[k]
             measure(own, thing)
             plane.x, plane.y = -thing.away_x, -thing.away_y
-            plane.b = self.bound(thing, share if thing.is_robot else 1.0)
+            bound = self.bound(thing, share if thing.is_robot else 1.0)
+            plane.b = bound if bound < HURRY * own.speed else inf
 
     def nearest(self, x: float, y: float, worst: int, own: OwnState, near: Nearby) -> Planar:
         """The velocity nearest to a wanted one x, y [m/s] that the half-planes allow, of which `worst` bars it most."""

@@ -1,12 +1,14 @@
 """Every registered plug-in, a user's too: a robot decides the same alone and in company, and bears losses."""
 
 from dataclasses import replace
-from math import cos, isfinite, nan, sin
+from math import cos, isfinite, nan, pi, sin
+from random import Random
 
 import msgspec
 import pytest
 
 from agents.body.interface import RangeScan
+from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
@@ -16,6 +18,7 @@ from agents.vectors import UNKNOWN
 from experiments.definition.plan import Plan
 from tests.agents.bench import Bench
 from tests.agents.few import triangle
+from tests.agents.things import near, own
 
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
@@ -148,3 +151,32 @@ def test_losses_restarts_and_unknown_positions(group, name):
     bench.step(0.3, watched)
     assert len(setpoints) > 300
     assert all(isfinite(number) for setpoint in setpoints[1:] for number in setpoint)
+
+
+def turned(random, distance):
+    """A place at a distance from 0 [m]."""
+    angle = random.uniform(-pi, pi)
+    return distance * cos(angle), distance * sin(angle)
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
+@pytest.mark.parametrize("name", registry.names(AVOIDANCES))
+def test_readings_beyond_the_horizon_change_nothing(name, kind):
+    """Range readings there are left out."""
+    avoidance, random, acted = made(AVOIDANCES, name), Random(7), 0
+    for _ in range(300):
+        speed = kind.speed
+        velocity = (random.uniform(-speed, speed), random.uniform(-speed, speed), 0.0)
+        here = own(kind, (0.0, 0.0), yaw=random.uniform(-pi, pi), velocity=velocity)
+        horizon = min(kind.radius + avoidance.horizon(here), 1e3)
+        close = [turned(random, random.uniform(kind.radius, horizon)) for _ in range(3)]
+        far = [turned(random, horizon * random.uniform(1.0 + 1e-9, 1.2)) for _ in range(30)]
+        goal = (random.uniform(-1.0, 1.0), random.uniform(-1.0, 1.0), 0.5)
+        reach = 1.0 / kind.response if kind.takes == "position" else 1.0
+        setpoint = (random.uniform(-speed, speed) * reach, random.uniform(-speed, speed) * reach, 0.0, 0.0)
+        alone, together = near(*close), near(*close, *far)
+        assert avoidance.deviate(goal, here, together, 0.01) == avoidance.deviate(goal, here, alone, 0.01)
+        restrained = avoidance.restrain(setpoint, here, alone)
+        assert avoidance.restrain(setpoint, here, together) == restrained
+        acted += restrained != setpoint or avoidance.deviate(goal, here, alone, 0.01) != goal
+    assert acted > 10
