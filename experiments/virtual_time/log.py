@@ -345,7 +345,7 @@ class Logbook:
         yield self._experiment.duration_s, "phase", "conductor", "landing"
 
 
-def _known(value: Any) -> Any:
+def _known(value: float | list[float]) -> float | tuple[float, ...] | None:
     """A value in the form of messages: a tuple or a number; None if it is NaN."""
     if isinstance(value, list):
         return None if math.isnan(value[0]) else tuple(value)
