@@ -218,7 +218,7 @@ class Logbook:
                         messages.vector(truth[row]),
                         messages.heading(true_yaw[row]),
                         received.get((k, row), []),
-                        **{what: _known(each[row]) for what, each in zip(known, more, strict=True)},
+                        **_known(known, [each[row] for each in more]),
                         goal_receipts=receipts.get((k, row), []),
                     )
                     for row, name in enumerate(log.names)
@@ -345,8 +345,10 @@ class Logbook:
         yield self._experiment.duration_s, "phase", "conductor", "landing"
 
 
-def _known(value: float | list[float]) -> float | tuple[float, ...] | None:
-    """A value in the form of messages: a tuple or a number; None if it is NaN."""
-    if isinstance(value, list):
-        return None if math.isnan(value[0]) else tuple(value)
-    return None if math.isnan(value) else value
+def _known(names: Iterable[str], values: Iterable[float | list[float]]) -> dict[str, Any]:
+    """Values in the form of messages, by name: a tuple or a number; None if it is NaN."""
+    found: dict[str, Any] = {}
+    for name, value in zip(names, values, strict=True):
+        first = value[0] if isinstance(value, list) else value
+        found[name] = None if math.isnan(first) else tuple(value) if isinstance(value, list) else value
+    return found
