@@ -11,6 +11,8 @@ from agents.decision.neighbours import Neighbour, Neighbours
 from agents.decision.situation import Situation
 from agents.network.validation import MAX_SPEED
 from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState
+from agents.plugins.calls import failure, wrong
+from agents.plugins.registry import FAILURES
 from agents.vectors import Vector, clamp, is_finite
 
 REACH: Final = 3.0  # [m] between axes; farther things are ignored
@@ -75,7 +77,7 @@ class Perception:
         own.speed, own.response, own.lag = min(kind.speed, limits.top_speed), kind.response, kind.lag
         own.by_position, own.by_twist = kind.takes == "position", kind.takes == "twist"
         own.flies = kind.flies
-        self._horizon = kind.radius + self.avoidance.horizon(own)  # from the own axis [m]
+        self._horizon = kind.radius + _horizon(self.avoidance, own)  # from the own axis [m]
         self._in_time = self._horizon + HURRY * own.speed * SCAN_S  # what comes within the horizon before it is old
         self._scan: RangeScan | None = None
         self.sees = False
@@ -174,6 +176,17 @@ class Perception:
                 thing.x, thing.y, thing.low, thing.high = point.x, point.y, point.height, point.height
                 thing.velocity_x = thing.velocity_y = thing.radius = thing.lag = 0.0
                 thing.is_robot = False
+
+
+def _horizon(avoidance: Avoidance, own: OwnState) -> float:
+    """Horizon of an avoidance [m]. Raises PluginError if there is none: readings must not be left out by mistake."""
+    try:
+        horizon = avoidance.horizon(own)
+    except FAILURES as error:
+        raise failure("avoidance", avoidance, error) from error
+    if not (isinstance(horizon, float | int) and horizon >= 0.0):
+        raise wrong("avoidance", avoidance, "horizon", horizon, "a distance of 0 m or more")
+    return horizon
 
 
 def _apart(sender: Neighbour, here: Vector) -> float:

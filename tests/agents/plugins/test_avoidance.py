@@ -1,5 +1,6 @@
 """The potential of the paper, and avoidances in the decision of a robot."""
 
+import math
 import re
 from dataclasses import replace
 from math import isfinite, sqrt
@@ -116,6 +117,11 @@ class Broken(Avoidance, frozen=True):
 
     way: str
 
+    def horizon(self, own):
+        if self.way == "horizon fails":
+            raise KeyError("own")
+        return {"horizon nan": math.nan, "horizon nothing": None}.get(self.way, math.inf)
+
     def deviate(self, goal, own, near, period):
         if self.way == "deviate fails":
             raise KeyError("goal")
@@ -142,6 +148,9 @@ class Broken(Avoidance, frozen=True):
         ("restrain nothing", r"`restrain` of the avoidance Broken must give four numbers, not nothing: is a `return` "),
         ("restrain words", "`restrain` of the avoidance Broken must give four numbers"),
         ("restrain shape", "`restrain` of the avoidance Broken"),
+        ("horizon fails", r"the avoidance Broken failed: KeyError: 'own' \(.*test_avoidance\.py:\d+\)$"),
+        ("horizon nan", "`horizon` of the avoidance Broken must give a distance of 0 m or more, not nan"),
+        ("horizon nothing", "`horizon` of the avoidance Broken must give a distance"),
     ],
 )
 def test_mistake_in_an_avoidance_is_named(way, says):
