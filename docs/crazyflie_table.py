@@ -10,7 +10,7 @@ from math import factorial, pi
 
 import numpy as np
 
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from twins.arrays import Array
 from twins.devices.crazyflie.flock import LOST, Estimator
 from twins.devices.crazyflie.planner import ORDER, Planner, evaluate, polynomial

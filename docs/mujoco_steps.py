@@ -8,13 +8,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from experiments.report.style import CASES, STYLE
 from twins.arrays import Array
 from twins.engines.engine import Engine, Stage
 from twins.engines.mujoco_engine import RigidBody
 from twins.engines.point_mass import PointMass
-from twins.models.quadrotor import RESPONSES
 from twins.scene import Scene
 
 DT, SECONDS, HEIGHT = 0.01, 4.0, 1.0
@@ -47,7 +46,7 @@ def figures(path: Array, step: float) -> tuple[float, float]:
 def main() -> None:
     """Both."""
     one = Stage((CRAZYFLIE,), [(0.0, 0.0, 0.0)], [0.0], DT, [False], Scene.empty())
-    print(f"law: {RESPONSES['crazyflie']}")
+    print(f"law: {CRAZYFLIE.motion}")
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 1.9), layout="constrained")
         panels = iter(figure.subplots(1, 4))

@@ -21,6 +21,7 @@ agents.clock agents.ticks agents.user_folder
 agents.formation agents.network
 agents.plugins
 agents.body
+agents.kinds
 agents.decision agents.protocols
 agents.safety
 agents.robot

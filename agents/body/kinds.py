@@ -1,88 +1,189 @@
-"""The kinds of robots: size, limits, and which setpoint they take (figures: reference sheets of the makers)."""
+"""The kinds of robots: size, limits, the setpoint that they take, and all that the project knows of one kind alone.
+
+A kind is a `Kind`, found by the entry-point group `zenpark.kinds`; those that come along live in `agents.kinds`.
+"""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import Final, Literal
 
+import msgspec
+
+from agents.plugins import registry
+from agents.plugins.registry import PluginError, UnknownPlugin
+from agents.vectors import Vector
+
 Takes = Literal["position", "velocity", "twist"]
+
+
+@dataclass(frozen=True)
+class Wheels:
+    """Two driven wheels."""
+
+    base: float  # distance between the wheels [m]
+    speed: float  # largest rim speed [m/s]
+    acceleration: float  # largest, of the rim [m/s²]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Closed loop of a quadrotor on board, for x, y and z."""
+
+    position: Vector  # gains [1/s]
+    velocity: Vector  # gains [1/s]
+    speed: Vector  # limits [m/s]
+    # rate at which the acceleration follows, because the quadrotor must tilt first [1/s]; inf: at once
+    tilt: Vector
+
+
+Motion = Wheels | Flight
+
+
+@dataclass(frozen=True)
+class Airframe:
+    """Rigid quadrotor with motors at 45° to its nose."""
+
+    mass: float  # [kg]
+    inertia: tuple[float, float, float]  # about its own x, y, z [kg m²]
+    arm: float  # from the centre to a motor [m]
+    thrust: float  # of a motor at full command [N]
+    torque: float  # of a motor about its axis, per thrust [m]
+    size: tuple[float, float, float]  # of the collision box [m]
+
+    def scaled(self, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
+        """Scale a design: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
+        heavier, longer = mass / self.mass, arm / self.arm
+        x, y, z = (each * heavier * longer**2 for each in self.inertia)
+        return Airframe(mass, (x, y, z), arm, self.thrust * heavier, self.torque * longer, size)
+
+
+@dataclass(frozen=True)
+class ProtocolTwin:
+    """What `--bodies protocol` makes of a robot."""
+
+    body: str  # of the group `zenpark.devices`
+    process: str | None = None  # that the robots of a kind share, if one link carries several
+    position: Literal["body", "external"] = "external"  # source of its position
+    device: Mapping[str, object] = field(default_factory=dict, hash=False)  # settings on top of those of the file
+
+
+class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Steering of a kind that takes twists and does not turn like two wheels; `twist` is quiet."""
+
+    def twist(  # noqa: PLR0917 - numbers alone, as `agents.decision.position_control.drive`
+        self,
+        x: float,
+        y: float,
+        yaw: float,
+        goal_yaw: float,
+        response: float,
+        turn_response: float,
+        speed: float,
+        turn_rate: float,
+    ) -> tuple[float, float]:
+        """Linear [m/s] and angular speed [rad/s] toward a goal that is x, y [m] away, and there to `goal_yaw` [rad].
+
+        `yaw` is measured [rad], `goal_yaw` NaN for any; the rates `response` and `turn_response` [1/s] and the limits
+        `speed` [m/s] and `turn_rate` [rad/s] are those of the kind.
+        """
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Kind:
     """Kind of robot."""
 
-    name: str  # as in the experiment file
+    name: str  # as in the experiment file, and as registered
     takes: Takes  # the setpoint that its body takes
     flies: bool  # takes off and lands
     radius: float  # horizontal half-size [m]
     height: float  # vertical size [m]; a position is that of the lowest point, so a body reaches from z to z + height
     mass: float  # ready to fly, with battery and decks [kg]
     endurance_s: float  # with a full battery, maker's figure
-    speed: float  # largest speed [m/s]; per axis for flying robots
+    speed: float  # largest speed [m/s]; per axis for robots that take velocities or fly
     turn_rate: float  # largest yaw rate [rad/s]
     response: float  # rate at which its position controller closes a position error [1/s]
     turn_response: float  # rate at which it closes a yaw error [1/s]
     # time constant with which its velocity follows what is commanded [s]
     lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
     overshoot: float = 0.0  # of a take-off of the real robot, share of its height, at most
+    motion: Motion | None = None  # of its twin; None: it has no twin
+    sensors: tuple[str, ...] = ()  # range sensors that each has, see `twins.sensing.range_sensors.SENSORS`
+    airframe: Airframe | None = None  # for the engine mujoco; None: that engine refuses it
+    # how it is known
+    aliases: tuple[str, ...] = ()  # parts of names by which importers know it
+    prefix: str = "R"  # of the names of its robots in generated experiments
+    colour: str = "#7a7a7a"  # in figures of many robots
+    mesh: str = (
+        ""  # its picture, a `module:function` from a kind to a `experiments.scene.models.Model`; "": by its size
+    )
+    # hardware
+    bodies: tuple[str, ...] = ()  # of the group `zenpark.bodies` that drive this kind only
+    library: str = ""  # that those need
+    twin: ProtocolTwin | None = None
+    connect: str = ""  # remedy for a robot that does not answer
+    charge: str = "charge it"  # remedy for an empty battery
+    locks: bool = False  # an emergency stop locks it until it is switched off and on
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a number that no robot has."""
+        positive = ("radius", "height", "mass", "endurance_s", "speed", "turn_rate", "response", "turn_response")
+        for name in positive:
+            if not (isfinite(value := getattr(self, name)) and value > 0.0):
+                raise ValueError(f"{name} of the kind {self.name!r} is {value!r}: give a positive number")
+        if not 0.0 <= self.lag < inf:
+            raise ValueError(f"lag of the kind {self.name!r} is {self.lag!r}: give seconds, not negative")
+        if self.flies == (self.takes == "twist"):
+            if self.flies:
+                raise ValueError(f"the kind {self.name!r} flies: let it take positions or velocities")
+        elif self.takes == "position" and not self.flies:
+            raise ValueError(f"the kind {self.name!r} drives: let it take velocities or twists")
 
 
-CRAZYFLIE: Final = Kind(
-    "crazyflie",
-    "position",
-    flies=True,
-    radius=0.065,
-    height=0.029,
-    mass=0.029,  # with a deck for its position: the maker's 27 g of a 2.1 are those of a bare one
-    endurance_s=420.0,
-    speed=1.0,
-    turn_rate=10.0,  # that of a step of 3 rad under the firmware's yaw controller
-    response=2.0,  # position P of the firmware
-    turn_response=7.6,  # step response of the firmware's yaw controller
-    lag=0.4,  # velocity loop and tilt, 0.2 s each
-    overshoot=0.11,  # the firmware's height loop, of 27 to 36 g: 7 to 11 %, for 10 to 15 s
-)
-TELLO: Final = Kind(
-    "tello",
-    "velocity",
-    flies=True,
-    radius=0.10,
-    height=0.041,
-    mass=0.080,
-    endurance_s=780.0,
-    speed=1.0,  # rc 100
-    turn_rate=math.radians(100.0),
-    response=1.0,
-    turn_response=1.0,
-    lag=1.0 / 3.0,
-)
-KHEPERA4: Final = Kind(
-    "khepera4",
-    "twist",
-    flies=False,
-    radius=0.070,
-    height=0.058,
-    mass=0.540,
-    endurance_s=18000.0,
-    speed=0.2712,  # 400 units of 0.6781 mm/s, the cap of the paper's authors; the wheels could do three times that
-    turn_rate=2.0 * 0.2712 / 0.1054,
-    response=1.0,
-    turn_response=1.5,
-)
-TURTLEBOT3: Final = Kind(
-    "turtlebot3",
-    "twist",
-    flies=False,
-    radius=0.105,
-    height=0.192,
-    mass=1.0,
-    endurance_s=9000.0,
-    speed=0.22,
-    turn_rate=2.84,
-    response=1.0,
-    turn_response=1.5,
-)
+class Kinds(Mapping[str, Kind]):
+    """Kinds of robots by name; each is loaded when it is asked for."""
 
-KINDS: Final[dict[str, Kind]] = {kind.name: kind for kind in (CRAZYFLIE, TELLO, KHEPERA4, TURTLEBOT3)}
+    loaded: dict[str, Kind]
+
+    def __init__(self) -> None:
+        self.loaded = {}
+
+    def __getitem__(self, name: str) -> Kind:
+        """Raises KeyError if it is not installed, PluginError if it cannot be used."""
+        kind = self.loaded.get(name)
+        if kind is None:
+            try:
+                kind = registry.load(registry.ROBOTS, name)
+            except UnknownPlugin:
+                raise KeyError(name) from None
+            if not isinstance(kind, Kind) or kind.name != name:
+                found = f"the kind {kind.name!r}" if isinstance(kind, Kind) else f"a {type(kind).__name__}"
+                raise PluginError(f"plug-in {name!r} among the kinds is {found}: register a `Kind` under its own name")
+            self.loaded[name] = kind
+        return kind
+
+    def __contains__(self, name: object) -> bool:
+        """Whether it is installed; it may be broken."""
+        return name in self.loaded or name in registry.names(registry.ROBOTS)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted({*self.loaded, *registry.names(registry.ROBOTS)}))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def usable(self) -> list[Kind]:
+        """Those that can be used."""
+        found = []
+        for name in self:
+            try:
+                found.append(self[name])
+            except PluginError:
+                continue
+        return found
+
+
+KINDS: Final = Kinds()

@@ -1,8 +1,8 @@
-"""Registry of plug-ins: bodies, triggers, laws, planners, avoidances and engines, found through entry points.
+"""Registry of plug-ins, found through entry points: bodies, kinds, triggers, laws, planners, avoidances and engines.
 
 A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a class, made
-with a `agents.body.interface.BodyRequest`. Any distribution may add one, for example under
-`[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
+with a `agents.body.interface.BodyRequest`; a kind of robot is an object `agents.body.kinds.Kind`. Any distribution may
+add one, for example under `[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from agents.plugins.predictors import Predictor
 from agents.plugins.triggers import Trigger
 
 BODIES: Final = "zenpark.bodies"
+ROBOTS: Final = "zenpark.kinds"  # kinds of robots
 TRIGGERS: Final = "zenpark.triggers"
 LAWS: Final = "zenpark.laws"
 PREDICTORS: Final = "zenpark.predictors"
@@ -31,6 +32,7 @@ PLANNERS: Final = "zenpark.planners"
 AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
 STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
+CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
 BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Gradient, AVOIDANCES: Avoidance}
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
@@ -85,15 +87,23 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
 
 
 def unusable(use: Callable[[str, str], object]) -> list[str]:
-    """Why registered plug-ins with parameters cannot be used: a line for each that `use(group, name)` refuses."""
+    """Why what a file may name cannot be used: a line for each plug-in that `use(group, name)` refuses."""
     lines = []
-    for group in STRUCTS:
+    for group in CHOSEN:
         for name in names(group):
             try:
                 use(group, name)
             except PluginError as error:
                 lines.append(f"left out: {' '.join(str(error).split())}; mend or uninstall it (docs/plugins.md)")
     return lines
+
+
+def find(path: str, what: str) -> Any:  # noqa: ANN401 - likewise
+    """The object at a `path`, `module:name`; raises PluginError, with `what` it is, if it cannot be had."""
+    try:
+        return EntryPoint(what, path, "").load()
+    except _IMPORT_FAILURES as error:
+        raise PluginError(f"{what} ({path}) fails to import: {type(error).__name__}: {error}") from error
 
 
 def struct(group: str, name: str) -> type[msgspec.Struct]:
@@ -159,7 +169,7 @@ def distributions(text: str | None = None) -> dict[str, str]:
 
 def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
-    entries = (entry for group in (BODIES, DEVICES, *STRUCTS) for entry in _installed().select(group=group))
+    entries = (entry for group in (BODIES, DEVICES, *CHOSEN) for entry in _installed().select(group=group))
     return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
 
 

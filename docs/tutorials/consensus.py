@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.body.kinds import TELLO
+from agents.kinds.tello import TELLO
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import bearable_factors, closed_shares
 from experiments.check.realisation import algebraic_connectivity

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import closed_shares
 from experiments.definition.rigidity import rigid_motions, rigidity, rigidity_matrix

@@ -19,7 +19,6 @@ from experiments.file import catalogue as entries
 from experiments.file.problems import refusal
 from twins.arrays import Array, norm
 
-PREFIX: Final = {"crazyflie": "CF", "tello": "DT", "khepera4": "KH", "turtlebot3": "TB"}
 LAWS: Final = ("distance", "displacement")
 HOVER: Final = 0.8  # [m] of flying robots in a plane
 ROOM: Final = 0.5  # [m] around the formation, on all sides and above
@@ -91,7 +90,7 @@ def experiment_file(made: Layout, wanted: LayoutOptions) -> str:
         )
     scatter = round(FREE * wanted.spacing, 3) if wanted.scatter is None else wanted.scatter
     digits = max(2, len(str(len(made))))
-    names = [f"{PREFIX.get(kind.name, 'R')}{number:0{digits}d}" for number in range(1, len(made) + 1)]
+    names = [f"{kind.prefix}{number:0{digits}d}" for number in range(1, len(made) + 1)]
     size = _arena(position, kind, scatter)
     width = max(len(f"{x:.3f}, {y:.3f}") for x, y in position[:, :2])
     robots = []

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from agents.body.kinds import Kind
+from agents.body.kinds import Flight, Kind
 from agents.safety.hazards import Incident, Outcome
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, World
@@ -24,7 +24,6 @@ from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation
 from twins.arrays import Array, norm
-from twins.models.quadrotor import RESPONSES, Response
 
 FAR: Final = 1e6  # [m] walls that no robot meets
 WORK: Final = 2.2e5  # robot ticks that are flown, of 10 to 20 µs each: 310 s of seven robots, 2 s of a thousand
@@ -60,13 +59,13 @@ def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
     it must tilt first, and bears less.
     """
     factor = 2.0 / closed_shares(kinds, hz)
-    drones = {kind.name for kind in kinds} & RESPONSES.keys()
-    for name in drones:
-        factor[[kind.name == name for kind in kinds]] = _bearable_factor(RESPONSES[name], hz)
+    drones = {kind.name: kind.motion for kind in kinds if isinstance(kind.motion, Flight)}
+    for name, flight in drones.items():
+        factor[[kind.name == name for kind in kinds]] = _bearable_factor(flight, hz)
     return factor
 
 
-def linear_step(response: Response, axis: int, dt: float) -> Array:
+def linear_step(response: Flight, axis: int, dt: float) -> Array:
     """Step (4, 4) of a `Quadrotor` within its limits, of position [m], velocity [m/s], its change in a step, goal."""
     tilt, gain = min(dt * response.tilt[axis], 1.0), dt * response.velocity[axis]
     pull = tilt * gain * response.position[axis]
@@ -77,7 +76,7 @@ def linear_step(response: Response, axis: int, dt: float) -> Array:
 
 
 @cache
-def _bearable_factor(response: Response, hz: float) -> float:
+def _bearable_factor(response: Flight, hz: float) -> float:
     steps = max(round(STEPS_HZ / hz), 1)
     period = np.linalg.matrix_power(linear_step(response, 0, 1.0 / (hz * steps)), steps)
 

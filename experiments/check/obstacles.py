@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
@@ -16,7 +17,6 @@ from experiments.recording.trace import finds_contacts
 from twins import scene as outlines
 from twins.arrays import Array, Index, Mask
 from twins.scene import Obstacle
-from twins.sensing.range_sensors import OF_KIND
 
 TWINS: Final = ("twin", WORLD)  # bodies that are simulated without the wire of a real one
 AVOID: Final = 'or let robots avoid it: [avoidance] with kind = "barrier"'
@@ -153,7 +153,7 @@ def reality(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _sensors(robot: Robot) -> tuple[str, ...]:
-    return OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
+    return KINDS[robot.kind].sensors if robot.sensors is None else tuple(robot.sensors)
 
 
 def _heights(analysis: Analysis, z: Array) -> tuple[Array, Array]:

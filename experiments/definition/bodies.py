@@ -18,36 +18,28 @@ from agents.vectors import Vector, clamp
 from experiments.definition.experiment import Experiment
 from twins import scene as outlines
 from twins.scene import Scene, World
-from twins.sensing.range_sensors import OF_KIND
 
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
 CLEAR: Final = 0.02  # [m] between robots that are scattered
 WORLD: Final = "world"  # the body of a robot that lives in the twin service
 VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
-# what `--bodies protocol` makes of each kind: its protocol twin, the process that its robots share (several Crazyflies
-# hang on one radio, all Tellos of a computer on one port), and the source of its position
-PROTOCOL: Final[dict[str, tuple[str, str | None, str]]] = {
-    "crazyflie": ("crazyflie-twin", "radio0", "external"),
-    "tello": ("tello-twin", "tellos", "external"),
-    "khepera4": ("khepera4-twin", None, "external"),
-    "turtlebot3": ("turtlebot3-twin", None, "external"),
-}
-# the kind that a body drives; those of other distributions, and simulators, drive any
-DRIVES: Final = {
-    **dict.fromkeys(("radio", "usb", "udp"), "crazyflie"),
-    **dict.fromkeys(("khepera4", "kteam"), "khepera4"),
-    **dict.fromkeys(("ros2dds", "rmw"), "turtlebot3"),
-    "tello": "tello",
-    **{twin: kind for kind, (twin, _, _) in PROTOCOL.items()},
-}
-LIBRARIES: Final = {"crazyflie": "cflib", "tello": "djitellopy", "turtlebot3": "rosbags"}  # of `./zenpark hardware`
 BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 
 
 def missing_library(body: str) -> str:
     """Name of the library that a body needs and that is not installed here; empty if there is none."""
-    library = LIBRARIES.get(DRIVES.get(body, ""), "")
-    return library if library and importlib.util.find_spec(library) is None else ""
+    kind = driven_kind(body)
+    return kind.library if kind and kind.library and importlib.util.find_spec(kind.library) is None else ""
+
+
+def own_bodies(kind: Kind) -> tuple[str, ...]:
+    """Bodies that drive robots of this kind only."""
+    return kind.bodies if kind.twin is None else (*kind.bodies, kind.twin.body)
+
+
+def driven_kind(body: str) -> Kind | None:
+    """The kind that a body drives; None of those that drive any, as simulators do."""
+    return next((kind for kind in KINDS.usable() if body in own_bodies(kind)), None)
 
 
 def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
@@ -107,7 +99,7 @@ def shared_world(experiment: Experiment, names: Sequence[str], *, sensing: bool 
     carried = []
     for name in names:
         robot = experiment.robots[name]
-        own = OF_KIND.get(robot.kind, ()) if robot.sensors is None else tuple(robot.sensors)
+        own = KINDS[robot.kind].sensors if robot.sensors is None else tuple(robot.sensors)
         carried.append(own if used or robot.sensors else ())
     return World(
         scene=scene(experiment),
@@ -199,13 +191,17 @@ def behind_protocols(experiment: Experiment) -> Experiment:
 
     Raises BodyError if the kind of a robot has no protocol twin.
     """
-    if strangers := sorted({robot.kind for robot in experiment.robots.values()} - PROTOCOL.keys()):
-        known = ", ".join(sorted(PROTOCOL))
+    twins = {name: KINDS[robot.kind].twin for name, robot in experiment.robots.items()}
+    if strangers := sorted({experiment.robots[name].kind for name, twin in twins.items() if twin is None}):
+        known = ", ".join(kind.name for kind in KINDS.usable() if kind.twin is not None)
         message = f"no protocol twin of {', '.join(map(repr, strangers))}, only of {known}"
         raise BodyError(f"--bodies protocol: {message}; choose --bodies twin or world")
     robots = {}
-    for name, robot in experiment.robots.items():
-        body, process, position = PROTOCOL[robot.kind]
-        device = robot.device | {"link": "radio"} if robot.kind == "crazyflie" else robot.device
-        robots[name] = msgspec.structs.replace(robot, body=body, process=process, position=position, device=device)
+    for name, twin in twins.items():
+        if twin is not None:
+            robot = experiment.robots[name]
+            robots[name] = msgspec.structs.replace(
+                robot, body=twin.body, process=twin.process, position=twin.position,
+                device={**robot.device, **twin.device},
+            )  # fmt: skip
     return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)

@@ -8,12 +8,12 @@ from typing import Final, cast
 
 import numpy as np
 
-from agents.body.kinds import KINDS
+from agents.body.kinds import KINDS, Kind
 from agents.plugins import registry
 from agents.plugins.laws import Law
 from agents.plugins.registry import did_you_mean
 from agents.plugins.triggers import Trigger
-from experiments.definition.bodies import DRIVES, WORLD
+from experiments.definition.bodies import WORLD, driven_kind, own_bodies
 from experiments.definition.experiment import Arena, Change, Experiment, Hybrid, Link, Robot, Target
 from experiments.definition.links import FORM, held_height, link_pairs
 from experiments.file import consistency_network
@@ -56,7 +56,7 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
 
 _ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
 # words of keys, of [disturbance], of events and of tables of results
-_RESERVED: Final = ("all", "estop", "run", "conductor", "mean", *_ROLES, *KINDS)
+_RESERVED: Final = ("all", "estop", "run", "conductor", "mean", *_ROLES)  # and the kinds of robots
 ROUNDED: Final = 1e-3  # [m] heights written with three decimals
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
@@ -128,9 +128,9 @@ def _start_conflicts(experiment: Experiment) -> Iterator[Fault]:
         if name in robots:
             yield Fault(path, f"'{name}' is the name of a robot already", "rename one of them", on_key=True)
         for robot, each in robots.items():
-            if each.kind not in KINDS:
+            kind, place = _known(each.kind), np.array(each.start[:2])
+            if kind is None:
                 continue
-            kind, place = KINDS[each.kind], np.array(each.start[:2])
             if not outlines.at_height(scene, number, 0.0, kind.height):  # a flying robot stands on the floor before
                 continue
             missing = kind.radius - float(outlines.distance(scene, number, scene.pose[number], place))
@@ -183,16 +183,18 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         if body.partition(":")[0] == "radio":
             hint = "write channel, rate and address, such as radio://0/80/2M/E7E7E7E701"
         yield Fault((*path, "body"), f"no {body!r} among the bodies", hint)
-    elif (driven := DRIVES.get(body, robot.kind)) != robot.kind and robot.kind in KINDS:
-        own = ", ".join(each for each, kind in DRIVES.items() if kind == robot.kind)
-        hint = f"write kind = '{driven}', or a body of a {robot.kind}: twin, world, {own}"
-        yield Fault((*path, "body"), f"'{body}' drives a {driven}, and {name} is a {robot.kind}", hint)
-    elif body in ("twin", WORLD) and robot.kind in KINDS and not has_model(KINDS[robot.kind]):
-        yield Fault((*path, "kind"), f"no twin of '{robot.kind}'", TWINLESS)
-    if robot.kind in KINDS:
-        yield from _hover(experiment, path, robot)
+    kind = _known(robot.kind)
+    if kind is None:
+        yield _unknown(path, robot.kind)
     else:
-        yield Fault((*path, "kind"), f"no {robot.kind!r} among the kinds of robots", did_you_mean(robot.kind, KINDS))
+        driven = driven_kind(body)
+        if driven is not None and driven is not kind:
+            known = ", ".join(("twin", WORLD, *own_bodies(kind)))
+            hint = f"write kind = '{driven.name}', or a body of a {kind.name}: {known}"
+            yield Fault((*path, "body"), f"'{body}' drives a {driven.name}, and {name} is a {kind.name}", hint)
+        elif body in ("twin", WORLD) and not has_model(kind):
+            yield Fault((*path, "kind"), f"no twin of '{kind.name}'", TWINLESS)
+        yield from _hover(experiment, path, robot, kind)
     for number, sensor in enumerate(robot.sensors or []):
         if sensor not in SENSORS:
             message = f"no {sensor!r} among the range sensors"
@@ -206,10 +208,28 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
 
 
+def _known(name: str) -> Kind | None:
+    """A kind; None if it is not installed, or cannot be used."""
+    try:
+        return KINDS.get(name)
+    except registry.PluginError:
+        return None
+
+
+def _unknown(path: tuple[str, str], name: str) -> Fault:
+    try:
+        KINDS[name]
+    except registry.PluginError as error:
+        return Fault((*path, "kind"), f"the kind '{name}' cannot be used: {error}", "mend or uninstall it")
+    except KeyError:
+        hint = f"{did_you_mean(name, KINDS)}; one of your own is a plug-in to install (docs/plugins.md)"
+    return Fault((*path, "kind"), f"no {name!r} among the kinds of robots", hint)
+
+
 def _names(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
     """Faults of the name of a robot, and of that of its process."""
     name = path[1]
-    if name in _RESERVED:
+    if name in _RESERVED or name in KINDS:
         message = f"a robot cannot be called '{name}', which has a meaning of its own"
         yield Fault(path, message, "rename it", on_key=True)
     if robot.process in _ROLES:
@@ -219,9 +239,9 @@ def _names(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         yield Fault((*path, "process"), message, "rename the process, and name it at each robot that shares it")
 
 
-def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot, kind: Kind) -> Iterator[Fault]:
     name, top, margin = path[1], experiment.arena.size[2], experiment.safety.margin
-    if not KINDS[robot.kind].flies:
+    if not kind.flies:
         if robot.hover is not None:
             message = f"'{name}' is a {robot.kind}, which does not fly"
             yield Fault((*path, "hover"), message, "leave hover out", on_key=True)

@@ -58,7 +58,7 @@ def described() -> dict[str, Any]:
     for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
         field["description"] = definitions["Channel"]["properties"][name]["description"]
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE]})
-    definitions["Robot"]["properties"]["kind"]["enum"] = list(KINDS)
+    definitions["Robot"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
     del partial["Experiment" + _CASE]["properties"]["cases"]
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = {
@@ -109,7 +109,7 @@ def _bounded(node: Mapping[str, Any]) -> dict[str, Any]:
 
 def unusable() -> list[str]:
     """Plug-ins that the schema leaves out: a line for each, with the reason and the remedy."""
-    return registry.unusable(_parameters)
+    return registry.unusable(lambda group, name: KINDS[name] if group == registry.ROBOTS else _parameters(group, name))
 
 
 def write_schema(path: File) -> None:

@@ -24,6 +24,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
+from agents.body.kinds import KINDS
 from experiments.metrics.signals import phase_starts
 from experiments.recording.trace import Trace
 from twins.arrays import Array
@@ -45,8 +46,6 @@ HATCHES: Final = ("", "////", "....", "xxxx", "\\\\\\\\", "----", "++++")
 # robots: Tol's muted colours, so that none of them is taken for a case
 ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499", "#C9A227")
 CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
-KIND_COLOURS: Final = {"turtlebot3": "#000000", "khepera4": "#44AA99", "crazyflie": "#AA4499", "tello": "#999933"}
-OTHER_KIND: Final = "#7a7a7a"  # of a kind that has no colour of its own
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MANY` robots
 BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
@@ -164,7 +163,7 @@ def robot_lines(trace: Trace) -> list[Line]:
         styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
         return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
     kinds = [trace.experiment.robots[name].kind for name in trace.robots]
-    return [{"color": KIND_COLOURS.get(kind, OTHER_KIND), "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
+    return [{"color": KINDS[kind].colour, "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
 def case_line(k: int) -> Line:

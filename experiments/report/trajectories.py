@@ -21,6 +21,7 @@ from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D, proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
+from agents.body.kinds import KINDS
 from experiments.check.analysis import Analysis
 from experiments.definition.formation import errors_over_time
 from experiments.definition.graph import edges
@@ -28,11 +29,9 @@ from experiments.recording.trace import Trace
 from experiments.report import scenery
 from experiments.report.style import (
     INK,
-    KIND_COLOURS,
     MAGENTA,
     MANY,
     MARKERS,
-    OTHER_KIND,
     PAPER,
     ROBOTS,
     STYLE,
@@ -176,7 +175,7 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
         for row, robot in enumerate(known.names):
             colour = ROBOTS[row % len(ROBOTS)]
             if len(known.names) > MANY:
-                colour = KIND_COLOURS.get(experiment.robots[robot].kind, OTHER_KIND)
+                colour = KINDS[experiment.robots[robot].kind].colour
             axes.plot(motion[:, row, 0], motion[:, row, 1], color=colour, linewidth=0.6)
             axes.plot(*known.start[row, :2], "o", ms=3.0, mec=colour, mfc="none", mew=0.7)
             axes.plot(*target[row, :2], "D", ms=4.0, mec=MAGENTA, mfc="none", mew=0.7, zorder=3)

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3, Kind
+from agents.body.kinds import Kind
+from agents.plugins import registry
 from twins.arrays import Array
 from twins.scene import Scene
 
@@ -90,7 +91,7 @@ class Model:
         return joined(self.body, self.accent)
 
 
-def _quadrotor(kind: Kind, rotor: float, arm: float) -> Model:
+def quadrotor(kind: Kind, rotor: float, arm: float) -> Model:
     """Arms in a cross, a hub, and four rotors, of which the two in front and the nose have the robot's colour."""
     reach = kind.radius - rotor
     top = kind.height
@@ -109,7 +110,7 @@ def _quadrotor(kind: Kind, rotor: float, arm: float) -> Model:
     return Model(joined(*parts), joined(nose, *marked))
 
 
-def _khepera(kind: Kind) -> Model:
+def khepera(kind: Kind) -> Model:
     """A low cylinder between two wheels, with a coloured top plate that points ahead."""
     radius, top = kind.radius, kind.height
     wheel = box(0.6 * radius, 0.08 * radius, 0.0, 0.65 * top)
@@ -123,7 +124,7 @@ def _khepera(kind: Kind) -> Model:
     return Model(body, joined(plate, nose))
 
 
-def _turtlebot(kind: Kind) -> Model:
+def turtlebot(kind: Kind) -> Model:
     """Stacked plates on two wheels, with a laser scanner on top."""
     radius, top = kind.radius, kind.height
     wheel = box(0.62 * radius, 0.17 * radius, 0.0, 0.34 * top)
@@ -139,19 +140,23 @@ def _turtlebot(kind: Kind) -> Model:
     return Model(body, joined(plate, scanner, nose))
 
 
-MODELS: Final[dict[str, Model]] = {
-    CRAZYFLIE.name: _quadrotor(CRAZYFLIE, rotor=0.023, arm=0.009),
-    TELLO.name: _quadrotor(TELLO, rotor=0.038, arm=0.014),
-    KHEPERA4.name: _khepera(KHEPERA4),
-    TURTLEBOT3.name: _turtlebot(TURTLEBOT3),
-}
+def crazyflie(kind: Kind) -> Model:
+    return quadrotor(kind, rotor=0.023, arm=0.009)
+
+
+def tello(kind: Kind) -> Model:
+    return quadrotor(kind, rotor=0.038, arm=0.014)
 
 
 def model(kind: Kind) -> Model:
-    """Model of a kind; of one without its own, a quadrotor or a cylinder on two wheels of its size."""
-    if kind.name in MODELS:
-        return MODELS[kind.name]
-    return _quadrotor(kind, 0.36 * kind.radius, 0.14 * kind.radius) if kind.flies else _khepera(kind)
+    """Model of a kind; of one without its own, a quadrotor or a cylinder on two wheels of its size.
+
+    Raises PluginError if the function that it names cannot be found.
+    """
+    if not kind.mesh:
+        return quadrotor(kind, 0.36 * kind.radius, 0.14 * kind.radius) if kind.flies else khepera(kind)
+    made: Model = registry.find(kind.mesh, f"mesh of the kind {kind.name!r}")(kind)
+    return made
 
 
 def obstacle(scene: Scene, number: int) -> Mesh:

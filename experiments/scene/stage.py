@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.body.kinds import KHEPERA4, Kind
+from agents.body.kinds import Kind
 from agents.decision.lifecycle import Phase
+from agents.kinds.khepera4 import KHEPERA4
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
 from experiments.definition import bodies

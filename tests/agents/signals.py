@@ -9,8 +9,8 @@ from math import dist, inf, nan
 
 import numpy as np
 
-from agents.body.kinds import KHEPERA4
 from agents.decision.transmission import Transmitter
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
 from agents.vectors import NO_SETPOINT, Vector

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.body.kinds import KHEPERA4
 from agents.clock import SLEW, STEP_S, Clock, correction_line, uptime
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, ConstantVelocity, Predictor
 from experiments.real_time.hosts.launcher import Launcher
 

@@ -1,6 +1,6 @@
 """A robot and what is near it, put together by hand."""
 
-from agents.body.kinds import KHEPERA4
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.avoidance import Nearby, OwnState
 
 

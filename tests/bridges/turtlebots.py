@@ -8,9 +8,9 @@ from math import nan
 import numpy as np
 
 from agents.body.interface import BodyRequest, Disturbance
-from agents.body.kinds import TURTLEBOT3
 from agents.clock import Clock
 from agents.decision.position_control import PositionController
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network.keys import Keys
 from agents.vectors import NO_SETPOINT
 from bridges.turtlebot3.body import TurtleBot3

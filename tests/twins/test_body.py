@@ -10,7 +10,11 @@ import pytest
 
 from agents.body.external_pose import SMOOTHING_S, External
 from agents.body.interface import BodyError, BodyState, Disturbance, Jitter
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.body.kinds import KINDS
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.registry import load
 from agents.vectors import NO_SETPOINT, ZERO
 from tests.twins.requests import request
@@ -273,8 +277,8 @@ def test_every_kind_has_a_twin(kind):
 
 
 def test_unknown_kind_has_no_twin():
-    with pytest.raises(BodyError, match="no twin of 'submarine'; add it to RESPONSES"):
-        body(replace(KHEPERA4, name="submarine"))
+    with pytest.raises(BodyError, match="no twin of 'submarine'; give the kind a `motion`"):
+        body(replace(KHEPERA4, name="submarine", motion=None))
 
 
 def test_twin_is_registered():
@@ -293,7 +297,7 @@ def test_disturbances_are_checked(word):
 def test_quiet_robot_needs_no_numpy():
     program = """
 import sys
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from tests.twins.requests import request
 from twins.body import TwinBody
 body = TwinBody(request((CRAZYFLIE,)))

@@ -434,8 +434,10 @@ def import_(
 def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
+    from experiments.file import json_schema
 
     plugins = {
+        "Kinds of robots": registry.ROBOTS,
         "Bodies": registry.BODIES,
         "Protocol twins": registry.DEVICES,
         "Triggers": registry.TRIGGERS,
@@ -445,6 +447,7 @@ def list_(as_json: AsJson = False) -> None:
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
     }
+    warn(json_schema.unusable())
     experiments = index.titles()
     found = {title: registry.names(group) for title, group in plugins.items()}
     width = max(len(name) for name in experiments)

@@ -190,7 +190,7 @@ def world(
 
 @app.command(epilog=example("twin crazyflie --count 2", "twin tello --faults '{\"loss\": 0.05}'"))
 def twin(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help="crazyflie, tello, khepera4 or turtlebot3.")],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help="Such as crazyflie; one that has a protocol twin.")],
     *,
     count: Annotated[int, typer.Option(min=1, max=99, help="How many.")] = 1,
     connect: Connect = None,

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyError, BodyRequest, settings
-from agents.body.kinds import KHEPERA4
+from agents.kinds.khepera4 import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from twins.arrays import Array
 from twins.body import instants

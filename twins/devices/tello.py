@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyError, BodyRequest, settings
-from agents.body.kinds import TELLO
+from agents.kinds.tello import TELLO
 from agents.protocols import tello as protocol
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector, difference, norm
 from twins.arrays import Array

@@ -17,7 +17,7 @@ import numpy as np
 import zenoh
 
 from agents.body.interface import BodyError, BodyRequest, settings
-from agents.body.kinds import TURTLEBOT3
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network import session as network
 from agents.protocols import ros2, turtlebot3
 from agents.protocols.ros2 import Message

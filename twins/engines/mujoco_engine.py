@@ -22,7 +22,7 @@ from agents.vectors import ZERO, Vector
 from twins.arrays import Array, Index, Mask, clamp, norm, some
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
 from twins.engines.engine import Mirrored, Planar, Pose, Stage, Touch
-from twins.engines.mujoco_model import AIRFRAMES, mjcf
+from twins.engines.mujoco_model import mjcf
 from twins.engines.point_mass import Orders, require_models
 from twins.models.differential import Differential
 from twins.models.onboard_flight import OnboardFlight
@@ -156,10 +156,10 @@ class Drones:
         rows = len(kinds)
         self._dt, self._ticks = dt, max(1, math.ceil(dt * RATE_HZ - 1e-6))
         self._period = dt / self._ticks
-        if unknown := sorted({kind.name for kind in kinds} - AIRFRAMES.keys()):
-            remedy = "add it to AIRFRAMES in twins/engines/mujoco_model.py (docs/plugins.md), or choose another engine"
+        frames = [kind.airframe for kind in kinds if kind.airframe is not None]
+        if unknown := sorted({kind.name for kind in kinds if kind.airframe is None}):
+            remedy = "give the kind an `airframe` (docs/plugins.md), or choose another engine"
             raise BodyError(f"the engine mujoco has no airframe of {', '.join(map(repr, unknown))}; {remedy}")
-        frames = [AIRFRAMES[kind.name] for kind in kinds]
         step = self._period / SUBSTEPS
         models = {frame: mujoco.MjModel.from_xml_string(mjcf(frame, scene, step, motor_lag)) for frame in frames}
         self._models = [models[frame] for frame in frames]

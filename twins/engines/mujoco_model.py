@@ -1,14 +1,14 @@
-"""MuJoCo model: parameters of the airframes, and the scene of one quadrotor as MJCF."""
+"""MuJoCo model: the scene of one quadrotor as MJCF."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
+from agents.body.kinds import Airframe
 from twins.arrays import Array
 from twins.scene import Scene
 
@@ -16,40 +16,6 @@ WALL: Final = 0.005  # [m] half the thickness of thin walls
 STIFF: Final = 0.004  # [s] time constant of a contact: a standing drone sinks in by 0.1 mm
 # front right, back right, back left, front left: direction along x and y, sign of the torque (neighbours turn opposite)
 MOTORS: Final = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
-
-
-@dataclass(frozen=True)
-class Airframe:
-    """Quadrotor with motors at 45° to its nose."""
-
-    mass: float  # [kg]
-    inertia: tuple[float, float, float]  # about its own x, y, z [kg m²]
-    arm: float  # from the centre to a motor [m]
-    thrust: float  # of a motor at full command [N]
-    torque: float  # of a motor about its axis, per thrust [m]
-    size: tuple[float, float, float]  # of the collision box [m]
-
-
-def _scaled(frame: Airframe, mass: float, arm: float, size: tuple[float, float, float]) -> Airframe:
-    """Scale a design: thrust with the mass, inertia with mass and arm squared, torque with the arm."""
-    heavier, longer = mass / frame.mass, arm / frame.arm
-    x, y, z = (each * heavier * longer**2 for each in frame.inertia)
-    return Airframe(mass, (x, y, z), arm, frame.thrust * heavier, frame.torque * longer, size)
-
-
-CRAZYFLIE: Final = Airframe(
-    mass=0.027,
-    inertia=(1.657e-5, 1.657e-5, 2.926e-5),
-    arm=0.046,
-    thrust=0.12,
-    torque=0.00596,  # Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", 2015
-    size=(0.092, 0.092, 0.029),
-)
-AIRFRAMES: Final[dict[str, Airframe]] = {
-    "crazyflie": CRAZYFLIE,
-    # a choice: the maker publishes mass and size only
-    "tello": _scaled(CRAZYFLIE, 0.080, 0.060, (0.098, 0.0925, 0.041)),
-}
 
 
 def mjcf(frame: Airframe, scene: Scene, step: float, motor_lag: float) -> str:

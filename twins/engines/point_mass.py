@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 import msgspec
 
 from agents.body.interface import BodyError
-from agents.body.kinds import Kind
+from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Setpoint, Vector
 from twins.engines.engine import Mirrored, Motion, Planar, Pose, Stage, Touch
-from twins.models.differential import DRIVES, Differential
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.models.differential import Differential
+from twins.models.quadrotor import Quadrotor
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
     from twins.scene import Scene
@@ -29,15 +29,12 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return PointMassEngine(moving_models(stage), stage.dt, stage.scene)
 
 
-TWINLESS: Final = (  # remedy for a kind of which `has_model` is false
-    "add it to RESPONSES if it flies, to DRIVES if it takes a twist; another motion needs a model of its own in "
-    "twins/models (docs/plugins.md); or name another body"
-)
+TWINLESS: Final = "give the kind a `motion` (docs/plugins.md), or name another body"  # if `has_model` is false
 
 
 def has_model(kind: Kind) -> bool:
     """Whether a model moves as the kind: a quadrotor flies, a differential drive takes a twist on the floor."""
-    return kind.name in (RESPONSES if kind.flies else DRIVES) and kind.flies == (kind.takes != "twist")
+    return isinstance(kind.motion, Flight if kind.flies else Wheels) and kind.flies == (kind.takes != "twist")
 
 
 def require_models(kinds: Iterable[Kind]) -> None:

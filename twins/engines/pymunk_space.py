@@ -10,9 +10,8 @@ from typing import Final
 import numpy as np
 import pymunk
 
-from agents.body.kinds import Kind
+from agents.body.kinds import Kind, Wheels
 from twins.arrays import Array
-from twins.models.differential import DRIVES
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
 
@@ -75,8 +74,8 @@ class Place:
         if not kind.flies:
             wheels = self.wheels[row] = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
             self.space.add(wheels)
-            if not mirrored:
-                self._add_floor_friction(wheels, body, force, 0.5 * DRIVES[kind.name].base * force)
+            if not mirrored and isinstance(kind.motion, Wheels):
+                self._add_floor_friction(wheels, body, force, 0.5 * kind.motion.base * force)
         elif not mirrored:
             self.feet[row] = self._add_floor_friction(self._floor, body, force, 0.0), force
 

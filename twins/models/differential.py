@@ -6,28 +6,11 @@ bridge, a watchdog on the robot, or nothing (docs/hanging.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import cos, isfinite, sin
-from typing import Final
 
 from agents.body.interface import NO_ATTITUDE, Attitude
-from agents.body.kinds import Kind
+from agents.body.kinds import Kind, Wheels
 from agents.vectors import ZERO, Setpoint, Vector, clamp
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Two driven wheels."""
-
-    base: float  # distance between the wheels [m]
-    speed: float  # largest rim speed [m/s]
-    acceleration: float  # largest, of the rim [m/s²]
-
-
-DRIVES: Final[dict[str, Drive]] = {
-    "khepera4": Drive(base=0.1054, speed=0.8137, acceleration=130.0 * 0.021),  # 130 rad/s² on a wheel of 42 mm
-    "turtlebot3": Drive(base=0.160, speed=0.22 + 2.84 * 0.080, acceleration=2.0),  # acceleration: our choice
-}
 
 
 class Differential:
@@ -55,9 +38,10 @@ class Differential:
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad]."""
-        drive = DRIVES[kind.name]
-        self._base, self._half_base = drive.base, 0.5 * drive.base
-        self._limit, self._acceleration = drive.speed, drive.acceleration
+        wheels = kind.motion
+        assert isinstance(wheels, Wheels)
+        self._base, self._half_base = wheels.base, 0.5 * wheels.base
+        self._limit, self._acceleration = wheels.speed, wheels.acceleration
         self.attitude, self.flying, self.wobble = NO_ATTITUDE, False, (0.0, 0.0)
         self.place(start, yaw, flying=False)
 

@@ -2,34 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import Final
 
-from agents.body.kinds import Kind
+from agents.body.kinds import Flight, Kind
 from agents.vectors import ZERO, Vector, clamp, wrap
 from twins.models.onboard_flight import TOUCHDOWN, OnboardFlight
 
 GRAVITY: Final = 9.81  # [m/s²]
-
-
-@dataclass(frozen=True)
-class Response:
-    """Closed loop on board, for x, y and z."""
-
-    position: Vector  # gains [1/s]
-    velocity: Vector  # gains [1/s]
-    speed: Vector  # limits [m/s]
-    # rate at which the acceleration follows, because the quadrotor must tilt first [1/s]; inf: at once
-    tilt: Vector
-
-
-RESPONSES: Final[dict[str, Response]] = {
-    # fitted to step responses of a rigid body under the firmware's cascade (docs/mujoco.md)
-    "crazyflie": Response((2.0, 2.0, 2.8), (5.0, 5.0, 3.5), (1.1, 1.1, 1.4), (5.0, 5.0, math.inf)),
-    # a choice: the maker publishes no figures
-    "tello": Response((1.0, 1.0, 1.0), (3.0, 3.0, 3.0), (1.0, 1.0, 1.0), (math.inf, math.inf, math.inf)),
-}
 
 
 class Quadrotor(OnboardFlight):
@@ -37,7 +16,7 @@ class Quadrotor(OnboardFlight):
 
     __slots__ = ("_change", "_dt", "_gain", "_response", "_speed", "_step_gain", "_tilt", "_turn", "_turn_rate")
 
-    _response: Response
+    _response: Flight
     _gain: Vector  # k_p [1/s]
     _speed: Vector  # limits [m/s]
     _turn: float  # gain of the yaw [1/s]
@@ -48,8 +27,10 @@ class Quadrotor(OnboardFlight):
     _change: Vector  # of velocity in a step, with the lag of tilting [m/s]
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
-        self._response = RESPONSES[kind.name]
-        self._gain, self._speed = self._response.position, self._response.speed
+        flight = kind.motion
+        assert isinstance(flight, Flight)
+        self._response = flight
+        self._gain, self._speed = flight.position, flight.speed
         self._turn, self._turn_rate = kind.turn_response, kind.turn_rate
         self._dt, self._step_gain, self._tilt = 0.0, ZERO, ZERO
         super().__init__(kind, start, yaw)

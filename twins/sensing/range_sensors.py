@@ -1,7 +1,7 @@
 """Range sensors of twins: direction, range, rate and noise of each.
 
 A new sensor is a new entry of `SENSORS`: a `Sensor` with its rays and parameters. A robot has a sensor when its
-`sensors` in the experiment file names it, or, for all robots of a kind, when `OF_KIND` does. No other module knows
+`sensors` in the experiment file names it, or, for all robots of a kind, when its kind does. No other module knows
 sensor names.
 
 Accuracies that makers give as limits (±) are read as two standard deviations of white noise: 95 % within them.
@@ -101,12 +101,6 @@ SENSORS: Final[dict[str, Sensor]] = {
         sigma=0.010,
         resolution=0.001,
     ),
-}
-OF_KIND: Final[dict[str, tuple[str, ...]]] = {
-    "khepera4": ("infrared", "ultrasonic"),
-    "turtlebot3": ("lds01",),
-    "crazyflie": (),
-    "tello": (),
 }
 
 

@@ -19,7 +19,7 @@ import msgspec
 import yaml
 from msgspec import Meta, Struct
 
-from agents.body.kinds import KINDS as BODIES
+from agents.body.kinds import KINDS
 from agents.plugins.registry import did_you_mean
 from experiments.file.problems import DocumentError, Problem, at_offset, refusal
 from experiments.file.text import content
@@ -30,14 +30,6 @@ When: TypeAlias = Literal["Continuous", "EventBased", "EvenBased"]  # both spell
 Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 LENGTH: Final = Meta(min_length=2, max_length=3)  # of a pose
-KINDS: Final = {  # their launcher knows robots by parts of their names as well
-    "dron": "crazyflie",
-    "crazyflie": "crazyflie",
-    "khepera": "khepera4",
-    "turtlebot": "turtlebot3",
-    "burger": "turtlebot3",
-    "tello": "tello",
-}
 CENTRAL: Final = "centralized"
 CENTRES: Final = ("origin", "sphere")
 MISSING: Final = "there is no such file"
@@ -173,7 +165,7 @@ class Robot(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if not self.kind:
-            known = ", ".join(KINDS)
+            known = ", ".join(part for kind in KINDS.usable() for part in kind.aliases)
             raise ValueError(
                 f"no kind of robot is in the name '{self.name}': use letters, digits and _, and in it one of {known}"
             )
@@ -467,7 +459,10 @@ def _check_names(file: str, robots: Mapping[str, Robot]) -> None:
 
 def kind_of(name: str) -> str:
     """Kind of a robot in zenpark by its name; empty for a name without a known kind, or that zenpark does not allow."""
-    return next((kind for part, kind in KINDS.items() if part in name.lower() and NAME.fullmatch(name)), "")
+    if not NAME.fullmatch(name):
+        return ""
+    known = ((part, kind.name) for kind in KINDS.usable() for part in kind.aliases)
+    return next((kind for part, kind in known if part in name.lower()), "")
 
 
 def _relation(part: str, kind: str) -> Relation:
@@ -532,4 +527,4 @@ def _world(file: str, text: str) -> Iterator[tuple[str, Pose]]:
                 x, y, z = place.typed(tuple[Number, Number, Number])
                 _, _, axis, angle = turn.typed(tuple[Number, Number, Number, Number])
                 yaw = math.copysign(1.0, axis) * angle if abs(axis) > 1.0 - 1e-3 else 0.0
-                yield name, (x, y, z if BODIES[kind_of(name)].flies else yaw)
+                yield name, (x, y, z if KINDS[kind_of(name)].flies else yaw)

@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 
 from agents.body.interface import UNANSWERED
-from agents.body.kinds import TELLO
+from agents.kinds.tello import TELLO
 from agents.network import messages
 from agents.protocols import tello
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot

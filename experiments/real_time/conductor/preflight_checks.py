@@ -13,13 +13,14 @@ import msgspec
 import numpy as np
 
 from agents.body.interface import settings
+from agents.body.kinds import KINDS
 from agents.body.limits import Safety
 from agents.body.measured_positions import FROZEN
 from agents.network import messages
 from agents.plugins import registry
 from agents.protocols import tello
 from agents.safety.detection import clock_off, clock_text
-from experiments.definition.bodies import DRIVES, WORLD
+from experiments.definition.bodies import WORLD, driven_kind
 from experiments.definition.experiment import Robot
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 from twins.arrays import Array
@@ -44,21 +45,6 @@ OLD_MONTHS: Final = 24  # firmware older than this: a warning
 STOP_S: Final = 1.0  # a stop that takes longer is bad
 STOP_WAY_M: Final = 0.05  # a robot on wheels rolls no farther after a stop
 RELEASE: Final = re.compile(r"(20\d\d)\.(\d{1,2})")  # as Bitcraze numbers them
-
-CONNECT: Final[Mapping[str, str]] = {
-    "crazyflie": "switch it on; channel, rate and address as in the Crazyflie client; radio plugged in and permitted "
-    "(docs/crazyflie.md)",
-    "tello": "switch it on; this computer in its Wi-Fi; UDP 8889 and 8890 through the firewall (docs/tello.md)",
-    "khepera4": "switch it on, start its server, ping its address (docs/khepera4.md)",
-    "turtlebot3": "switch it on, start its bringup and the Zenoh bridge, `ROS_DOMAIN_ID` as in the file "
-    "(docs/turtlebot3.md)",
-}
-BATTERY: Final[Mapping[str, str]] = {
-    "crazyflie": "charge it; one that sags under load although it was full is worn: replace it",
-    "tello": "charge it, or put a full one in",
-    "khepera4": "charge it",
-    "turtlebot3": "charge it; below 11 V the board beeps",
-}
 
 
 class Check(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,8 +125,8 @@ def at_rest(observed: Mapping[str, Observed], safety: Safety, today: date) -> di
 
 
 def _address(each: Observed) -> Check:
-    ours = registry.body_name(each.robot.body) in DRIVES  # another body knows its robot better than we do
-    remedy = CONNECT.get(each.robot.kind if ours else "", "is it switched on, and its address right?")
+    kind = driven_kind(registry.body_name(each.robot.body))  # another body knows its robot better than we do
+    remedy = (kind.connect if kind else "") or "is it switched on, and its address right?"
     if each.status is None:
         return _bad("address", each.ended or "its process says nothing", remedy)
     silent = not len(each.positions()) and each.status.battery is None and each.last.firmware is None
@@ -177,7 +163,7 @@ def _battery(each: Observed, status: messages.Status, safety: Safety) -> Check:
         return _not_known("battery", each)
     said = _charged(math.inf if charge is None else charge, math.inf if volts is None else volts)
     if charge is not None and charge < safety.battery_min:
-        return _bad("battery", f"{said}, less than {safety.battery_min:.0%}", BATTERY.get(each.robot.kind, "charge it"))
+        return _bad("battery", f"{said}, less than {safety.battery_min:.0%}", KINDS[each.robot.kind].charge)
     return Check(check="battery", verdict="ok", found=f"{said} at rest")
 
 
@@ -238,7 +224,7 @@ def _start(name: str, observed: Mapping[str, Observed], safety: Safety) -> Check
 
 def _counts_from_start(robot: Robot) -> bool:
     """Whether a real robot, or its protocol twin, measures its way only: it is at its `start` wherever it stands."""
-    if robot.position == "external" or registry.body_name(robot.body) not in DRIVES:
+    if robot.position == "external" or driven_kind(registry.body_name(robot.body)) is None:
         return False
     return robot.hover is None or not robot.device.get("positioning")
 
@@ -282,7 +268,7 @@ def stop_in_motion(observed: Observed, tried: Tried) -> Check:
     way = _largest_displacement(tried.states)
     if check.verdict == "ok" and observed.robot.hover is None and way > STOP_WAY_M:
         return _bad(check.check, f"rolled on for {way:.2f} m", "lower its speed; do its brakes and wheels hold?")
-    if check.verdict == "ok" and observed.robot.kind == "crazyflie":
+    if check.verdict == "ok" and KINDS[observed.robot.kind].locks:
         return msgspec.structs.replace(check, found=f"{check.found}; locked until it is switched off and on")
     return check
 
@@ -290,7 +276,8 @@ def stop_in_motion(observed: Observed, tried: Tried) -> Check:
 def stop_at_rest(robot: Robot, tried: Tried) -> Check:
     """Emergency stop of a robot that stands."""
     check = stop("stop, motors off", tried)
-    if check.verdict == "ok" and DRIVES.get(registry.body_name(robot.body)) == "crazyflie":  # a stop would lock it
+    kind = driven_kind(registry.body_name(robot.body))
+    if check.verdict == "ok" and kind is not None and kind.locks:
         return not_tried(check.check, "not tried: --stop tries it")
     return check
 
@@ -325,7 +312,7 @@ def hop(observed: Observed, tried: Tried, safety: Safety) -> Check:
         said = f"{height:.2f} m of {wanted:g} m high, {side:.2f} m to the side{loaded}"
         remedy = _hop_remedy(height - wanted, side)
     if not remedy and tried.charge < safety.battery_low:
-        remedy = BATTERY.get(observed.robot.kind, "charge it")
+        remedy = KINDS[observed.robot.kind].charge
     return Check(check=what, verdict="bad" if remedy else "ok", found=said, remedy=remedy)
 
 

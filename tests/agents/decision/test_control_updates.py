@@ -4,9 +4,9 @@ from math import dist
 
 import pytest
 
-from agents.body.kinds import KHEPERA4
 from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD, ConstantVelocity
 from agents.plugins.triggers import SendOnDelta
 from experiments.definition.experiment import Formation, Leg

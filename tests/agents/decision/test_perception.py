@@ -6,11 +6,14 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.interface import BodyState, RangeScan
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.perception import AHEAD_S, DESCENT_S, REACH, SCAN_S, Perception
 from agents.decision.situation import Situation
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Avoidance
 
 LIMITS = Limits(low=(-5.0, -5.0, 0.0), high=(5.0, 5.0, 2.5), speed=0.5)

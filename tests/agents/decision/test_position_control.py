@@ -7,8 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.body.kinds import KINDS
 from agents.decision.position_control import REACHED, TURNED, PositionController, drive
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from twins.models.differential import Differential
 
 FEW = settings(max_examples=25)

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Avoidance, Potential
 from agents.plugins.calls import explain
 from agents.plugins.registry import AVOIDANCES, FAILURES, PluginError, build

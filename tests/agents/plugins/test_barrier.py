@@ -9,7 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.body.kinds import KINDS
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.avoidance import Nearby, Plane, measure
 from agents.plugins.barrier import Barrier, closest
 from tests.agents.things import NOTHING, near, own

@@ -2,8 +2,8 @@
 
 import pytest
 
-from agents.body.kinds import KHEPERA4
 from agents.decision.neighbours import Incoming, Neighbours
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins import registry
 from agents.plugins.predictors import HOLD, ConstantVelocity, Hold
 from agents.plugins.triggers import LastEvent

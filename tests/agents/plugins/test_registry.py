@@ -161,7 +161,7 @@ def test_changeable_plug_in_is_refused(foreign):
 
 
 def test_unusable_plug_ins_are_named_with_remedy(foreign, monkeypatch):
-    monkeypatch.setattr(registry, "STRUCTS", (foreign,))
+    monkeypatch.setattr(registry, "CHOSEN", (foreign,))
     lines = registry.unusable(registry.struct)
     assert [line.partition(" (")[0] for line in lines] == [
         f"left out: plug-in '{name}'" for name in ("function", "gone", "keeper", "misnamed")

@@ -7,9 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.interface import RangeScan
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import LATE_SHARE, ProcessHealth
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import (
     FOREIGN_S,

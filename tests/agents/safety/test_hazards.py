@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.body.limits import Limits
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause, Hazards, Outcome, failed, is_blind, rules
 
 ROOM = {"low": (-2.0, -2.0, 0.0), "high": (2.0, 2.0, 2.5)}

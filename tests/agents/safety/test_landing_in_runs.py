@@ -4,8 +4,9 @@ from math import dist
 
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.decision.lifecycle import DONE, LANDING
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.hazards import Cause
 from agents.safety.landing import NEAR
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot

@@ -4,7 +4,11 @@ import math
 
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.body.kinds import KINDS
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.obedience import Obedience
 
 DT = 0.01

@@ -5,7 +5,8 @@ from math import inf, nan
 
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
 from agents.safety.positions import FLIP, JUMP_M, REACH, Continuity, ExternalPositions
 
 

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from agents.body.interface import BodyState
-from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import ProcessHealth, Situation
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
 from agents.plugins.predictors import HOLD
 from agents.safety.preflight import LOST_S, Preflight
 from agents.safety.setpoint_filter import SetpointFilter

@@ -7,9 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.body.interface import BodyState
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TELLO, TURTLEBOT3
+from agents.body.kinds import KINDS
 from agents.body.limits import Limits
 from agents.decision.situation import Situation
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
 
 FEW = settings(max_examples=100)

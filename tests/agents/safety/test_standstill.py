@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from agents.body.kinds import KHEPERA4
 from agents.decision.situation import SILENT_S
+from agents.kinds.khepera4 import KHEPERA4
 from tests.agents.safety.watched import DT, Watched
 
 

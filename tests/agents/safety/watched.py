@@ -4,10 +4,10 @@ import math
 from types import SimpleNamespace
 
 from agents.body.interface import BodyState
-from agents.body.kinds import CRAZYFLIE
 from agents.body.limits import Limits
 from agents.decision.neighbours import Incoming, Neighbours
 from agents.decision.situation import ProcessHealth, Situation
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, Status
 from agents.safety.hazards import Cause, Hazards

@@ -2,8 +2,8 @@
 
 import pytest
 
-from agents.body.kinds import CRAZYFLIE
 from agents.decision.lifecycle import Lifecycle, Phase
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.safety.detection import Ascent
 from agents.safety.obedience import Obedience
 from agents.safety.setpoint_filter import OUTSIDE_M

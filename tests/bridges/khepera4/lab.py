@@ -2,8 +2,8 @@
 
 import math
 
-from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import PositionController
+from agents.kinds.khepera4 import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import drivers
 from bridges.khepera4.odometry import Odometer

@@ -21,8 +21,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents.body.interface import BodyError
-from agents.body.kinds import KHEPERA4
 from agents.decision.position_control import PositionController
+from agents.kinds.khepera4 import KHEPERA4
 from agents.protocols import khepera4 as protocol
 from bridges.khepera4 import body as khepera4
 from bridges.khepera4 import drivers

@@ -1,6 +1,6 @@
 """A Tello's pilot with a drone made of lists and a clock made of numbers."""
 
-from agents.body.kinds import TELLO
+from agents.kinds.tello import TELLO
 from agents.protocols import tello as protocol
 from bridges.tello.pilot import Duty, TelloPilot
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from zenoh.handlers import RingChannel
 
 from agents.body.interface import BodyError
-from agents.body.kinds import KHEPERA4
+from agents.kinds.khepera4 import KHEPERA4
 from agents.network.session import open_session
 from agents.protocols import ros2, turtlebot3
 from bridges.turtlebot3.body import TurtleBot3

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.laws import Distance
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
@@ -17,7 +17,7 @@ from experiments.sweep.runs import figures_of
 from experiments.virtual_time import conductor, simulation
 from experiments.virtual_time.log import Logbook
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.models.quadrotor import Quadrotor
 
 pytestmark = pytest.mark.slow  # each check flies the experiment on the virtual clock
 
@@ -344,5 +344,5 @@ def test_linear_step_is_model(axis: int) -> None:
     for _ in range(200):
         quadrotor.command((setpoint[0], setpoint[1], setpoint[2], 0.0))
         quadrotor.move(dt)
-        state = linear_step(RESPONSES["crazyflie"], axis, dt) @ state
+        state = linear_step(CRAZYFLIE.motion, axis, dt) @ state
         assert quadrotor.position[axis] == pytest.approx(state[0], abs=1e-12)

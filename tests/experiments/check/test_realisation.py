@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
 from experiments.check.check import check
 from experiments.check.realisation import (
     Solids,

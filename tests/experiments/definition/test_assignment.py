@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from agents.body.interface import Disturbance, Jitter
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
 from agents.body.limits import Safety
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.laws import Distance
 from agents.plugins.planners import Line
 from agents.plugins.triggers import Periodic, SendOnDelta

@@ -7,14 +7,13 @@ from dataclasses import replace
 import pytest
 
 from agents.body.interface import BodyError
-from agents.body.kinds import KINDS
+from agents.body.kinds import KINDS, Kind
 from experiments.check.analysis import analyse
 from experiments.check.ideal_run import predict
 from experiments.definition.bodies import choose_bodies
 from experiments.file.document import load, loads
 from experiments.file.problems import DocumentError
 from experiments.report import style, trajectories
-from twins.models.differential import DRIVES
 
 KIND = "alphabot"
 ROVERS = (
@@ -25,9 +24,16 @@ ROVERS = (
 )
 
 
+ALPHABOT = Kind(
+    KIND, "twist", flies=False, radius=0.11, height=0.08, mass=0.8, endurance_s=3600.0, speed=0.3, turn_rate=2.0,
+    response=1.0, turn_response=1.5,
+)  # fmt: skip
+MOVING = replace(ALPHABOT, motion=KINDS["khepera4"].motion)
+
+
 @pytest.fixture(autouse=True)
 def known(monkeypatch):
-    monkeypatch.setitem(KINDS, KIND, replace(KINDS["khepera4"], name=KIND))
+    monkeypatch.setitem(KINDS.loaded, KIND, ALPHABOT)
 
 
 def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
@@ -35,29 +41,28 @@ def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
         loads(ROVERS)
     first = caught.value.problems[0]
     assert (first.line, first.message) == (6, f"no twin of '{KIND}'")
-    assert "to DRIVES if it takes a twist" in first.hint
+    assert "give the kind a `motion`" in first.hint
 
 
 def test_a_kind_whose_motion_no_model_has_is_refused_too(monkeypatch):
     """On the floor with velocities, not with a twist: an omnidirectional robot."""
-    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     assert loads(ROVERS)
-    monkeypatch.setitem(KINDS, KIND, replace(KINDS[KIND], takes="velocity"))
+    monkeypatch.setitem(KINDS.loaded, KIND, replace(MOVING, takes="velocity"))
     with pytest.raises(DocumentError) as caught:
         loads(ROVERS)
     assert caught.value.problems[0].message == f"no twin of '{KIND}'"
-    assert "another motion needs a model of its own" in caught.value.problems[0].hint
 
 
 def test_a_kind_without_a_protocol_twin_is_refused_by_name(monkeypatch):
-    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):
         choose_bodies(loads(ROVERS).experiment, "protocol")
     assert choose_bodies(load("triangle").experiment, "protocol")
 
 
 def test_many_robots_of_a_kind_without_a_colour_are_drawn(monkeypatch):
-    monkeypatch.setitem(DRIVES, KIND, DRIVES["khepera4"])
+    monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     cases = loads(ROVERS).cases()
     figure = trajectories.expected_motion({name: analyse(case, predict(case)) for name, case in cases.items()})
-    assert style.OTHER_KIND in {line.get_color() for line in figure.axes[0].lines}
+    assert ALPHABOT.colour in {line.get_color() for line in figure.axes[0].lines}

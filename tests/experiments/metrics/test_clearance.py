@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TURTLEBOT3
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.network.messages import Contact
 from experiments.definition.experiment import Arena
 from experiments.metrics.clearance import Clearance, collisions

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from agents.body.kinds import KINDS
 from experiments.definition.experiment import Arena
 from experiments.metrics.measure import measure
 from experiments.report import figures, style
@@ -155,7 +156,7 @@ def test_a_periodic_case_is_a_line_of_text():
 
 def test_cases_and_robots_have_palettes_of_their_own():
     assert not set(style.CASES[:-1]) & set(style.ROBOTS)
-    assert not set(style.CASES[:-1]) & set(style.KIND_COLOURS.values())
+    assert not set(style.CASES[:-1]) & {kind.colour for kind in KINDS.values()}
 
 
 def test_figures_show_themselves_in_notebooks():

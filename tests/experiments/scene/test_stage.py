@@ -166,7 +166,7 @@ def test_every_kind_has_a_model_of_its_size(kind):
 
 
 @pytest.mark.parametrize(
-    "mesh", [models.box(1.0, 2.0, 0.0, 0.5), models.cylinder(0.3, 0.1, 0.4), models.MODELS["khepera4"].whole]
+    "mesh", [models.box(1.0, 2.0, 0.0, 0.5), models.cylinder(0.3, 0.1, 0.4), models.model(KINDS["khepera4"]).whole]
 )
 def test_faces_look_outward(mesh):
     a, b, c = (mesh.vertices[mesh.faces[:, k].astype(int)] for k in range(3))

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError, Disturbance, Jitter
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
 from agents.vectors import NO_SETPOINT, ZERO
 from tests.twins.planar_drive import columns, command, stage
 from tests.twins.requests import request
 from tests.twins.runge_kutta import runge_kutta
 from twins.body import TwinBody
-from twins.engines.mujoco_model import AIRFRAMES
-from twins.models.quadrotor import GRAVITY, RESPONSES, Quadrotor
+from twins.models.quadrotor import GRAVITY, Quadrotor
 from twins.scene import Obstacle, Scene, World
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
@@ -57,7 +58,7 @@ def rise_and_overshoot(path, step, dt=DT):
 
 def linear_cascade(step, seconds, h=0.0005):
     """x of the continuous cascade, tilts small and nothing at its limit, by Runge and Kutta: the paper's figure 6."""
-    frame = AIRFRAMES["crazyflie"]
+    frame = CRAZYFLIE.airframe
     unit = 2.0 * frame.thrust / 65535.0 * frame.arm / math.sqrt(2.0)  # torque of one unit of roll or pitch [N m]
     lag, inertia = 0.03, frame.inertia[0]
 
@@ -80,7 +81,7 @@ def linear_cascade(step, seconds, h=0.0005):
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
 def test_motors_carry_the_weight(kind):
     engine = hovering(kind)
-    weight = AIRFRAMES[kind.name].mass * GRAVITY
+    weight = kind.airframe.mass * GRAVITY
     assert engine.drones.state[0, LIFT].sum() == pytest.approx(weight, rel=2e-3)
     assert engine.motions[0].attitude == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-6)
     assert engine.motions[0].position == pytest.approx((0.0, 0.0, 1.0), abs=2e-3)
@@ -383,8 +384,7 @@ def test_drones_hunt_with_the_gain_of_wheels():
     assert error[3.0] > 0.025
 
 
-def test_kind_without_airframe_is_refused(monkeypatch):
-    drone = replace(CRAZYFLIE, name="mine")
-    monkeypatch.setitem(RESPONSES, "mine", RESPONSES["crazyflie"])
-    with pytest.raises(BodyError, match="no airframe of 'mine'; add it to AIRFRAMES"):
+def test_kind_without_airframe_is_refused():
+    drone = replace(CRAZYFLIE, name="mine", airframe=None)
+    with pytest.raises(BodyError, match="no airframe of 'mine'; give the kind an `airframe`"):
         RigidBody().build(stage((drone,), [(0, 0)]))

@@ -5,7 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins.planners import Line
 from agents.vectors import UNKNOWN
 from tests.twins.planar_drive import DT, Drive, command, furnished, stage, still

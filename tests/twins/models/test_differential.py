@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from agents.body.kinds import KHEPERA4, TURTLEBOT3
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import ZERO
-from twins.models.differential import DRIVES, Differential
+from twins.models.differential import Differential
 
 DT = 0.01
 
@@ -47,7 +48,7 @@ def test_straight_on_and_on_the_spot():
     drive(twin, (0.2, 0.0), 1.0)
     way = np.linalg.norm(twin.position)
     np.testing.assert_allclose(twin.position, way * np.array([0.5, math.sqrt(0.75), 0.0]), atol=1e-12)
-    ramp = 0.2**2 / (2 * DRIVES["khepera4"].acceleration)
+    ramp = 0.2**2 / (2 * KHEPERA4.motion.acceleration)
     assert way == pytest.approx(0.2 - ramp, abs=0.002)
     place = twin.position
     drive(twin, (0.0, 0.0), 0.2)
@@ -58,7 +59,7 @@ def test_straight_on_and_on_the_spot():
 
 @pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
 def test_limit_of_wheels_keeps_the_curve(kind):
-    limits, twin = DRIVES[kind.name], robot(kind)
+    limits, twin = kind.motion, robot(kind)
     v, w = 3.0, 6.0
     drive(twin, (v, w), 2.0)
     speed = np.linalg.norm(twin.velocity)

@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from agents.body.kinds import CRAZYFLIE, TELLO
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.tello import TELLO
 from agents.vectors import NO_SETPOINT, ZERO
 from tests.twins.runge_kutta import runge_kutta
 from twins.models.onboard_flight import CLIMB, TOUCHDOWN
-from twins.models.quadrotor import RESPONSES, Quadrotor
+from twins.models.quadrotor import Quadrotor
 
 DT = 0.01
 
@@ -52,7 +53,7 @@ def test_steps_solve_stated_law(axis, target):
     dt, setpoint = 0.001, [0.0, 0.0, 0.8, 0.0]
     setpoint[axis] += target
     path = fly(flying(), tuple(setpoint), 5.0, dt)[:, axis] - (0.8 if axis == 2 else 0.0)
-    truth = exact(RESPONSES["crazyflie"], axis, target, dt * np.arange(5001))
+    truth = exact(CRAZYFLIE.motion, axis, target, dt * np.arange(5001))
     np.testing.assert_allclose(path, truth[1:], atol=3e-3 * target)
     assert path[-1] == pytest.approx(target, rel=0.01)
 
@@ -71,7 +72,7 @@ def test_steps_rise_like_firmware(axis, step, rise_ms):
 def test_axes_keep_their_speed_limit():
     path = fly(flying(), (50.0, -50.0, 30.0, 0.0), 3.0)[:, :3]
     speed = np.abs(np.diff(path, axis=0)) / DT
-    limit = RESPONSES["crazyflie"].speed
+    limit = CRAZYFLIE.motion.speed
     # a third state may pass a limit by its overshoot
     assert (speed.max(axis=0) <= np.multiply(1.2, limit)).all()
     np.testing.assert_allclose(speed[-1], limit, rtol=0.01)
@@ -97,7 +98,7 @@ def test_yaw_follows_exponentially():
 def test_velocity_robot_follows_with_lag():
     tello = flying(TELLO)
     path = fly(tello, (0.5, 0.0, 0.0, 0.3), 3.0)
-    gain = RESPONSES["tello"].velocity[0]
+    gain = TELLO.motion.velocity[0]
     assert path[-1, 0] == pytest.approx(0.5 * (3.0 - (1.0 - math.exp(-gain * 3.0)) / gain), abs=0.01)
     assert tello.velocity == pytest.approx((0.5, 0.0, 0.0), abs=1e-3)
     assert tello.yaw == pytest.approx(0.9)

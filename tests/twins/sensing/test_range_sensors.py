@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from agents.body.interface import BodyError
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, KINDS, TURTLEBOT3
+from agents.body.kinds import KINDS
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import ZERO
 from tests.twins.requests import request
 from twins.body import TwinBody
@@ -16,7 +19,7 @@ from twins.engines.engine import Stage
 from twins.engines.point_mass import PointMass
 from twins.scene import Obstacle, Scene, World
 from twins.sensing import range_sensors
-from twins.sensing.range_sensors import OF_KIND, SENSORS, RangeSensors
+from twins.sensing.range_sensors import SENSORS, RangeSensors
 
 
 def placed(kinds, carried, *, obstacles=None, size=(6.0, 6.0, 2.5), noise=0.0, mirrored=None):
@@ -59,8 +62,7 @@ def test_sensors_make_sense():
         assert 0.0 <= sensor.nearest < sensor.farthest, name
         assert sensor.fan.reach == sensor.mount + sensor.farthest, name
         assert sensor.rate_hz > 0.0, name
-    assert OF_KIND.keys() <= KINDS.keys()
-    assert {name for own in OF_KIND.values() for name in own} <= SENSORS.keys()
+    assert {name for kind in KINDS.values() for name in kind.sensors} <= SENSORS.keys()
 
 
 def test_figures_of_the_makers():

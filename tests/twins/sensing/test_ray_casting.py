@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4, TELLO, TURTLEBOT3
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.tello import TELLO
+from agents.kinds.turtlebot3 import TURTLEBOT3
 from twins.scene import Obstacle, Scene
 from twins.sensing import ray_casting
 from twins.sensing.ray_casting import Beams, Caster, Fan

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from agents.body.interface import BodyError
-from agents.body.kinds import CRAZYFLIE
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols import crazyradio
 from agents.protocols.crtp import Port, header
 from twins.arrays import Array

@@ -8,7 +8,8 @@ import numpy as np
 
 from agents.body.external_pose import velocity_after
 from agents.body.interface import BodyRequest
-from agents.body.kinds import CRAZYFLIE
+from agents.body.kinds import Flight
+from agents.kinds.crazyflie import CRAZYFLIE
 from agents.protocols.crazyflie import Lighthouse, Loco, Outside, chosen
 from agents.protocols.crtp import Info, Power
 from twins.arrays import Array, Index, Mask, some
@@ -21,7 +22,7 @@ from twins.devices.crazyflie.vertical import VerticalLoops
 from twins.devices.device import Faults
 from twins.models.disturbance import HoverJitter, Latency, Measurement
 from twins.models.noise import refill
-from twins.models.quadrotor import GRAVITY, RESPONSES, Quadrotor
+from twins.models.quadrotor import GRAVITY, Quadrotor
 
 SETTLING_S: Final = 0.1  # time constant of the convergence of estimate and variance with measurements
 PRECISE: Final = 1e-5  # [m²] final variance
@@ -195,9 +196,10 @@ class Flock:
         self._low_since = np.full(rows, np.inf)  # [s]
         self._drain = self.dt * faults.drain / CRAZYFLIE.endurance_s
         self._disturbances = Disturbances(request, self.dt)
-        response, kind = RESPONSES["crazyflie"], request.kinds[0]
-        self._gain, self._turn_gain = np.array(response.position), kind.turn_response
-        self._speed_gain = np.array(response.velocity)
+        flight = CRAZYFLIE.motion
+        assert isinstance(flight, Flight)
+        self._gain, self._turn_gain = np.array(flight.position), request.kinds[0].turn_response
+        self._speed_gain = np.array(flight.velocity)
         self.estimator.error[:] = -self.quadrotor.position  # it believes to be where it was switched on,
         self.estimator.turn[:] = -self.quadrotor.yaw  # and to look along x
         self.vertical = VerticalLoops([each.platform for each in settings], self.dt)

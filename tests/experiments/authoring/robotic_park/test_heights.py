@@ -3,9 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import CRAZYFLIE, KHEPERA4
 from agents.formation.anchors import Anchor
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
+from agents.kinds.crazyflie import CRAZYFLIE
+from agents.kinds.khepera4 import KHEPERA4
 from experiments.authoring import layouts
 from experiments.authoring.robotic_park.heights import Room, find_shape
 from experiments.check.realisation import ENOUGH, Solids

@@ -1,0 +1,45 @@
+"""Crazyflie 2.1 (figures: Bitcraze's data sheet and firmware)."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final
+
+from agents.body.kinds import Airframe, Flight, Kind, ProtocolTwin
+
+CRAZYFLIE: Final = Kind(
+    "crazyflie",
+    "position",
+    flies=True,
+    radius=0.065,
+    height=0.029,
+    mass=0.029,  # with a deck for its position: the maker's 27 g of a 2.1 are those of a bare one
+    endurance_s=420.0,
+    speed=1.0,
+    turn_rate=10.0,  # that of a step of 3 rad under the firmware's yaw controller
+    response=2.0,  # position P of the firmware
+    turn_response=7.6,  # step response of the firmware's yaw controller
+    lag=0.4,  # velocity loop and tilt, 0.2 s each
+    overshoot=0.11,  # the firmware's height loop, of 27 to 36 g: 7 to 11 %, for 10 to 15 s
+    # fitted to step responses of a rigid body under the firmware's cascade (docs/mujoco.md)
+    motion=Flight((2.0, 2.0, 2.8), (5.0, 5.0, 3.5), (1.1, 1.1, 1.4), (5.0, 5.0, inf)),
+    airframe=Airframe(
+        mass=0.027,
+        inertia=(1.657e-5, 1.657e-5, 2.926e-5),
+        arm=0.046,
+        thrust=0.12,
+        torque=0.00596,  # Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", 2015
+        size=(0.092, 0.092, 0.029),
+    ),
+    aliases=("dron", "crazyflie"),
+    prefix="CF",
+    colour="#AA4499",
+    mesh="experiments.scene.models:crazyflie",
+    bodies=("radio", "usb", "udp"),
+    library="cflib",
+    twin=ProtocolTwin("crazyflie-twin", "radio0", device={"link": "radio"}),  # several hang on one radio
+    connect="switch it on; channel, rate and address as in the Crazyflie client; radio plugged in and permitted "
+    "(docs/crazyflie.md)",
+    charge="charge it; one that sags under load although it was full is worn: replace it",
+    locks=True,
+)

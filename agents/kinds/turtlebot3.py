@@ -1,0 +1,32 @@
+"""TurtleBot3 Burger (figures: Robotis' manual)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from agents.body.kinds import Kind, ProtocolTwin, Wheels
+
+TURTLEBOT3: Final = Kind(
+    "turtlebot3",
+    "twist",
+    flies=False,
+    radius=0.105,
+    height=0.192,
+    mass=1.0,
+    endurance_s=9000.0,
+    speed=0.22,
+    turn_rate=2.84,
+    response=1.0,
+    turn_response=1.5,
+    motion=Wheels(base=0.160, speed=0.22 + 2.84 * 0.080, acceleration=2.0),  # acceleration: our choice
+    sensors=("lds01",),
+    aliases=("turtlebot", "burger"),
+    prefix="TB",
+    colour="#000000",
+    mesh="experiments.scene.models:turtlebot",
+    bodies=("ros2dds", "rmw"),
+    library="rosbags",
+    twin=ProtocolTwin("turtlebot3-twin"),
+    connect="switch it on, start its bringup and the Zenoh bridge, `ROS_DOMAIN_ID` as in the file (docs/turtlebot3.md)",
+    charge="charge it; below 11 V the board beeps",
+)
