@@ -17,7 +17,7 @@ import numpy as np
 from experiments.definition.experiment import Channel, Experiment
 from experiments.definition.plan import Plan
 from experiments.file.document import load
-from experiments.sweep.runs import Figures, figures_of
+from experiments.sweep.runs import RunMetrics, run_metrics
 from experiments.virtual_time import simulation
 from experiments.virtual_time.log import Logbook
 
@@ -29,15 +29,15 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], float, float, float]:
-    """Figures of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
+def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, float, float]:
+    """Metrics of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
     listeners = np.bincount(Plan(experiment).pose_links.sender, minlength=len(experiment.robots))
-    found: list[Figures] = []
+    found: list[RunMetrics] = []
     messages, deliveries, delay = [], [], []
     for seed in seeds:
         log = simulation.simulate(experiment, seed, lean=True)
         book, time = Logbook(log, experiment, ""), log.sent.stamp
-        found.append(figures_of(book.trace()))
+        found.append(run_metrics(book.trace()))
         within = (time >= -1e-9) & (time < experiment.duration_s - 1e-9)
         sent = np.bincount(log.sent.link[within], minlength=len(log.names))
         told, received = 0, 0
@@ -49,9 +49,9 @@ def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[Figures], 
     return found, fmean(messages), fmean(deliveries), fmean(delay) if delay else 0.0
 
 
-def mean(runs: Sequence[Figures], what: str) -> float:
+def mean(runs: Sequence[RunMetrics], what: str) -> float:
     """Over the seeds for which it is known."""
-    known = [value for run in runs if (value := getattr(run, what)) is not None]
+    known = [value for run in runs if (value := run.values[what]) is not None]
     return fmean(known) if known else float("nan")
 
 
@@ -65,14 +65,14 @@ def main() -> None:
         print(f"\n{name}, seeds 1 to {len(seeds)}\n")
         print("| one way | decides | messages | deliveries | goals late by | IAE | ITAE | acquired | formed |")
         print("|---|---|---|---|---|---|---|---|---|")
-        first: list[Figures] | None = None
+        first: list[RunMetrics] | None = None
         for delay_s in DELAYS_S:
             for who, case in cases.items():
                 experiment = msgspec.structs.replace(case, trigger=trigger, channel=Channel(delay_s=delay_s))
                 runs, messages, deliveries, late = flown(experiment, seeds)
                 first = first or runs
                 ratio = {what: mean(runs, what) / mean(first, what) for what in ("iae", "itae")}
-                formed = sum(run.acquired_s is not None for run in runs)
+                formed = sum(run.values["acquired_s"] is not None for run in runs)
                 late_ms = "–" if who == "distributed" else f"{1e3 * late:.0f} ms"
                 print(
                     f"| {1e3 * delay_s:g} ms | {who} | {messages:.0f} | {deliveries:.0f} | {late_ms} | "

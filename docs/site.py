@@ -148,6 +148,7 @@ def _is_option(part: click.Parameter) -> bool:
 def metrics() -> Iterator[str]:
     """Metrics, which are the columns of metrics.csv and the fields of metrics.json."""
     from experiments.metrics import results  # noqa: PLC0415
+    from experiments.metrics.metric import OURS  # noqa: PLC0415
 
     yield "# Metrics and CSV columns\n"
     yield (
@@ -155,6 +156,8 @@ def metrics() -> Iterator[str]:
         " the fields of `RobotMetrics` as columns; those of a later phase begin with `phase2_`, of the closest approach"
         " with `near_` and `near_arena_`, of the shadow twin with `shadow_`. `metrics.json` has everything below.\n"
     )
+    yield from ("| metric | head | definition |", "|---|---|---|")
+    yield from (f"| `{name}` | {each.head} | {_cell(each.meaning)} |" for name, each in OURS.items())
     yield from _structs(results)
 
 

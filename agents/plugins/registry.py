@@ -1,4 +1,4 @@
-"""Registry of plug-ins, found through entry points: bodies, kinds, triggers, laws, planners, avoidances and engines.
+"""Registry of plug-ins by entry points: bodies, kinds, triggers, laws, planners, avoidances, engines and metrics.
 
 A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a class, made
 with a `agents.body.interface.BodyRequest`; a kind of robot is an object `agents.body.kinds.Kind`. Any distribution may
@@ -34,6 +34,7 @@ ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
 STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
 CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
 BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Gradient, AVOIDANCES: Avoidance}
+METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
 
@@ -161,15 +162,19 @@ def body_name(address: str) -> str:
 
 
 def distributions(text: str | None = None) -> dict[str, str]:
-    """Installed distributions with plug-ins, and their versions, but for our own; those that a text names, if given."""
+    """Installed distributions with plug-ins, and their versions, but for our own; with metrics, or named, if `text`."""
     words = None if text is None else {*re.findall(r"[\w.-]+", text)}
-    owners = {_name(dist): dist.version for entry, dist in _foreign() if words is None or entry.name in words}
+    used = [
+        (entry, dist) for entry, dist in _foreign() if entry.group == METRICS or words is None or entry.name in words
+    ]
+    owners = {_name(dist): dist.version for _, dist in used}
     return dict(sorted(owners.items()))
 
 
 def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     """Entry points of other distributions than ours."""
-    entries = (entry for group in (BODIES, DEVICES, *CHOSEN) for entry in _installed().select(group=group))
+    groups = (BODIES, DEVICES, METRICS, *CHOSEN)
+    entries = (entry for group in groups for entry in _installed().select(group=group))
     return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
 
 

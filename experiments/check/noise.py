@@ -12,7 +12,7 @@ from experiments.check.analysis import Analysis
 from experiments.check.findings import DELAYED, FORGIVEN, Finding
 from experiments.check.ideal_run import fly, has_noise, isolated, repetitions
 from experiments.check.theory import FAR_OFF, strength
-from experiments.metrics.measure import WINDOW_S
+from experiments.metrics.measurement import WINDOW_S
 
 SOFT: Final = 3.0  # time constants of a mode, of whose error 5 % are left then, that are to fit into the run
 LATER: Final = 2.0  # times the time without noise, from which on a formation is acquired late

@@ -8,9 +8,7 @@ of a run that was interrupted cover the time until then.
 from __future__ import annotations
 
 import math
-import statistics
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -22,50 +20,41 @@ from agents.safety.hazards import UNRESOLVED, failed, is_blind
 from experiments.definition import link_conditions
 from experiments.definition.graph import Links
 from experiments.metrics import centralised
-from experiments.metrics.clearance import Clearance, collisions
+from experiments.metrics.clearance import collisions
 from experiments.metrics.comparable import reasons
-from experiments.metrics.results import INDICES, Approach, Belief, CaseMetrics, Collision, Passage, Phase, RobotMetrics
+from experiments.metrics.measurement import BAND, Measurement
+from experiments.metrics.metric import (
+    OURS,
+    Number,
+    case_values,
+    foreign_metrics,
+    known_metrics,
+    unusable_metrics,
+    values_of,
+)
+from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
     LinkErrors,
-    after_last,
     belief_errors,
     closest_distance,
     integral,
-    integrals,
-    leaders,
     link_passages,
     mean_known,
     net_rotation,
     network_away,
     outside_arena,
-    phase_starts,
-    transmission_gaps,
-    transmissions,
 )
 from experiments.recording.trace import ROUNDING_S, Trace
 from twins.arrays import norm
 
-WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
-BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # a robot whose position is known for less of the run was out of reach
 GAP_S: Final = 0.5  # [s] shorter times without a position are not named
-KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
 
 
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _mean_indices(robots: Sequence[RobotMetrics]) -> dict[str, float | None]:
-    """Each index averaged over the robots for which it is known; `acquired_s` only if all of them acquired."""
-    mean: dict[str, float | None] = {}
-    for index in INDICES:
-        known = [value for value in (getattr(robot, index) for robot in robots) if value is not None]
-        complete = len(known) == len(robots) or index != "acquired_s"
-        mean[index] = statistics.fmean(known) if known and complete else None
-    return mean
 
 
 def failures(trace: Trace, known: Sequence[float]) -> tuple[str, ...]:
@@ -102,20 +91,15 @@ def measure(trace: Trace) -> CaseMetrics:
     """
     if len(trace.time) < 2:
         raise ValueError(f"case '{trace.case}' holds fewer than two samples: the run ended before it began")
-    names, errors = trace.robots, LinkErrors.of_trace(trace)
-    bounds = bounds_of(trace)
-    phases = _phases(trace, errors, bounds)
-    clearance = Clearance.of_trace(trace)
+    names, shared = trace.robots, Measurement(trace)
+    errors, clearance, kept = shared.errors, shared.clearance, shared.kept
     touched = collisions(trace, clearance)
-    passed = link_passages(trace)
-    robots = _robots(trace, errors, phases, touched, clearance, passed=passed)
+    values, faults = values_of(known_metrics(), shared)
+    robots = _robots(shared, touched, values)
 
-    leading = leaders(trace)
-    died = tuple(robot.robot for robot in robots if robot.known < KNOWN and robot.robot not in leading)
-    kept = [i for i, name in enumerate(names) if name not in leading and name not in died]
-    together = [_all([phase[i].acquired_s for i in kept if errors.own[:, i].any()]) for phase in phases]
+    together = [_all([phase[i].acquired_s for i in kept if errors.own[:, i].any()]) for phase in shared.phases]
     rotation: list[float | None] = []
-    for k, (_, begin, end) in enumerate(bounds):
+    for k, (_, begin, end) in enumerate(shared.bounds):
         after = begin + round((together[k] or 0.0) / float(trace.time[1] - trace.time[0]))
         formed = k > 0 or together[k] is not None  # before, there is no shape that one could turn
         rotation.append(net_rotation(trace.true_position[after:end, kept], trace.time[after:end]) if formed else None)
@@ -134,11 +118,11 @@ def measure(trace: Trace) -> CaseMetrics:
         planned_s=trace.experiment.duration_s,
         interrupted=ended_early(trace),
         tolerance=trace.experiment.tolerance,
-        starts_s=tuple(start for start, _, _ in bounds),
+        starts_s=tuple(start for start, _, _ in shared.bounds),
         robots=robots,
-        leaders=leading,
-        died=died,
-        mean=_mean_indices([robots[i] for i in kept]),
+        leaders=shared.leaders,
+        died=shared.died,
+        mean=case_values(known_metrics(), values, kept),
         acquired_s=tuple(together),
         rotation_rad_s=tuple(rotation),
         j2=_benchmark_cost(trace, errors),
@@ -152,8 +136,8 @@ def measure(trace: Trace) -> CaseMetrics:
         excursion=max(0.0, float(beyond[farthest])),
         excursion_robot=names[farthest] if beyond[farthest] > 0.0 else "",
         lost=int(trace.lost.sum()),
-        dropped=sum(each.dropped for each in passed),
-        passages=passed,
+        dropped=int(shared.dropped.sum()),
+        passages=link_passages(trace),
         modelled=link_conditions.models_network(trace.experiment),
         missed_deadlines=int(trace.missed_deadlines.sum()),
         missed_share=_share(trace.missed_deadlines.sum(), ticks + int(trace.missed_deadlines.sum())),
@@ -174,6 +158,7 @@ def measure(trace: Trace) -> CaseMetrics:
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
+        metric_faults=(*unusable_metrics(), *faults),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
 
@@ -183,49 +168,15 @@ def ended_early(trace: Trace) -> bool:
     return float(trace.time[-1]) < trace.experiment.duration_s - 1.5 * float(trace.time[1] - trace.time[0])
 
 
-def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
-    """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
-    starts = phase_starts(trace)
-    begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
-    ends = [*begins[1:], len(trace.time)]
-    return [(starts[k], int(begin), int(end)) for k, begin, end in zip(first, begins, ends, strict=True)]
-
-
-def _phases(trace: Trace, errors: LinkErrors, bounds: Sequence[tuple[float, int, int]]) -> list[list[Phase]]:
-    """Per phase and robot: time of acquisition and residual error."""
-    window = max(1, round(WINDOW_S / float(trace.time[1] - trace.time[0])))
-    found = []
-    for start, begin, end in bounds:
-        acquired = errors.part(begin, end).acquired(window, trace.experiment.tolerance)
-        worst = errors.part(max(begin, end - window), end).worst(trace.robots)
-        found.append([Phase(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
-    return found
-
-
 def _robots(
-    trace: Trace,
-    errors: LinkErrors,
-    phases: Sequence[Sequence[Phase]],
-    touched: Sequence[Collision],
-    clearance: Clearance,
-    *,
-    passed: Sequence[Passage],
+    shared: Measurement, touched: Sequence[Collision], values: Mapping[str, Sequence[Number]]
 ) -> tuple[RobotMetrics, ...]:
-    rows, time, mine = len(trace.robots), trace.time, errors.own
-    duration = float(time[-1] - time[0])
-    joined = np.zeros(rows) if trace.joined is None else trace.joined
-    present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])  # [s] of each robot
-    total = errors.per_robot()
-    iae, itae, rmse = integrals(total, time)
-    there = errors.expected()
+    """Metrics of each robot, from the contacts and the values of `known_metrics`."""
+    trace, errors, clearance = shared.trace, shared.errors, shared.clearance
+    rows, duration = len(trace.robots), float(trace.time[-1] - trace.time[0])
+    there, mine = errors.expected(), errors.own
     covered = (np.isfinite(errors.error) & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
     coverage = (covered @ mine) / np.maximum(mine.sum(axis=0), 1.0)
-    known = errors.known()
-    unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
-    settled = after_last(unsettled & (errors.there | np.isfinite(total)), time)
-    sent, recorded = transmissions(trace)
-    early = [int((trace.sent_by(i).stamp < joined[i]).sum()) for i in range(rows)]  # poses before a robot took part
-    size = np.bincount(trace.sent.link, weights=trace.sent.bytes, minlength=rows)
     linked = np.zeros((rows, rows), dtype=bool)  # links for avoidance alone do not belong to the formation
     guided = centralised.guided_rows(trace)[errors.net.receiver]  # the centre receives their neighbours' poses
     linked[errors.net.receiver[~guided], errors.net.sender[~guided]] = True
@@ -235,44 +186,38 @@ def _robots(
     listeners = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.received_by_centre(trace)
     if trace.goals is not None:
         delivered += trace.goals.received
-    goals, goal_bytes, late = *centralised.goals_to(trace), centralised.delays(trace)
-    waits = [
-        (wait.min(), float(np.median(wait)), wait.max()) if len(wait) else (np.nan,) * 3
-        for wait in transmission_gaps(trace)
-    ]
+    goals, goal_bytes = centralised.goals_to(trace)
+    late, agreements = centralised.delays(trace), agreement(trace)
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
-    agreements = agreement(trace)
-    dropped = Counter(dict.fromkeys(trace.robots, 0))
-    for link in passed:
-        dropped[link.sender] += link.dropped
     numbers = {  # (N,) each
-        **{"messages": sent, "bytes": size, "recorded": recorded, "listeners": listeners, "heard": delivered},
-        **{"lost": trace.lost, "missed_deadlines": trace.missed_deadlines, "updates": trace.decisions},
+        **{"recorded": shared.transmissions[1], "listeners": listeners, "heard": delivered},
         **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
         "foreign": np.zeros(rows, dtype=np.intp) if trace.foreign is None else trace.foreign,
     }
-    unsure = {"iae": iae, "itae": itae, "rmse": rmse}  # (N,) each, NaN where unknown
-    unsure |= zip(("gap_min_s", "gap_median_s", "gap_max_s"), np.array(waits).T, strict=True)
-    own_numbers: list[dict[str, Any]] = [
-        {what: int(each[i]) for what, each in numbers.items()}
-        | {what: _number(each[i]) for what, each in unsure.items()}
-        | late[i]
-        for i in range(rows)
-    ]
+    foreign = [name for name, metric in foreign_metrics().items() if metric.per == "robot"]
+
+    def plain(i: int) -> dict[str, Any]:
+        waits = shared.waits[i]
+        return {
+            **{name: values[name][i] for name in OURS},
+            **{what: int(each[i]) for what, each in numbers.items()},
+            "gap_min_s": float(waits.min()) if len(waits) else None,
+            "gap_median_s": float(np.median(waits)) if len(waits) else None,
+            "gap_max_s": float(waits.max()) if len(waits) else None,
+            **late[i],
+        }
+
     return tuple(
         RobotMetrics(
             robot=name,
             kind=trace.experiment.robots[name].kind,
-            f_hz=float(sent[i] - early[i]) / float(present[i]),
-            acquired_s=phases[0][i].acquired_s,
-            dropped=dropped[name],
-            residual=phases[0][i].residual,
-            worst=phases[0][i].worst,
-            phases=tuple(phase[i] for phase in phases[1:]),
-            settle_s=duration if (when := settled[i]) is None else when,
+            residual=shared.phases[0][i].residual,
+            worst=shared.phases[0][i].worst,
+            phases=tuple(phase[i] for phase in shared.phases[1:]),
+            settle_s=duration if (when := shared.settled[i]) is None else when,
             missed_share=_share(trace.missed_deadlines[i], trace.ticks[i] + trace.missed_deadlines[i]),
             coverage=float(coverage[i]),
-            known=float(known[i]),
+            known=float(shared.known[i]),
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
             overlap=max((each.overlap for each in own[i]), default=None),
@@ -282,7 +227,8 @@ def _robots(
             intervened_share=_share(trace.interventions[i], trace.ticks[i]),
             avoided_share=_share(trace.avoided[i], trace.ticks[i]),
             shadow=agreements[i],
-            **own_numbers[i],
+            extra={name: values[name][i] for name in foreign},
+            **plain(i),
         )
         for i, name in enumerate(trace.robots)
     )

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import msgspec
-
-INDICES: Final = (
-    *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s"),
-    *("lost", "dropped", "missed_deadlines"),
-)
 
 
 class Phase(msgspec.Struct, frozen=True):
@@ -124,6 +117,12 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     delay_p95_s: float | None = None  # [s]
     delay_max_s: float | None = None  # [s]
     foreign: int = 0  # poses in its name that did not come from its process, and were refused
+    extra: dict[str, float | None] = {}  # metrics of other distributions, by name
+
+    def value(self, name: str) -> float | None:
+        """The value of a metric; None if it is unknown, or was not measured."""
+        found: float | None = self.extra.get(name, getattr(self, name, None))
+        return found
 
     @property
     def by_the_end(self) -> tuple[float | None, str]:
@@ -165,7 +164,7 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     robots: tuple[RobotMetrics, ...]
     leaders: tuple[str, ...]  # robots that the means leave out because they lead
     died: tuple[str, ...]  # robots that the means leave out because their position is unknown for too long
-    # each of `INDICES` averaged over the others; `acquired_s` is None if any of them never acquired
+    # each of `known_metrics` averaged over the others, or of the case; `acquired_s` is None if any never acquired
     mean: dict[str, float | None]
     # [s] acquisition of the whole formation per phase, since the start of the phase
     acquired_s: tuple[float | None, ...]
@@ -210,3 +209,4 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     guidance: Guidance | None = None  # None if each robot decides for itself
     # why the figures are compared with none of another case, one clause each, see `metrics.comparable`
     spoiled: tuple[str, ...] = ()
+    metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each

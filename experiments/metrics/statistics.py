@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
 from experiments.metrics.comparable import SAME_COVERAGE, coverage, equally_long
-from experiments.metrics.results import INDICES, CaseMetrics
-
-# indices that grow with the known part of a run
-INTEGRALS: Final = ("iae", "itae")
+from experiments.metrics.metric import known_metrics
+from experiments.metrics.results import CaseMetrics
 
 
 def ratio(value: float | None, reference: float | None) -> float | None:
@@ -22,17 +20,18 @@ def ratio(value: float | None, reference: float | None) -> float | None:
 
 
 def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index: str) -> list[float | None]:
-    """An index of each run over the reference: of the same seed if all seeds are the same, else over its mean.
+    """A metric of each run over the reference: of the same seed if all seeds are the same, else over its mean.
 
-    None for runs that were spoiled, for those that are shorter than others, and of integrals for those of which less is
-    known than of others; such a run of the reference is left out.
+    None for runs that were spoiled, for those that are shorter than others, and of metrics that add up for those of
+    which less is known than of others; such a run of the reference is left out.
     """
-    every = [*runs, *reference]
+    every, metric = [*runs, *reference], known_metrics().get(index)
+    sums = metric is not None and metric.sums
     longest, most = max(run.duration_s for run in every), max(coverage(run) for run in every)
 
     def value(run: CaseMetrics) -> float | None:
-        less = index in INTEGRALS and most - coverage(run) > SAME_COVERAGE
-        return None if run.spoiled or less or not equally_long((run.duration_s, longest)) else run.mean[index]
+        less = sums and most - coverage(run) > SAME_COVERAGE
+        return None if run.spoiled or less or not equally_long((run.duration_s, longest)) else run.mean.get(index)
 
     return ratios_by_seed(*({run.seed: value(run) for run in each} for each in (runs, reference)))
 
@@ -58,14 +57,15 @@ def by_case(cases: Sequence[CaseMetrics]) -> dict[str, list[CaseMetrics]]:
 
 
 def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Mean, standard deviation and 95 % confidence half-width of each index and ratio over runs of several seeds.
+    """Mean, standard deviation and 95 % confidence half-width of each metric and ratio over runs of several seeds.
 
     Returns:
-        `{"seeds": [...], "cases": {case: {"mean" | "ratio": {index: {"mean", "std", "ci95", "n"}}}}}`. `n` counts the
+        `{"seeds": [...], "cases": {case: {"mean" | "ratio": {metric: {"mean", "std", "ci95", "n"}}}}}`. `n` counts the
         seeds for which the value is known; the half-width is Student's, None for fewer than two. Of runs that were
         spoiled or interrupted, which the means include, also `{"flawed": {case: {seed: [reason, ...]}}}`.
     """
     cases = list(dict.fromkeys(case for each in documents for case in each["cases"]))
+    names = dict.fromkeys(name for each in documents for found in each["cases"].values() for name in found["mean"])
     flawed: dict[str, dict[int, list[str]]] = {}
     for each in documents:
         for case, found in each["cases"].items():
@@ -77,10 +77,10 @@ def across_seeds(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "cases": {
             case: {
                 group: {
-                    index: msgspec.structs.asdict(
-                        spread([each["cases"][case][group][index] for each in documents if case in each["cases"]])
+                    name: msgspec.structs.asdict(
+                        spread([each["cases"][case][group].get(name) for each in documents if case in each["cases"]])
                     )
-                    for index in INDICES
+                    for name in names
                 }
                 for group in ("mean", "ratio")
             }

@@ -23,7 +23,6 @@ SOURCE: Final = KEPT
 ORIGIN: Final = "run.json"
 METRICS: Final = "metrics.json"
 LATEST: Final = 1e11  # [s] UTC that a date can be made of
-KEY_FIGURES: Final = ("f_hz", "iae", "rmse", "acquired_s")  # means over the robots of a case, see `metrics.json`
 
 
 class RunOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -118,7 +117,7 @@ class PastRun(msgspec.Struct, frozen=True):
     megabytes: float  # of all files
     recorded: bool  # whether it has a recording
     seeds: list[int]
-    cases: dict[str, dict[str, dict[int, float | None]]]  # `KEY_FIGURES` of each case, by seed; None: not known
+    cases: dict[str, dict[str, dict[int, float | None]]]  # metrics of each case, by seed; None: not known
     # of each case and seed what a reader of its figures must know: how much of its time it took, what spoiled it
     remarks: dict[str, dict[int, str]] = {}
     lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
@@ -163,7 +162,8 @@ def _past_run(folder: Path) -> PastRun | None:
             remarks.setdefault(each.case, {})[each.seed] = each.remark
     for case in dict.fromkeys(each.case for each in cases):
         means = {each.seed: each.mean for each in cases if each.case == case}
-        figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in KEY_FIGURES}
+        names = dict.fromkeys(name for mean in means.values() for name in mean)
+        figures[case] = {name: {seed: mean.get(name) for seed, mean in means.items()} for name in names}
     seeds = sorted({each.seed for each in cases})
     try:
         made = origin.begun if 0.0 < origin.begun < LATEST else source.stat().st_mtime

@@ -18,6 +18,7 @@ import numpy as np
 
 from agents.errors import ExplainedError
 from experiments.definition.graph import adjacency
+from experiments.metrics.metric import PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, phase_starts
 from experiments.recording.trace import Trace
@@ -58,12 +59,6 @@ UNITS: Final[dict[str, Any]] = {
         "bearing": "1, from the speaker to the listener",
     },
     "metrics": {
-        "f_hz": "Hz",
-        "bytes": "bytes",
-        "iae": "m s",
-        "itae": "m s^2",
-        "rmse": "m",
-        "acquired_s": "s",
         "residual": "m",
         "settle_s": "s",
         "gap_min_s": "s",
@@ -153,6 +148,8 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     net, sent, experiment = trace.plan.links, trace.sent, trace.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
     columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
+    columns += [name for robot in metrics.robots[:1] for name in robot.extra]
+    measured = {name: metric.unit.translate(PLAIN) for name, metric in known_metrics().items() if metric.unit}
     links = {
         "listener": net.receiver + 1,  # MATLAB counts from 1
         "speaker": net.sender + 1,
@@ -177,12 +174,12 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         "adjacency": adjacency(net, len(trace.robots)),
         "metrics": {
             "robot": [robot.robot for robot in metrics.robots],
-            **{name: [getattr(robot, name) for robot in metrics.robots] for name in columns},
+            **{name: [robot.value(name) for robot in metrics.robots] for name in columns},
             **{name: getattr(metrics, name) for name in ("leaders", "mean", "j2", "belief_rms", "belief_max")},
             "formation_acquired_s": metrics.acquired_s,
             "rotation_rad_s": metrics.rotation_rad_s,
         },
-        "units": UNITS,
+        "units": UNITS | {"metrics": measured | UNITS["metrics"]},
     }
     return {name: _converted(value) for name, value in case.items()}
 

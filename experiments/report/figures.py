@@ -20,7 +20,8 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from experiments.metrics.measure import WINDOW_S, bounds_of
+from experiments.metrics.measurement import WINDOW_S, bounds_of
+from experiments.metrics.metric import FORMULA, known_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import LinkErrors, leaders, moving_mean, transmission_gaps
@@ -28,7 +29,6 @@ from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
 from experiments.report.metrics_files import Band
 from experiments.report.style import (
-    BARS,
     CASES,
     HATCHES,
     INK,
@@ -37,6 +37,7 @@ from experiments.report.style import (
     MARKERS,
     PAPER,
     SHORTEST_S,
+    TALLEST,
     WIDTH,
     Drawing,
     Line,
@@ -109,9 +110,10 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     grouped = by_case(cases)
     (reference, first), *others = grouped.items()
     figure = Drawing(figsize=(width, 1.9 if len(others) <= 4 else 2.3), layout="constrained")
-    panels = figure.subplots(1, 2, width_ratios=(1, len(BARS) - 1))
+    bars = _bar_metrics()
+    panels = figure.subplots(1, 2, width_ratios=(1, len(bars) - 1))
     share = min(0.8 / max(1, len(others)), 0.5)
-    for axes, indices in zip(panels, (BARS[:1], BARS[1:]), strict=True):
+    for axes, indices in zip(panels, (bars[:1], bars[1:]), strict=True):
         tops = [0.0]
         for k, (name, runs) in enumerate(others):
             found = [spread(ratios(runs, first, index)) for index, _, _ in indices]
@@ -143,27 +145,37 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     return figure
 
 
+def _bar_metrics() -> list[tuple[str, str, str]]:
+    """Metrics that are drawn as bars: name, label and unit as matplotlib writes them."""
+    return [
+        (name, f"${metric.label}$" if len(metric.label) == 1 else plain(metric.label), metric.unit.translate(FORMULA))
+        for name, metric in known_metrics().items()
+        if metric.figure
+    ]
+
+
 @styled
 def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     """Transmission rate and errors of each robot (paper, figure 15); those that the means leave out in brackets."""
     grouped = by_case(cases)
     names = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots))
     out = {name for case in cases for name in (*case.leaders, *case.died)}
-    figure = Drawing(figsize=(width, 4.3), layout="constrained")
-    panels = figure.subplots(len(BARS), 1, sharex=True, squeeze=False)[:, 0]
+    bars = [each for each in _bar_metrics() if known_metrics()[each[0]].per == "robot"]
+    figure = Drawing(figsize=(width, min(1.075 * len(bars), TALLEST)), layout="constrained")
+    panels = figure.subplots(len(bars), 1, sharex=True, squeeze=False)[:, 0]
     share = 0.8 / max(1, len(grouped))
-    for axes, (index, label, unit) in zip(panels, BARS, strict=True):
-        known = [value for case in cases for robot in case.robots if (value := getattr(robot, index))]
+    for axes, (index, label, unit) in zip(panels, bars, strict=True):
+        known = [value for case in cases for robot in case.robots if (value := robot.value(index))]
         wide = index == "f_hz" and bool(known) and max(known) > WIDE * min(known)
         for k, (name, runs) in enumerate(grouped.items()):
             robots = [robot for run in runs for robot in run.robots]
-            found = [spread([getattr(each, index) for each in robots if each.robot == name]) for name in names]
+            found = [spread([each.value(index) for each in robots if each.robot == name]) for name in names]
             x = np.arange(len(names)) + (k - 0.5 * (len(grouped) - 1)) * share
             if wide:
                 _points(axes, x, found, k=k)
             else:
                 _bars(axes, x, found, width=share, k=k, label=plain(name))
-        axes.set_ylabel(f"{label} [{unit}]")
+        axes.set_ylabel(f"{label} [{unit}]" if unit else label)
         axes.tick_params(axis="x", length=0)
         if wide:  # beside fifty messages a second two are seen on a logarithmic axis alone, which has no zero for bars
             axes.set_yscale("log")

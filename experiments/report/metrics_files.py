@@ -10,23 +10,23 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 
-from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics, ShadowMetrics
+from experiments.metrics.results import CaseMetrics, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 from twins.arrays import Array
 
-_NESTED: Final = ("phases", "near", "near_arena", "shadow")
+_NESTED: Final = ("phases", "near", "near_arena", "shadow", "extra")
 
 
 def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[str, Any]:
-    """The figures of one run for scripts: per case and robot the indices, their means, and ratios to the first case."""
+    """The figures of one run for scripts: per case and robot the metrics, their means, and ratios to the first case."""
     return {
         "run": run_folder,
         "seed": seed,
         "cases": {
             case.case: {
-                "robots": {robot.robot: {index: getattr(robot, index) for index in INDICES} for robot in case.robots},
+                "robots": {robot.robot: _of_robot(robot, case) for robot in case.robots},
                 "mean": dict(case.mean),
-                "ratio": {index: next(iter(ratios([case], cases[:1], index))) for index in INDICES},
+                "ratio": {index: next(iter(ratios([case], cases[:1], index))) for index in case.mean},
                 "collisions": len(case.collisions),
                 "network": {
                     "messages": case.network_messages,
@@ -37,10 +37,16 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
                 "near_m": None if case.near is None else case.near.gap,
                 **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
                 **({"spoiled": list(case.spoiled)} if case.spoiled else {}),
+                **({"metric_faults": list(case.metric_faults)} if case.metric_faults else {}),
             }
             for case in cases
         },
     }
+
+
+def _of_robot(robot: RobotMetrics, case: CaseMetrics) -> dict[str, float | None]:
+    """Metrics of a robot by name; those of the case are left out."""
+    return {name: robot.value(name) for name in case.mean if name in _PLAIN or name in robot.extra}
 
 
 def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
@@ -67,7 +73,8 @@ def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     near = [f"{what}_{part}" for what in ("near", "near_arena") for part in ("gap", "to", "at_s")]
     shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
-    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows]
+    added = dict.fromkeys(name for case in cases for name in case.mean if name not in _PLAIN)
+    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added]
 
 
 _PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
@@ -83,6 +90,7 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
             if near is not None:
                 row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
         row |= _flat_shadow(robot.shadow) if robot.shadow else {}
+        row |= robot.extra
         known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
         yield {**known, "in_mean": int(robot.robot not in out), **row}
 

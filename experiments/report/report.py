@@ -21,11 +21,11 @@ from experiments.report import figures, replay
 from experiments.report.metrics_files import Band
 from experiments.report.page import Finding, PageFigure, Row, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.tables import (
-    DEFINITIONS,
     architecture_table,
     clearance_tables,
     clocks_table,
     collision_table,
+    definitions,
     events_tables,
     network_tables,
     over_seeds,
@@ -140,7 +140,7 @@ def write(
         *_of_worlds(cases, drawings, len(pictures)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
-        _DEFINED,
+        _defined(),
     ]
     first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
@@ -227,7 +227,7 @@ def compare(
         *_results(cases),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         *_details(cases),
-        _DEFINED,
+        _defined(),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     return render(
@@ -258,7 +258,9 @@ def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: b
     return [Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
-_DEFINED: Final = Section("Definitions", terms=DEFINITIONS, folded=f"{len(DEFINITIONS)} terms")
+def _defined() -> Section:
+    terms = definitions()
+    return Section("Definitions", terms=terms, folded=f"{len(terms)} terms")
 
 
 def _results(cases: Sequence[CaseMetrics]) -> list[Section]:

@@ -48,7 +48,6 @@ ROBOTS: Final = ("#000000", "#CC6677", "#44AA99", "#999933", "#6FB7DC", "#AA4499
 CORNERS: Final = ((3.0, 3.0), (-3.0, 3.0), (3.0, -3.0), (-3.0, -3.0))  # [pt] of a text from its point
 MANY: Final = 8  # robots that have a colour each; more are coloured by kind
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X", "*")  # of cases, parameters, or `MANY` robots
-BARS: Final = (("f_hz", "$f$", "Hz"), ("iae", "IAE", "m s"), ("itae", "ITAE", "m s$^2$"), ("rmse", "RMSE", "m"))
 
 STYLE: Final[Mapping[Any, Any]] = {
     "font.family": "serif",

@@ -15,6 +15,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from agents.network.messages import Event
+from experiments.metrics.metric import ERRORS, OURS, Metric, known_metrics
 from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
 from experiments.recording.trace import Trace
@@ -28,30 +29,11 @@ ALIKE_S: Final = 0.2  # [s] between the same event of two cases
 ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "says", "start")  # kinds that stand folded
 MOST_COLLISIONS: Final = 100
 
-SUMMARY: Final = (
-    ("f_hz", "Transmission rate f [Hz]"),
-    ("messages", "Transmissions"),
-    ("bytes", "Payload [bytes]"),
-    ("iae", "IAE [m s]"),
-    ("itae", "ITAE [m s²]"),
-    ("rmse", "RMSE [m]"),
-    ("acquired_s", "Acquired, mean [s]"),
-)
-TROUBLES: Final = (
-    ("lost", "Lost samples"),
-    ("dropped", "Dropped by the modelled network"),
-    ("missed_deadlines", "Missed deadlines"),
-)
-DEFINITIONS: Final = (
+FORMATION: Final = (
     ("e(t)", "Formation error of a robot: the sum of |distance − target distance| over the links on which it listens;"
      " for one without incoming links, over its outgoing ones. Taken on true positions."),
-    ("f", "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too."),
-    ("IAE", "Integral of e(t) over the run (trapezoidal)."),
-    ("ITAE", "Integral of t · e(t); t counts from the common start."),
-    ("RMSE", "Root of the mean of e(t)²."),
-    ("Acquired", "From when on the moving mean over one second of the error of each link stays within the tolerance,"
-     " until the next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean"
-     " over followers is of their own times, and is given only if every follower acquired."),
+)  # fmt: skip
+RUN: Final = (
     ("Phase", "From the start, or from a leg of the timeline, to the next leg or the end."),
     ("Worst link", "Of each robot the link with the largest error, averaged over the last second of a phase."),
     ("Net rotation", "How fast the formation turns about its centroid, seen from above, after it was acquired: the"
@@ -72,7 +54,6 @@ DEFINITIONS: Final = (
      " to so far ahead. Along and across are in the robot's heading, to the left positive."),
     ("Correlation", "Pearson's, between robot and twin, of positions and of speeds over 0.2 s; a dash where one of them"
      " hardly moved."),
-    ("Missed deadline", "A tick that was skipped because its time had passed; shares are of the ticks that were due."),
     ("Spoiled", "A run in which a robot failed or began late, 1 % of the deadlines or of the poses were missed or lost,"
      " messages could not be read, or the world was slow. Its figures are compared with none."),
     ("×", "Over the reference with the same seed, of runs of equal length that nothing spoiled."),
@@ -80,6 +61,12 @@ DEFINITIONS: Final = (
      " run are left out of the means; their neighbours' errors leave out the links to them."),
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
+
+
+def definitions() -> tuple[tuple[str, str], ...]:
+    """Terms of a report and what they mean, all metrics among them."""
+    return (*FORMATION, *((metric.label, metric.meaning) for metric in known_metrics().values()), *RUN)
+
 
 EXTREMES: Final = "Of worst, largest, longest and closest values too the mean over seeds."
 EXTREME_UNITS: Final = ("Distances [cm]", "Delay of poses [ms]", "Hardest impulse [mN s]")
@@ -104,19 +91,27 @@ def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
     return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
 
 
+def summary_metrics() -> dict[str, Metric]:
+    """Metrics of the first table of a report: all but those that add up over robots."""
+    return {name: metric for name, metric in known_metrics().items() if metric.mean != "sum" or metric.per == "case"}
+
+
 def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> Table:
-    """The indices of each case, averaged over the followers, and their ratios to the first case; some, if `chosen`."""
+    """The metrics of each case, averaged over the followers, and their ratios to the first case; some, if `chosen`."""
     grouped = by_case(cases)
     first = next(iter(grouped.values()))
 
     def cell(runs: Sequence[CaseMetrics], index: str) -> Cell:
-        text, share = _over_seeds([run.mean[index] for run in runs]), spread(ratios(runs, first, index))
+        text, share = _over_seeds([run.mean.get(index) for run in runs]), spread(ratios(runs, first, index))
         if runs is first or share.mean is None:
             return text
         return text, f"× {ratio_words(share)}"
 
-    shown = [(index, label) for index, label in SUMMARY if not chosen or index in chosen]
-    rows = [Row((label, *(cell(runs, index) for runs in grouped.values()))) for index, label in shown]
+    shown = {name: metric for name, metric in summary_metrics().items() if not chosen or name in chosen}
+    rows = [
+        Row((metric.head + " of the case" * (metric.per == "case"), *(cell(runs, name) for runs in grouped.values())))
+        for name, metric in shown.items()
+    ]
     seeds = max(len(runs) for runs in grouped.values())
     note = f"× is relative to {next(iter(grouped))}." if len(grouped) > 1 else ""
     note += f" {over_seeds(seeds)}" if seeds > 1 else ""
@@ -179,13 +174,19 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         for unit, lines in units.items()
     ]
     sums = [
-        Row((label, *(number(sum(getattr(run, field) for run in runs)) for runs in by_case(cases).values())))
-        for field, label in TROUBLES
+        Row((metric.head, *(number(_total(runs, name)) for runs in by_case(cases).values())))
+        for name, metric in known_metrics().items()
+        if name not in summary_metrics()
     ]
     tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
     formed = any(case.belief for case in cases)  # a formation that was never acquired is a result
     shown = [table if formed and table is tables[0] else _occurred(table) for table in tables]
     return tuple(table for table in shown if table.rows)
+
+
+def _total(runs: Sequence[CaseMetrics], name: str) -> float | None:
+    """Sum of a metric over all robots and seeds."""
+    return _known(sum, (robot.value(name) for run in runs for robot in run.robots))
 
 
 def _occurred(table: Table) -> Table:
@@ -228,9 +229,9 @@ def architecture_table(cases: Sequence[CaseMetrics]) -> Table | None:
     )
     rows = [Row(("Decides", *(architecture_of(runs[0]) for runs in grouped.values()))), *table.rows]
     if len(grouped) > 1:
-        for index in ("iae", "itae", "rmse"):
-            relative = (interval(spread(ratios(runs, first, index))) for runs in grouped.values())
-            rows.append(Row((f"{index.upper()} relative to {reference}", *relative)))
+        for name in ERRORS:
+            relative = (interval(spread(ratios(runs, first, name))) for runs in grouped.values())
+            rows.append(Row((f"{OURS[name].label} relative to {reference}", *relative)))
     return Table(table.head, tuple(row for row in rows if any(cell != NONE for cell in row.cells[1:])))
 
 
@@ -275,6 +276,11 @@ def _cell(what: Callable[[Iterable[Any]], float], field: str, scale: float = 1.0
     return lambda items: number(_known(what, map(value, items)), scale)
 
 
+def _measured(name: str) -> Callable[[Sequence[RobotMetrics]], str]:
+    """The mean of the known values of a metric."""
+    return lambda robots: number(_known(_mean, (robot.value(name) for robot in robots)))
+
+
 def _mean(values: Iterable[float]) -> float:
     """The mean; a single value as it is, so that a whole number is shown as one."""
     first, *others = values
@@ -289,12 +295,11 @@ def robot_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     left_out = {name for run in runs for name in (*run.leaders, *run.died)}
     columns: list[Column] = [
-        ("f [Hz]", _cell(_mean, "f_hz")),
-        ("Sent", _cell(_mean, "messages")),
-        ("IAE [m s]", _cell(_mean, "iae")),
-        ("ITAE [m s²]", _cell(_mean, "itae")),
-        ("RMSE [m]", _cell(_mean, "rmse")),
-        ("Acquired [s]", _cell(_mean, "acquired_s")),
+        (metric.head, _measured(name))
+        for name, metric in known_metrics().items()
+        if metric.per == "robot"
+        and (metric.shown or metric.figure)
+        and (name in summary_metrics() or _total(runs, name))
     ]
     later = range(1, max(len(run.starts_s) for run in runs))
     columns += [(f"{_phase(runs, k).strip()} [s]", partial(_acquired_again, k=k)) for k in later]

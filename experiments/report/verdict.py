@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoils
+from experiments.metrics.metric import ERRORS, OURS
 from experiments.metrics.results import CaseMetrics, Collision
 from experiments.metrics.statistics import by_case, ratios, same_length, spread
 from experiments.report.page import Finding, Mark, interval, number
@@ -25,6 +26,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *spoiled(cases),
         *interruptions(cases),
         *_troubles(cases),
+        *metric_faults(cases),
         *_lost_poses(cases),
         *_of_each_case(cases, _foreign),
         *_of_each_case(cases, _modelled),
@@ -76,6 +78,11 @@ def _troubles(cases: Sequence[CaseMetrics]) -> list[Finding]:
         for case in cases
         if case.troubles
     ]
+
+
+def metric_faults(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Metrics of other distributions that failed, once each."""
+    return [Finding("fair", f"{text}.") for text in dict.fromkeys(text for run in cases for text in run.metric_faults)]
 
 
 def interruptions(cases: Sequence[CaseMetrics]) -> list[Finding]:
@@ -273,7 +280,7 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = f"{name} needs {how}: f {means[0]} rather than {means[1]} Hz"
             text += f"{_with_leaders(runs, first)}{some}."
             found.append(Finding("good" if fewer > 0.0 and float(share) and not some else "plain", text))
-        errors = [(index.upper(), spread(ratios(runs, first, index))) for index in ("iae", "itae", "rmse")]
+        errors = [(OURS[name].label, spread(ratios(runs, first, name))) for name in ERRORS]
         known = [(label, each) for label, each in errors if each.mean is not None]
         if not same_length([*runs, *first]):
             text = f"Runs of different length of {name} and {reference} are not compared."

@@ -24,10 +24,11 @@ from agents.errors import ExplainedError
 from agents.plugins.registry import did_you_mean
 from experiments.file.document import Document, chosen, load
 from experiments.file.problems import refusal
+from experiments.metrics.metric import short_name, swept_metrics
 from experiments.sweep.plan import FIRST_TUNING, Axis, Cell, arguments, combination, compared, seeds_of
 from experiments.sweep.store import Store
 from experiments.sweep.sweep import SweepRunner, folder_of, origin
-from experiments.sweep.table import MEANS, RATIOS, CellRow, words_of
+from experiments.sweep.table import CellRow, relative_metrics, words_of
 from experiments.sweep.workers import workers
 
 Progress = Callable[[str, int, int], None]  # case, evaluations done, of at most so many
@@ -42,44 +43,49 @@ ROUND: Final = 6  # so many of the best are looked at again at a time, until one
 ROUNDS: Final = 4
 BROKEN: Final = 1e6  # added to what breaks a limit
 
-_LIMIT: Final = re.compile(r"\s*([A-Za-z_]+)\s*<=?\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*")
+_LIMIT: Final = re.compile(r"\s*([A-Za-z_]\w*)\s*([<>])=?\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*")
 
 
 @dataclass(frozen=True)
 class Limit:
-    """An index that must not be larger; a ratio to the reference for those that have one."""
+    """A bound of a metric; of its ratio to the reference for those that have one."""
 
     index: str
-    most: float
+    bound: float
+    least: bool = False  # the metric must not be smaller; else not larger
 
     def __str__(self) -> str:
-        return f"{_word(self.index)} <= {self.most:g}"
+        return f"{_word(self.index)} {'>=' if self.least else '<='} {self.bound:g}"
+
+    def excess(self, value: float) -> float:
+        """Distance beyond the bound; negative within."""
+        return self.bound - value if self.least else value - self.bound
 
 
 @dataclass(frozen=True)
 class Wish:
-    """An index to be minimised, within limits of others."""
+    """A metric to be minimised, or maximised where more is better, within limits of others."""
 
     index: str
     limits: tuple[Limit, ...]
 
     def rank(self, row: CellRow) -> float:
-        """The less the better, limits first; more than any other if it cannot be known, or if runs failed."""
-        least = row.value(self.index).mean
-        if least is None or row.failed:
+        """A number, the less the better, limits first; more than any other if it cannot be known, or if runs failed."""
+        aim, metrics = row.value(self.index).mean, swept_metrics()
+        if aim is None or row.failed:
             return 3.0 * BROKEN
         excess = 0.0
         for limit in self.limits:
             value = row.value(limit.index)
-            if value.mean is None or (limit.index == "acquired_s" and row.acquired != 1.0):
+            if value.mean is None or (metrics[limit.index].mean == "all" and value.n < row.seeds):
                 return 2.0 * BROKEN
-            excess += max(0.0, value.mean + (value.ci95 or 0.0) - limit.most) / max(abs(limit.most), 1e-9)
-        return BROKEN * (1.0 + min(excess, 1.0)) if excess > 0.0 else least
+            excess += max(0.0, limit.excess(value.mean) + (value.ci95 or 0.0)) / max(abs(limit.bound), 1e-9)
+        return BROKEN * (1.0 + min(excess, 1.0)) if excess > 0.0 else _aim(self.index, aim)
 
     def kept(self, row: CellRow) -> bool:
         """Whether the means of a row keep all limits."""
-        values = [(row.value(limit.index).mean, limit.most) for limit in self.limits]
-        return all(mean is not None and mean <= most for mean, most in values) and not row.failed
+        means = [(limit, row.value(limit.index).mean) for limit in self.limits]
+        return all(mean is not None and limit.excess(mean) <= 0.0 for limit, mean in means) and not row.failed
 
 
 @dataclass(frozen=True)
@@ -117,13 +123,20 @@ def wish_of(text: str) -> Wish:
     limits = []
     for part in rest:
         found = _LIMIT.fullmatch(part)
-        if not found:
+        if not found or (found[2] == ">" and swept_metrics()[_known(found[1], place)].better != "more"):
             raise refusal(place, f"'{part}' is no limit", "write one as iae<=1.01")
-        limits.append(Limit(_known(found[1], place), float(found[2])))
+        limits.append(Limit(_known(found[1], place), float(found[3]), found[2] == ">"))
     least = _known(first, place)
+    if not swept_metrics()[least].better:
+        raise refusal(place, f"neither less nor more of '{first}' is better", "name another metric, such as messages")
     if not limits:
         raise refusal(place, "without a limit the best is to say nothing", "add one, such as iae<=1.01")
     return Wish(least, tuple(limits))
+
+
+def _aim(index: str, value: float) -> float:
+    """The value of a metric with its sign turned where more is better."""
+    return -value if swept_metrics()[index].better == "more" else value
 
 
 def searched(tuning: Sequence[int]) -> tuple[int, ...]:
@@ -200,6 +213,7 @@ def tune(
             final = sorted(plan.values(), key=lambda cell: cell.case != reference)
             runner.run_missing(final, seeds)
             reported = runner.rows(final, seeds)
+            notes += runner.metric_faults(final, seeds)
     return TuningResult(read, wish, tuning, seeds, tuple(reported), tuple(tried), tuple(selected), folder, tuple(notes))
 
 
@@ -272,11 +286,12 @@ def _library() -> Any:  # noqa: ANN401 - it has no types
 
 
 def _known(name: str, place: str) -> str:
-    known = (*MEANS, "f", "acquired")
-    if name.lower() not in known:
-        raise refusal(place, f"no index is called '{name}'", did_you_mean(name, known))
-    return {"f": "f_hz", "acquired": "acquired_s"}.get(name.lower(), name.lower())
+    names = {word: metric for metric in swept_metrics() for word in (metric, short_name(metric))}
+    if name.lower() not in names:
+        raise refusal(place, f"no metric is called '{name}'", did_you_mean(name, names))
+    return names[name.lower()]
 
 
 def _word(index: str) -> str:
-    return f"{index.upper() if index in ('iae', 'itae', 'rmse') else index} ratio" if index in RATIOS else index
+    relative = relative_metrics()
+    return f"{relative[index].label} ratio" if index in relative else index

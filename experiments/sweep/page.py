@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from experiments.metrics.metric import foreign_metrics
 from experiments.report import style
 from experiments.report.page import Finding, PageFigure, Section, Table, date_of, numbered, render, seeds_in_words
 from experiments.report.page import Row as Line
@@ -14,7 +15,7 @@ from experiments.report.tables import over_seeds, ratio_words
 from experiments.sweep.optimise import TuningResult
 from experiments.sweep.pareto import by_environment, front, pareto
 from experiments.sweep.sweep import SweepResult
-from experiments.sweep.table import NUMBERS, CellRow, parameter_columns
+from experiments.sweep.table import CellRow, numbers, parameter_columns, relative_metrics
 
 PAGE: Final = "sweep.html"
 MOST_LINES: Final = 40  # of a table that stands open
@@ -31,11 +32,10 @@ TERMS: Final = (
     ("Gap", "Shortest time between two transmissions of any robot in any seed."),
     ("±", "Half-width of the 95 % confidence interval of the mean over seeds (Student's t)."),
 )  # fmt: skip
-CAPTIONS: Final = (
+CAPTION: Final = (
     "Messages against IAE; towards the lower left is better. Full: no other of the same environment has fewer messages "
     "and no more error (grey line); hollow: another has, or runs failed. Along a curve the named parameter changes, "
-    "markers tell the others; more than 7 curves or markers are not joined. Whiskers: 95 % confidence.",
-    "Messages against ITAE, likewise.",
+    "markers tell the others; more than 7 curves or markers are not joined. Whiskers: 95 % confidence."
 )
 
 
@@ -72,7 +72,7 @@ def write(found: SweepResult | TuningResult, command: str) -> Path:
         sections=[
             *sections,
             Section("The experiment", listing=found.read.listing, folded="Show the file"),
-            Section("Definitions", terms=TERMS),
+            Section("Definitions", terms=(*TERMS, *((m.label, m.meaning) for m in foreign_metrics().values()))),
         ],
     )
 
@@ -110,12 +110,13 @@ def verdict(tuned: TuningResult) -> list[Finding]:
 
 
 def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) -> Table:
-    """A row for each cell: case, parameters, numbers; some of them (keys of `NUMBERS`), if `chosen`.
+    """A row for each cell: case, parameters, numbers; some of them (keys of `numbers`), if `chosen`.
 
     With a `title`, for a paper: a number that is the same in all cells stands in the note, with the number of seeds.
     """
     parameters = parameter_columns(rows)
-    columns = {NUMBERS[name][0]: [NUMBERS[name][1](row) for row in rows] for name in chosen or NUMBERS}
+    shown = numbers()
+    columns = {shown[name][0]: [shown[name][1](row) for row in rows] for name in chosen or shown}
     alike = {head: cells[0] for head, cells in columns.items() if title and not chosen and len({*cells}) == 1}
     columns = parameters | {head: cells for head, cells in columns.items() if head not in alike}
     lines = [Line((row.case, *(cells[k] for cells in columns.values())), row.reference) for k, row in enumerate(rows)]
@@ -129,10 +130,15 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
 def pictures(
     folder: Path, rows: Sequence[CellRow], *, joined: bool = True, width: float = style.WIDTH, pdf: bool = False
 ) -> tuple[PageFigure, ...]:
-    """Messages against IAE and against ITAE, so wide [in]; also as files, see `style.save`."""
-    drawn = {index: pareto(rows, index, joined=joined, width=width) for index in ("iae", "itae")}
-    saved = [style.save(each, folder / "figures", f"pareto_{index}", pdf=pdf) for index, each in drawn.items()]
-    return numbered(zip(saved, CAPTIONS, strict=True))
+    """Messages against IAE, ITAE and other metrics with a figure, so wide [in]; also as files, see `style.save`."""
+    against = {name: metric for name, metric in relative_metrics().items() if metric.figure and metric.shown}
+    drawn = {name: pareto(rows, name, joined=joined, width=width) for name in against}
+    saved = [style.save(each, folder / "figures", f"pareto_{name}", pdf=pdf) for name, each in drawn.items()]
+    others = [
+        f"Messages against {metric.label}, likewise{'; more is better' * (metric.better == 'more')}."
+        for metric in [*against.values()][1:]
+    ]
+    return numbered(zip(saved, [CAPTION, *others], strict=True))
 
 
 def _fewest(rows: Sequence[CellRow]) -> list[Finding]:

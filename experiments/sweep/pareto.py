@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from experiments.metrics.metric import known_metrics
 from experiments.report.style import (
     CASES,
     CORNERS,
@@ -26,7 +27,7 @@ from experiments.report.style import (
     spread_texts,
     styled,
 )
-from experiments.sweep.table import CellRow, short, words_of
+from experiments.sweep.table import UNKNOWN, CellRow, short, words_of
 from twins.arrays import Array
 
 MOST_CURVES: Final = 7  # colours of cases, and markers; more could not be told apart, and are drawn as clouds
@@ -48,7 +49,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
 
     Args:
         rows: The cells; those whose ratios are unknown are left out.
-        index: Of the error: `iae`, `itae` or `rmse`.
+        index: Of the error: `iae`, or another metric that has a ratio.
         joined: Whether cells of a case are joined along a parameter, if these curves are few; else they are a cloud.
     """
     known = [row for row in rows if not row.reference and _point_of(row, index) is not None]
@@ -84,7 +85,7 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
     cross: dict[str, Any] = {"color": INK, "markersize": 7, "markeredgewidth": 1.0, "zorder": 4}
     axes.plot(1.0, 1.0, "+", label=f"{_reference(rows)} (reference)", **cross)
     axes.set_xlabel(f"messages relative to {_reference(rows)}")
-    axes.set_ylabel(f"{index.upper()} relative to {_reference(rows)}")
+    axes.set_ylabel(f"{plain(known_metrics()[index].label)} relative to {_reference(rows)}")
     low = min((row.ratio["messages"].mean or 1.0 for row in known), default=1.0)
     if low < 1.0 / SPAN:
         axes.set_xscale("log")
@@ -103,12 +104,16 @@ def pareto(rows: Sequence[CellRow], index: str = "iae", *, joined: bool = True, 
 def front(rows: Sequence[CellRow], index: str = "iae") -> list[CellRow]:
     """Cells than which none has fewer messages and no more error, or less error and no more messages.
 
+    Of a metric of which more is better, less counts as more error.
     Cells are those of one environment. A cell with failed runs is not among them: those that failed are not counted in
     its figures.
     """
     found: list[CellRow] = []
     last = (math.inf, math.inf)
-    points = [(at, row) for row in rows if not row.failed and (at := _point_of(row, index)) is not None]
+    sign = -1.0 if known_metrics()[index].better == "more" else 1.0
+    points = [
+        ((at[0], sign * at[1]), row) for row in rows if not row.failed and (at := _point_of(row, index)) is not None
+    ]
     for at, row in sorted(points, key=lambda point: point[0]):
         if at[1] < last[1] or at == last:
             found.append(row)
@@ -145,7 +150,7 @@ def _varies(rows: Sequence[CellRow], case: str, path: str) -> bool:
 
 
 def _point_of(row: CellRow, index: str) -> tuple[float, float] | None:
-    messages, error = row.ratio["messages"].mean, row.ratio[index].mean
+    messages, error = row.ratio.get("messages", UNKNOWN).mean, row.ratio.get(index, UNKNOWN).mean
     return None if messages is None or error is None else (messages, error)
 
 

@@ -16,7 +16,7 @@ from typing import Final, Self
 import msgspec
 
 from experiments.file.problems import refusal
-from experiments.sweep.runs import Figures, WorkResult
+from experiments.sweep.runs import RunMetrics, WorkResult
 
 RUNS: Final = "runs.jsonl"
 ORIGIN: Final = "origin.json"
@@ -25,7 +25,7 @@ ORIGIN: Final = "origin.json"
 class _Line(msgspec.Struct, frozen=True):
     cell: str
     code: str
-    runs: list[Figures]
+    runs: list[RunMetrics]
     failed: dict[int, str] = {}
 
 
@@ -46,7 +46,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._path = folder, folder / RUNS
-        self._runs: dict[tuple[str, str], dict[int, Figures]] = {}
+        self._runs: dict[tuple[str, str], dict[int, RunMetrics]] = {}
         self._failed: dict[tuple[str, str], dict[int, str]] = {}
         self.damaged = 0
 
@@ -90,7 +90,7 @@ class Store:
             found.append("the experiment file has changed: what it changes is run anew")
         return found
 
-    def runs(self, cell: str, code: str) -> dict[int, Figures]:
+    def runs(self, cell: str, code: str) -> dict[int, RunMetrics]:
         """Runs of a cell that are done, by seed."""
         return self._runs.get((cell, code), {})
 

@@ -26,10 +26,11 @@ from experiments.definition.experiment import Experiment
 from experiments.file import document
 from experiments.file.document import Document, load
 from experiments.file.problems import refusal
+from experiments.metrics.metric import unusable_metrics
 from experiments.recording.run_folder import RUNS
 from experiments.sweep import table
 from experiments.sweep.plan import Axis, Cell, arguments, cells, seeds_of
-from experiments.sweep.runs import Figures, code_of
+from experiments.sweep.runs import RunMetrics, code_of, lean_enough
 from experiments.sweep.store import Store, StoreOrigin
 from experiments.sweep.table import CellRow
 from experiments.sweep.workers import Work, Workers, workers
@@ -39,7 +40,8 @@ if TYPE_CHECKING:
 
 MOST_SEEDS: Final = 100  # of one cell side by side: more are hardly faster, and progress would come in larger steps
 SHARE: Final = 3  # each worker gets its part in at least so many pieces, so that all end at about the same time
-MOST_BYTES: Final = 2e8  # of positions that one process logs
+MOST_BYTES: Final = 2e8  # of samples that one process logs
+LEAN_BYTES, WHOLE_BYTES = 48.0, 340.0  # of a sample of a robot
 LONGEST: Final = 60  # letters of a folder's name that is made up here
 AROUND_S: Final = 15.0  # take-off and landing are logged, too
 
@@ -114,6 +116,7 @@ def sweep(
                 runner.run_missing(plan, seeds, progress)
         rows = runner.rows(plan, seeds)
         failures = runner.failures(plan, seeds)
+        notes += runner.metric_faults(plan, seeds)
         missing = sum(len(runner.missing(cell, seeds)) for cell in _distinct(plan))
     return SweepResult(read, tuple(axes), seeds, tuple(rows), failures, missing, folder, tuple(notes))
 
@@ -177,7 +180,12 @@ class SweepRunner:
             if seed in seeds
         )
 
-    def _runs(self, cell: Cell, seeds: Sequence[int]) -> dict[int, Figures]:
+    def metric_faults(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[str]:
+        """Metrics of other distributions that cannot be used or failed, each once."""
+        runs = (run for cell in _distinct(plan) for run in self._runs(cell, seeds).values())
+        return [*unusable_metrics(), *dict.fromkeys(text for run in runs for text in run.metric_faults)]
+
+    def _runs(self, cell: Cell, seeds: Sequence[int]) -> dict[int, RunMetrics]:
         done = self.store.runs(cell.digest, code_of(cell.experiment))
         return {seed: done[seed] for seed in seeds if seed in done}
 
@@ -185,7 +193,8 @@ class SweepRunner:
 def side_by_side(experiment: Experiment) -> int:
     """Seeds of an experiment that one process simulates side by side."""
     samples = (experiment.duration_s + AROUND_S) * experiment.rates.state_hz
-    return max(1, min(MOST_SEEDS, int(MOST_BYTES / (48.0 * samples * len(experiment.robots)))))
+    size = LEAN_BYTES if lean_enough() else WHOLE_BYTES
+    return max(1, min(MOST_SEEDS, int(MOST_BYTES / (size * samples * len(experiment.robots)))))
 
 
 def folder_of(read: Document, axes: Sequence[Axis], what: str) -> Path:

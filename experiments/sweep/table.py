@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,15 +12,15 @@ import msgspec
 
 from experiments.file import reference as reference_of_file
 from experiments.metrics.comparable import equally_long
+from experiments.metrics.metric import Metric, short_name, swept_metrics
 from experiments.metrics.statistics import Spread, ratio, spread
 from experiments.report.page import NONE, interval
 from experiments.report.tables import ratio_words
 from experiments.sweep.plan import Cell
-from experiments.sweep.runs import Figures
+from experiments.sweep.runs import RunMetrics
 
-MEANS: Final = ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s", "updates", "dropped")
-RATIOS: Final = ("messages", "iae", "itae", "rmse")
 SHORT: Final = 5  # letters of a unit that stands behind a value
+UNKNOWN: Final = Spread(None, None, None, 0)
 
 
 class CellRow(msgspec.Struct, frozen=True):
@@ -32,15 +33,15 @@ class CellRow(msgspec.Struct, frozen=True):
     reference: bool  # the ratios of others are taken over it
     seeds: int  # runs that succeeded
     failed: int  # runs that failed, or in which a robot did; the statistics leave them out
-    mean: dict[str, Spread]  # over the seeds: each of `MEANS`; `acquired_s` over those in which all acquired
-    # of each of `RATIOS` over the reference with the same seed, then over the seeds; only of runs of equal length
+    mean: dict[str, Spread]  # over the seeds: each of `swept_metrics`; `acquired_s` over those in which all acquired
+    # of each relative metric over the reference with the same seed, then over the seeds; only of runs of equal length
     ratio: dict[str, Spread]
     acquired: float | None  # share of the seeds in which every robot but the leaders acquired
     gap_min_s: float | None  # shortest time between two transmissions of any robot, in all seeds [s]
 
     def value(self, index: str) -> Spread:
-        """The ratio of an index if it has one, else its mean."""
-        return self.ratio[index] if index in self.ratio else self.mean[index]
+        """The ratio of a metric if it has one, else its mean; unknown if it was not measured."""
+        return self.ratio.get(index, self.mean.get(index, UNKNOWN))
 
     @property
     def words(self) -> str:
@@ -62,7 +63,7 @@ class CellRow(msgspec.Struct, frozen=True):
         return f"{self.case} {self.words}".strip()
 
 
-def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures], failed: int = 0) -> CellRow:
+def row(cell: Cell, runs: Mapping[int, RunMetrics], reference: Mapping[int, RunMetrics], failed: int = 0) -> CellRow:
     """A cell's runs, by seed, and those of its reference."""
     mine = [runs[seed] for seed in sorted(runs)]
     paired = [
@@ -70,7 +71,8 @@ def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures
         for seed in sorted(runs)
         if seed in reference and equally_long((runs[seed].duration_s, reference[seed].duration_s))
     ]
-    acquired = [run.acquired_s is not None for run in mine]
+    acquired = [run.values["acquired_s"] is not None for run in mine]
+    relative = relative_metrics()
     gaps = [run.gap_min_s for run in mine if run.gap_min_s is not None]
     return CellRow(
         case=cell.case,
@@ -80,21 +82,25 @@ def row(cell: Cell, runs: Mapping[int, Figures], reference: Mapping[int, Figures
         reference=cell.digest == cell.reference,
         seeds=len(mine),
         failed=failed,
-        mean={index: spread([getattr(run, index) for run in mine]) for index in MEANS},
+        mean={name: spread([run.values[name] for run in mine]) for name in swept_metrics()},
         ratio={
-            index: spread([ratio(getattr(one, index), getattr(other, index)) for one, other in paired])
-            for index in RATIOS
+            name: spread([ratio(one.values[name], other.values[name]) for one, other in paired]) for name in relative
         },
         acquired=sum(acquired) / len(acquired) if acquired else None,
         gap_min_s=min(gaps, default=None),
     )
 
 
+def relative_metrics() -> dict[str, Metric]:
+    """Metrics of sweeps that are taken over the reference."""
+    return {name: metric for name, metric in swept_metrics().items() if metric.relative}
+
+
 def write_csv(path: Path, rows: Sequence[CellRow]) -> None:
     """A line for each row; empty where a value is unknown, and where a case has no such parameter."""
     paths = list(dict.fromkeys(path for each in rows for path in each.parameters))
-    columns = [part for index in MEANS for part in (index, f"{index}_ci95")]
-    columns += [part for index in RATIOS for part in (f"{index}_ratio", f"{index}_ratio_ci95")]
+    columns = [part for name in swept_metrics() for part in (name, f"{name}_ci95")]
+    columns += [part for name in relative_metrics() for part in (f"{name}_ratio", f"{name}_ratio_ci95")]
     head = ["case", *paths, "reference", "seeds", "failed", *columns, "acquired_share", "gap_min_s"]
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, head, restval="")
@@ -134,36 +140,44 @@ def read_json(path: Path) -> tuple[dict[str, Any], list[CellRow]]:
 
 def _of_seeds(row: CellRow, text: str, index: str) -> str:
     """A ratio in words, and of how many seeds it is, unless it is of all."""
-    known = row.ratio[index].n
+    known = row.value(index).n
     return text if known in {0, row.seeds} else f"{text} ({known} of {row.seeds})"
 
 
-def _acquired(row: CellRow) -> str:
-    """Mean time of acquisition over the seeds in which all acquired, and how many these are, unless all did."""
-    known = row.mean["acquired_s"].n
-    if not known:
+def _mean_of(row: CellRow, metric: Metric, name: str) -> str:
+    """Mean over the seeds; of a metric that must be known of all robots, with the number of seeds in which it is."""
+    mean = row.mean.get(name, UNKNOWN)
+    if metric.mean != "all":
+        return interval(mean)
+    if not mean.n:
         return f"never ({row.seeds} seeds)" if row.seeds else NONE
-    return interval(row.mean["acquired_s"]) + (f" ({known} of {row.seeds})" if known < row.seeds else "")
+    return interval(mean) + (f" ({mean.n} of {row.seeds})" if mean.n < row.seeds else "")
 
 
-NUMBERS: Final[Mapping[str, tuple[str, Callable[[CellRow], str]]]] = {  # for people, by the name behind `--metrics`
-    "f": ("f [Hz]", lambda row: interval(row.mean["f_hz"])),
-    "messages": ("messages ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["messages"]), "messages")),
-    "iae": ("IAE ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["iae"]), "iae")),
-    "itae": ("ITAE ratio", lambda row: _of_seeds(row, ratio_words(row.ratio["itae"]), "itae")),
-    "acquired": ("acquired [s]", _acquired),
-    "gap": ("gap [ms]", lambda row: NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}"),
-    "dropped": ("dropped", lambda row: interval(row.mean["dropped"])),
-}
+def _ratio_of(row: CellRow, name: str) -> str:
+    return _of_seeds(row, ratio_words(row.ratio.get(name, UNKNOWN)), name)
+
+
+def numbers() -> dict[str, tuple[str, Callable[[CellRow], str]]]:
+    """Head and text of each column for people, by the name behind `--metrics`."""
+    found: dict[str, tuple[str, Callable[[CellRow], str]]] = {}
+    for name, metric in swept_metrics().items():
+        if metric.shown and metric.relative:
+            found[short_name(name)] = (f"{metric.label} ratio", partial(_ratio_of, name=name))
+        elif metric.shown:
+            found[short_name(name)] = (metric.head, partial(_mean_of, metric=metric, name=name))
+    found["gap"] = ("gap [ms]", lambda row: NONE if row.gap_min_s is None else f"{1e3 * row.gap_min_s:.0f}")
+    return found
 
 
 def text(rows: Sequence[CellRow]) -> list[str]:
     """The main columns, for the terminal."""
-    heads = [head for head, _ in NUMBERS.values()]
+    shown = numbers().values()
+    heads = [head for head, _ in shown]
     lines: list[tuple[str, ...]] = [("case", "parameters", "seeds", *heads)]
     for row in rows:
         seeds = str(row.seeds) + (f" ({row.failed} failed)" if row.failed else "")
-        lines.append((row.case, row.words, seeds, *(number(row) for _, number in NUMBERS.values())))
+        lines.append((row.case, row.words, seeds, *(number(row) for _, number in shown)))
     width = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [
         "  ".join(cell.ljust(width[k]) if k < 2 else cell.rjust(width[k]) for k, cell in enumerate(line)).rstrip()

@@ -342,14 +342,15 @@ def bundles() -> Iterator[Target]:
 
 def sweep_runs() -> Iterator[Target]:
     """`runs.jsonl` and `origin.json` of a sweep: lines that cannot be read are counted, not fatal."""
-    from experiments.sweep.runs import Figures  # noqa: PLC0415
+    from experiments.sweep.runs import RunMetrics  # noqa: PLC0415
     from experiments.sweep.store import ORIGIN, RUNS, Store, StoreOrigin  # noqa: PLC0415
 
     kinds = {int: 1, float: 0.5, bool: True, str: "x"}
     blank = {
         field.name: next((value for kind, value in kinds.items() if field.type is kind), None)
-        for field in msgspec.structs.fields(Figures)
+        for field in msgspec.structs.fields(RunMetrics)
     }
+    blank |= {"values": {"iae": 0.5}, "metric_faults": []}
     line = json.dumps({"cell": "c", "code": "d", "runs": [blank], "failed": {"3": "why"}}).encode() + b"\n"
     with place_for(RUNS) as file:
 

@@ -305,14 +305,26 @@ def explain(
     ] = "",
     as_json: AsJson = False,
 ) -> int:
-    """Explain a key of the experiment file, a plug-in or a kind of robot: text, unit, default, limits, an example."""
+    """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""
     import difflib
 
     from experiments.file import json_schema, reference
+    from experiments.metrics.metric import known_metrics, short_name
     from experiments.metrics.results import RobotMetrics
 
     found = reference.matching(key) if key else reference.tables()
     warn(json_schema.unusable())
+    metric = {short_name(name): each for name, each in known_metrics().items()}.get(short_name(key.lower()))
+    if not found and metric is not None:
+        print_result(
+            {"label": metric.label, "unit": metric.unit, "meaning": metric.meaning},
+            *(
+                f"metric: {metric.head}",
+                textwrap.fill(metric.meaning, WIDEST, initial_indent="  ", subsequent_indent="  "),
+            ),
+            as_json=as_json,
+        )
+        return 0
     if not found:
         nearest, about = reference.nearest(key), reference.about(key)
         near = difflib.get_close_matches(key, nearest, 1, 0.75 if about else 0.6)
@@ -435,6 +447,7 @@ def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
     from experiments.file import json_schema
+    from experiments.metrics.metric import known_metrics, unusable_metrics
 
     plugins = {
         "Kinds of robots": registry.ROBOTS,
@@ -447,9 +460,9 @@ def list_(as_json: AsJson = False) -> None:
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
     }
-    warn(json_schema.unusable())
+    warn([*json_schema.unusable(), *unusable_metrics()])
     experiments = index.titles()
-    found = {title: registry.names(group) for title, group in plugins.items()}
+    found = {title: registry.names(group) for title, group in plugins.items()} | {"Metrics": [*known_metrics()]}
     width = max(len(name) for name in experiments)
     print_result(
         {"experiments": [{"name": name, "title": title} for name, title in experiments.items()]}

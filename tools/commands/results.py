@@ -56,10 +56,11 @@ def report(
 ) -> int:
     """Write the report of one run, or compare several; of a sweep, its figures or its table."""
     from experiments.file.problems import refusal
+    from experiments.metrics.metric import short_name
     from experiments.recording.reader import RecordingError
     from experiments.report import report as pages  # matplotlib takes 0.6 s
     from experiments.report import typeset
-    from experiments.report.tables import SUMMARY
+    from experiments.report.tables import summary_metrics
     from experiments.run import reopen_seeds
 
     if metrics and not (as_latex or as_markdown):
@@ -88,7 +89,7 @@ def report(
     ]
     if as_latex or as_markdown:
         cases = pages.labelled(named) if len(read) > 1 else named[0][1]
-        names = {name.removesuffix("_hz").removesuffix("_s"): name for name, _ in SUMMARY}
+        names = {short_name(name): name for name in summary_metrics()}
         tables = pages.result_tables(cases, [names[name] for name in known_words("--metrics", [metrics or ""], names)])
         _put(typeset.latex(tables, width) if as_latex else typeset.markdown(tables), out)
         return 0
@@ -149,7 +150,7 @@ def _report_sweep(
     except ValueError as error:
         raise RecordingError(f"{folder / SWEEP}: cannot be read: {error}; make the sweep again") from None
     if form is not None:
-        chosen = known_words("--metrics", [metrics or ""], table.NUMBERS)
+        chosen = known_words("--metrics", [metrics or ""], table.numbers())
         _put(form([pages.table(rows, str(document.get("experiment", folder.name)), chosen)]), out)
         return 0
     searched = "tuning" in document  # its figures show all that was tried
@@ -235,6 +236,7 @@ def compare(
     as_json: AsJson = False,
 ) -> int:
     """Compare many runs: how their files, seeds and versions differ, then their key figures against the first."""
+    from experiments.metrics.metric import console_metrics
     from experiments.recording.reader import RecordingError
     from experiments.recording.run_folder import differences, past_runs
     from experiments.report.tables import over_seeds
@@ -258,14 +260,14 @@ def compare(
         for folder, each in differ.items():
             say(f"{folder}: {'; '.join(each) or SAME}")
         reference = next(iter(first.cases.values()), {})
-        rows, remarks = [], list[str]()
+        rows, remarks, shown = [], list[str](), console_metrics()
         for run in found:
             for case, figures in run.cases.items():
                 fair = _comparable(run, case, first)
-                cells = [_against(values, reference.get(name, {}), fair) for name, values in figures.items()]
+                cells = [_against(figures.get(name, {}), reference.get(name, {}), fair) for name in shown]
                 rows.append([run.folder, case, f"{len(run.seeds)}", *cells])
                 remarks += [f"  {run.folder}, {case}, seed {k}: {why}" for k, why in run.remarks.get(case, {}).items()]
-        head = ("run", "case", "seeds", "f, Hz", "IAE, m s", "RMSE, m", "acquired, s (– never)")
+        head = ("run", "case", "seeds", *(m.head + " (– never)" * (m.mean == "all") for m in shown.values()))
         say("", *columns([head, *rows]))
         if remarks:
             say("Not compared, because spoiled or of another length:", *remarks)
@@ -495,13 +497,16 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     if not found and not sweeps:
         print("no run of that kind" if words else f"no run in {', '.join(below or ['runs'])}")
         return
-    head = ("when, UTC", "run", "case", "f, Hz", "IAE, m s", "RMSE, m", "acquired, s", "MB", "tags", "remarks")
+    from experiments.metrics.metric import console_metrics
+
+    shown = console_metrics()
+    head = ("when, UTC", "run", "case", *(metric.head for metric in shown.values()), "MB", "tags", "remarks")
     rows = []
     for run in found:
         clock = " (virtual)" * run.origin.virtual
         first = [_minute(run.made), f"{run.folder}{clock}"]
         for k, (case, figures) in enumerate((run.cases or {"-": {}}).items()):
-            values = [interval(spread([*by_seed.values()])) for by_seed in figures.values()] or [NONE] * 4
+            values = [interval(spread([*figures[name].values()])) if name in figures else NONE for name in shown]
             last = [f"{run.megabytes:.1f}", ", ".join(run.origin.tags)] if k == 0 else ["", ""]
             known = dict.fromkeys(run.remarks.get(case, {}).values())
             rows.append([*(first if k == 0 else ["", ""]), case, *values, *last, " | ".join(known)])

@@ -401,6 +401,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
     if any(case.leaders for case in cases):
         yield verdict.left_out(cases)
     yield from (finding.text for finding in verdict.contacts(cases) if finding.mark == "bad")
+    yield from (finding.text for finding in verdict.metric_faults(cases))
     if len(runs) > 1:
         yield f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)"
     yield from (f"note: {note}" for note in runs[0].notes)
@@ -426,6 +427,7 @@ def _hazards(runs: Sequence[Run]) -> Iterator[str]:
 
 def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     """The key figures of a case, over all seeds: means of a robot; losses are sums over all robots."""
+    from experiments.metrics.metric import foreign_metrics
     from experiments.metrics.statistics import Spread, spread
     from experiments.report.page import interval
     from experiments.report.tables import ratio_words
@@ -442,6 +444,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         line += ", no link was measured"
     else:
         line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
+    added = {name: metric for name, metric in foreign_metrics().items() if metric.shown and name in mean}
+    line += "".join(f", {metric.label} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
     line += f", lost {sum(each.lost for each in measured)}"
     if missed := sum(each.missed_deadlines for each in measured):
         share = spread([each.missed_share for each in measured]).mean or 0.0
@@ -449,7 +453,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
     if dropped := sum(each.dropped for each in measured):
         line += f", {dropped} dropped by the modelled network"
     if name != next(iter(found["cases"])) and shares["f_hz"].mean is not None:
-        line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']})"
+        more = [f", {metric.label} {ratio[name]}" for name, metric in added.items() if metric.relative]
+        line += f"   (ratios: f {ratio['f_hz']}, IAE {ratio['iae']}{''.join(more)})"
     return line
 
 

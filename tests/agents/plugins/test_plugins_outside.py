@@ -51,12 +51,17 @@ def installed(tmp_path_factory):
     for name, module, made, group in REGISTERED:
         (folder / f"{module}.py").write_text(source_of(made), encoding="utf-8")
         groups.setdefault(group, {})[name] = f"{module}:{made}"
-    written = folder / f"my_plugins-{about['version']}.dist-info"
+    install(folder, about["name"], about["version"], groups)
+    return folder
+
+
+def install(folder, name, version, groups):
+    """Leaves in a folder what an installer leaves of a distribution with these entry points."""
+    written = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     written.mkdir()
-    (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {about['name']}\nVersion: {about['version']}\n")
+    (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
     lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in made.items()) for group, made in groups.items()]
     (written / "entry_points.txt").write_text("\n".join(lines))
-    return folder
 
 
 def zenpark(folder, *arguments):

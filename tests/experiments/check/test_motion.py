@@ -13,7 +13,7 @@ from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import document
-from experiments.sweep.runs import figures_of
+from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation
 from experiments.virtual_time.log import Logbook
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
@@ -47,8 +47,8 @@ def test_wheels_stop_before_weak_formation_is_acquired():
     numbers = figures(weak)
     assert numbers.acquired_s is None
     log = simulation.simulate(msgspec.structs.replace(weak, seed=7), 7, lean=True)
-    run = figures_of(Logbook(log, weak, "").trace())
-    assert run.acquired_s is None
+    run = run_metrics(Logbook(log, weak, "").trace())
+    assert run.values["acquired_s"] is None
     last = log.true_position[log.time <= weak.duration_s][-1]
     off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
     assert numbers.end_error_mm == pytest.approx(1e3 * off, rel=0.1)
@@ -102,8 +102,8 @@ def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
 def late(experiment: Experiment, seeds: list[int]) -> int:
     """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
     logs = (simulation.simulate(experiment, seed, lean=True) for seed in seeds)
-    runs = [figures_of(Logbook(log, experiment, "").trace()) for log in logs]
-    return sum(run.acquired_s is None or run.acquired_s > 15.0 for run in runs)
+    runs = [run_metrics(Logbook(log, experiment, "").trace()) for log in logs]
+    return sum(run.values["acquired_s"] is None or run.values["acquired_s"] > 15.0 for run in runs)
 
 
 def test_soft_formation_is_found_under_hover_jitter():

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from agents.network.messages import Event
 from experiments.definition.experiment import Anchor
 from experiments.metrics import measure, statistics
-from experiments.metrics.results import INDICES, CaseMetrics, RobotMetrics
+from experiments.metrics.metric import OURS
+from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import belief_errors, formation_errors, net_rotation
 from experiments.recording.trace import Trace
 from experiments.report import metrics_files, verdict
@@ -279,7 +280,7 @@ def test_document_has_the_shape_for_scripts():
     assert b["collisions"] == 0
     short = metrics_files.document("runs/7", 4, [measure.measure(cut(park("a", seed=4), 8.0))])["cases"]["a"]
     assert (short["duration_s"], short["interrupted"]) == (8.0, True)
-    assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(INDICES)
+    assert set(b["robots"]["TB01"]) == set(b["mean"]) == set(b["ratio"]) == set(OURS)
     followers = [b["robots"][name]["iae"] for name in b["robots"] if name != "TB01"]
     assert b["mean"]["iae"] == pytest.approx(np.mean(followers))
     assert b["ratio"]["f_hz"] == pytest.approx(b["mean"]["f_hz"] / 50.0)
@@ -326,7 +327,7 @@ def test_a_whole_run_may_end_one_sample_before_its_time():
 
 def test_spread_over_seeds():
     documents = [
-        {"seed": k, "cases": {"a": {group: dict.fromkeys(INDICES, value) for group in ("mean", "ratio")}}}
+        {"seed": k, "cases": {"a": {group: dict.fromkeys(OURS, value) for group in ("mean", "ratio")}}}
         for k, value in enumerate([1.0, 2.0, None, 3.0])
     ]
     found = statistics.across_seeds(documents)

@@ -6,6 +6,7 @@ import pytest
 from experiments.definition.experiment import World
 from experiments.file import reference
 from experiments.file.document import load
+from experiments.metrics.metric import swept_metrics
 from experiments.metrics.statistics import Spread
 from experiments.recording import version
 from experiments.sweep import table
@@ -13,8 +14,8 @@ from experiments.sweep.optimise import wish_of
 from experiments.sweep.page import _fewest
 from experiments.sweep.pareto import by_environment, front
 from experiments.sweep.plan import arguments, cells
-from experiments.sweep.runs import Figures, WorkResult, code_of, digest, fly
-from experiments.sweep.table import MEANS, RATIOS, CellRow
+from experiments.sweep.runs import RunMetrics, WorkResult, code_of, digest, fly
+from experiments.sweep.table import CellRow, relative_metrics
 
 
 def _cells(*given):
@@ -22,12 +23,14 @@ def _cells(*given):
 
 
 def _figures(seed=1, *, messages=100.0, duration_s=20.0):
-    return Figures(seed, 5.0, messages, 1.0, 1.0, 0.1, 3.0, 0.02, 40.0, 0, duration_s)
+    return RunMetrics(seed, dict.fromkeys(swept_metrics(), 1.0) | {"messages": messages}, 0.02, duration_s)
 
 
 def _row(messages, iae, *, failed=0, **environment):
-    ratio = {index: Spread({"messages": messages, "iae": iae}.get(index, 1.0), 0.0, 0.01, 9) for index in RATIOS}
-    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in MEANS}
+    ratio = {
+        index: Spread({"messages": messages, "iae": iae}.get(index, 1.0), 0.0, 0.01, 9) for index in relative_metrics()
+    }
+    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in swept_metrics()}
     return CellRow("event", {**environment}, environment, {}, False, 9, failed, mean, ratio, 1.0, 0.02)
 
 

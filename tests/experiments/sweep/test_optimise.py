@@ -3,17 +3,18 @@
 import pytest
 
 from experiments.file.problems import DocumentError
+from experiments.metrics.metric import swept_metrics
 from experiments.metrics.statistics import Spread
 from experiments.sweep.optimise import BROKEN, Limit, Wish, searched, tune, wish_of
-from experiments.sweep.table import MEANS, RATIOS, CellRow
+from experiments.sweep.table import CellRow, relative_metrics
 from tools.commands import sweep as commands
 
 SHORT = ["duration_s=4.0"]
 
 
 def row(**ratios):
-    found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in RATIOS}
-    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in MEANS}
+    found = {index: Spread(ratios.get(index, 1.0), 0.0, 0.01, 9) for index in relative_metrics()}
+    mean = {index: Spread(1.0, 0.0, 0.01, 9) for index in swept_metrics()}
     return CellRow("event", {}, {}, {}, False, 9, 0, mean, found, 1.0, 0.02)
 
 
@@ -29,8 +30,8 @@ def test_a_wish():
         ("", "what is to be least", "messages, iae<=1.01"),
         ("iae<=1.01", "what is to be least", "messages, iae<=1.01"),
         ("messages", "without a limit", "iae<=1.01"),
-        ("messages, iea<=1.01", "no index is called 'iea'", "'iae'?"),
-        ("mesages, iae<=1.01", "no index is called 'mesages'", "'messages'?"),
+        ("messages, iea<=1.01", "no metric is called 'iea'", "'iae'?"),
+        ("mesages, iae<=1.01", "no metric is called 'mesages'", "'messages'?"),
         ("messages, iae>=1.01", "'iae>=1.01' is no limit", "iae<=1.01"),
         ("messages, iae<=", "'iae<=' is no limit", "iae<=1.01"),
         ("messages, iae<=1.0.1", "'iae<=1.0.1' is no limit", "iae<=1.01"),

@@ -9,7 +9,7 @@ from experiments.file import structure
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.sweep import runs
-from experiments.sweep.runs import WorkResult, code_of, digest, figures_of, fly
+from experiments.sweep.runs import WorkResult, code_of, digest, fly, run_metrics
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
 
@@ -23,15 +23,15 @@ def park():
 @pytest.mark.parametrize("seed", [3, 8])
 def test_lean_figures_are_those_of_the_report(park, seed):
     lean, whole = (Logbook(simulate(park, seed, lean=lean), park, "event").trace() for lean in (True, False))
-    figures, measured = figures_of(lean), measure.measure(whole)
-    assert figures == figures_of(whole)
+    figures, measured = run_metrics(lean), measure.measure(whole)
+    assert figures == run_metrics(whole)
     assert figures.seed == seed
     for index in ("f_hz", "messages", "iae", "itae", "rmse", "acquired_s"):
-        assert getattr(figures, index) == measured.mean[index], index
+        assert figures.values[index] == measured.mean[index], index
     assert figures.gap_min_s == min(robot.gap_min_s for robot in measured.robots if robot.gap_min_s is not None)
-    assert figures.dropped == measured.dropped
+    assert figures.values["dropped"] == measured.dropped
     followers = [robot.updates for robot in measured.robots if robot.robot not in measured.leaders]
-    assert figures.updates == np.mean(followers)
+    assert figures.values["updates"] == np.mean(followers) == measured.mean["updates"]
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_run_depends_on_its_seed_alone(park):
     together = flown(lossy, seeds)
     assert [run.seed for run in together.runs] == seeds
     assert flown(lossy, [4, 2]).runs == [together.runs[3], together.runs[1]]
-    assert sum(run.dropped for run in together.runs) > 0
+    assert sum(run.values["dropped"] for run in together.runs) > 0
 
 
 @pytest.mark.slow

@@ -1,0 +1,158 @@
+"""Shared quantities of the metrics of one trace, each computed when it is first asked for, and once."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from experiments.metrics.clearance import Clearance
+from experiments.metrics.results import Phase
+from experiments.metrics.signals import (
+    LinkErrors,
+    after_last,
+    integrals,
+    leaders,
+    phase_starts,
+    transmission_gaps,
+    transmissions,
+)
+from experiments.recording.trace import Trace
+from twins.arrays import Array, Index
+
+WINDOW_S: Final = 1.0  # [s] of the moving mean that decides on acquisition, and of the residual
+BAND: Final = 0.02  # of the largest error: the 2 % band of the settling time
+KNOWN: Final = 0.95  # a robot whose position is known for less of the run counts as died
+
+
+class Measurement:
+    """Quantities of a trace of T samples and N robots that several metrics need; unknown numbers are NaN.
+
+    All errors are taken on true positions. A robot that died has NaN positions from then on: its links are left out
+    from that moment.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self.trace = trace
+
+    @cached_property
+    def errors(self) -> LinkErrors:
+        """Errors of the links [m]."""
+        return LinkErrors.of_trace(self.trace)
+
+    @cached_property
+    def robot_errors(self) -> Array:
+        """e(t) of each robot (T, N) [m], over its own links."""
+        return self.errors.per_robot()
+
+    @cached_property
+    def integrals(self) -> tuple[Array, Array, Array]:
+        """IAE [m s], ITAE [m s²] and RMSE [m] of each robot, (N,) each."""
+        return integrals(self.robot_errors, self.trace.time)
+
+    @cached_property
+    def clearance(self) -> Clearance:
+        """Distances between surfaces."""
+        return Clearance.of_trace(self.trace)
+
+    @cached_property
+    def known(self) -> Array:
+        """Share of the time at which the position of each robot is known (N,)."""
+        return self.errors.known()
+
+    @cached_property
+    def leaders(self) -> tuple[str, ...]:
+        """Robots that lead: means leave them out."""
+        return leaders(self.trace)
+
+    @cached_property
+    def died(self) -> tuple[str, ...]:
+        """Followers whose position is unknown for too long: means leave them out."""
+        names = zip(self.trace.robots, self.known, strict=True)
+        return tuple(name for name, share in names if share < KNOWN and name not in self.leaders)
+
+    @cached_property
+    def kept(self) -> list[int]:
+        """Rows of the robots in the means."""
+        out = {*self.leaders, *self.died}
+        return [i for i, name in enumerate(self.trace.robots) if name not in out]
+
+    @cached_property
+    def bounds(self) -> list[tuple[float, int, int]]:
+        """Phases, see `bounds_of`."""
+        return bounds_of(self.trace)
+
+    @cached_property
+    def window(self) -> int:
+        """Samples of the moving mean."""
+        return max(1, round(WINDOW_S / float(self.trace.time[1] - self.trace.time[0])))
+
+    @cached_property
+    def acquired(self) -> list[float | None]:
+        """Acquisition of each robot in the first phase [s]; None if never."""
+        return self._acquired(0)
+
+    @cached_property
+    def phases(self) -> list[list[Phase]]:
+        """Per phase and robot: time of acquisition and residual error."""
+        found = []
+        for k, (start, begin, end) in enumerate(self.bounds):
+            acquired = self._acquired(k) if k else self.acquired
+            worst = self.errors.part(max(begin, end - self.window), end).worst(self.trace.robots)
+            found.append([Phase(start, when, *left) for when, left in zip(acquired, worst, strict=True)])
+        return found
+
+    def _acquired(self, phase: int) -> list[float | None]:
+        _, begin, end = self.bounds[phase]
+        return self.errors.part(begin, end).acquired(self.window, self.trace.experiment.tolerance)
+
+    @cached_property
+    def settled(self) -> list[float | None]:
+        """From when on the error of each robot stays in its 2 % band [s]; None if never."""
+        total = self.robot_errors
+        unsettled = ~(total <= BAND * np.where(np.isfinite(total), total, 0.0).max(axis=0))
+        return after_last(unsettled & (self.errors.there | np.isfinite(total)), self.trace.time)
+
+    @cached_property
+    def transmissions(self) -> tuple[Index, Index]:
+        """Poses sent by each robot, by their running numbers, and those of them in the recording, (N,) each."""
+        return transmissions(self.trace)
+
+    @cached_property
+    def rate(self) -> Array:
+        """Poses that each robot sent in a second, from when it takes part (N,) [Hz]."""
+        trace, rows = self.trace, range(len(self.trace.robots))
+        time, joined = trace.time, np.zeros(len(rows)) if trace.joined is None else trace.joined
+        present = np.maximum(time[-1] - np.maximum(joined, time[0]), time[1] - time[0])
+        early = np.array([(trace.sent_by(i).stamp < joined[i]).sum() for i in rows], dtype=np.intp)
+        return np.asarray((self.transmissions[0] - early) / present)
+
+    @cached_property
+    def waits(self) -> list[Array]:
+        """Times between the transmissions of each robot [s]."""
+        return transmission_gaps(self.trace)
+
+    @cached_property
+    def payload(self) -> Index:
+        """Payload that each robot sent (N,) [bytes]."""
+        sent = self.trace.sent
+        assert sent.bytes is not None, "a sweep keeps sizes only where a metric needs sent"
+        size = np.bincount(sent.link, weights=sent.bytes, minlength=len(self.trace.robots))
+        return size.astype(np.intp)
+
+    @cached_property
+    def dropped(self) -> Index:
+        """Poses of each robot that the modelled network dropped, over all receivers (N,)."""
+        rows, dropped = len(self.trace.robots), self.trace.dropped
+        if dropped is None:
+            return np.zeros(rows, dtype=np.intp)
+        return np.bincount(self.trace.plan.pose_links.sender, weights=dropped, minlength=rows).astype(np.intp)
+
+
+def bounds_of(trace: Trace) -> list[tuple[float, int, int]]:
+    """Start [s], first row and last row + 1 of each phase; legs that begin within one sample are one phase."""
+    starts = phase_starts(trace)
+    begins, first = np.unique(np.searchsorted(trace.time, np.array(starts) - 1e-9), return_index=True)
+    ends = [*begins[1:], len(trace.time)]
+    return [(starts[k], int(begin), int(end)) for k, begin, end in zip(first, begins, ends, strict=True)]

@@ -1,0 +1,240 @@
+"""Metrics: what each is called, how runs are compared by it, and how it is measured; ours, and those from outside.
+
+Console, files, reports, sweeps and searches draw from `known_metrics`. A distribution adds one under
+`[project.entry-points."zenpark.metrics"]`, see docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from functools import cache
+from math import isfinite
+from operator import attrgetter
+from pathlib import Path
+from traceback import extract_tb
+from typing import ClassVar, Final, Literal, cast, get_args
+
+import msgspec
+import numpy as np
+
+from agents.plugins import registry
+from experiments.metrics.measurement import Measurement
+from experiments.metrics.results import CaseMetrics, RobotMetrics
+from experiments.recording.trace import Trace
+from twins.arrays import Array, Index
+
+Per = Literal["robot", "case"]
+Better = Literal["less", "more", ""]
+Mean = Literal["known", "all", "sum", "worst"]
+Number = float | None
+PLAIN: Final = str.maketrans({"²": "^2", "³": "^3", "·": " "})  # for MATLAB, which reads ASCII
+FORMULA: Final = str.maketrans({"²": "$^2$", "³": "$^3$", "·": " "})  # for figures
+
+
+class Metric(msgspec.Struct, frozen=True):
+    """A measured quantity; its docstring is its definition in reports."""
+
+    label: ClassVar[str] = ""  # heads of tables, axes
+    unit: ClassVar[str] = ""
+    per: ClassVar[Per] = "robot"
+    better: ClassVar[Better] = "less"
+    # from robots to the case: mean of the known values, mean if all are known, sum over all robots, worst value
+    mean: ClassVar[Mean] = "known"
+    sums: ClassVar[bool] = False  # adds up over what is known of a run: no ratio where less of a run is known
+    relative: ClassVar[bool] = True  # sweeps, limits and searches take it over the reference
+    swept: ClassVar[bool] = True  # a column of sweeps
+    shown: ClassVar[bool] = True  # a column in the terminal and in the tables of reports
+    figure: ClassVar[bool] = False  # a bar; with `relative` and `shown` a Pareto front as well
+    needs: ClassVar[tuple[str, ...]] = ("true_position",)  # fields of the trace: a sweep keeps these
+
+    def of(self, trace: Trace, shared: Measurement) -> Array | Index | float:
+        """Values of all robots (N,), or of the case (); NaN where unknown. A pure function: it changes no array."""
+        raise NotImplementedError
+
+    @property
+    def meaning(self) -> str:
+        """The definition, on one line."""
+        return " ".join((type(self).__doc__ or "").split())
+
+    @property
+    def head(self) -> str:
+        """Label and unit, for the head of a table."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    def average(self, values: Sequence[Number]) -> Number:
+        """The value of a case, from those of the robots in the means."""
+        known = [value for value in values if value is not None]
+        if not known or (self.mean == "all" and len(known) < len(values)):
+            return None
+        if self.mean == "worst":
+            return min(known) if self.better == "more" else max(known)
+        return statistics.fmean(known)
+
+
+def _ours(of: Callable[[Measurement], Array | Index], label: str, meaning: str, **facts: object) -> Metric:
+    """One of our metrics as an object of a class of its own, with the attributes `facts`."""
+    body = {"of": lambda _self, _trace, shared: of(shared), "label": label, "__doc__": meaning, **facts}
+    made = msgspec.defstruct(label, [], bases=(Metric,), namespace=body, module=__name__, frozen=True)
+    return cast(type[Metric], made)()
+
+
+UNSEEN: Final = {"mean": "sum", "swept": False, "shown": False}  # they do not occur in virtual time
+OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMetrics`
+    "f_hz": _ours(
+        attrgetter("rate"), "f",
+        "Transmissions over duration. Counted by running numbers, so that what a recorder lost counts too.",
+        unit="Hz", relative=False, figure=True,
+    ),
+    "messages": _ours(lambda m: m.transmissions[0], "Messages", "Transmissions of a robot, by their running numbers."),
+    "bytes": _ours(
+        attrgetter("payload"), "Payload", "Payload of the transmissions of a robot.",
+        unit="bytes", swept=False, shown=False,
+    ),
+    "iae": _ours(
+        lambda m: m.integrals[0], "IAE", "Integral of e(t) over the run (trapezoidal).",
+        unit="m s", sums=True, figure=True,
+    ),
+    "itae": _ours(
+        lambda m: m.integrals[1], "ITAE", "Integral of t · e(t); t counts from the common start.",
+        unit="m s²", sums=True, figure=True,
+    ),
+    "rmse": _ours(lambda m: m.integrals[2], "RMSE", "Root of the mean of e(t)².", unit="m", shown=False, figure=True),
+    "acquired_s": _ours(
+        lambda m: np.array(m.acquired, dtype=float), "Acquired",
+        "From when on the moving mean over one second of the error of each link stays within the tolerance, until the"
+        " next phase or the end; 0 if it never left. \"By all\" is when the last follower was there; the mean over"
+        " followers is of their own times, and is given only if every follower acquired.",
+        unit="s", mean="all", relative=False,
+    ),
+    "updates": _ours(
+        attrgetter("trace.decisions"), "Updates", "Goals that a robot computed anew.", relative=False, shown=False
+    ),
+    "lost": _ours(
+        attrgetter("trace.lost"), "Lost samples",
+        "Poses that by their numbers were sent and never reached a receiver.", **UNSEEN,
+    ),
+    "dropped": _ours(
+        attrgetter("dropped"), "Dropped", "Poses that the modelled network dropped, over all receivers.",
+        mean="sum", relative=False,
+    ),
+    "missed_deadlines": _ours(
+        attrgetter("trace.missed_deadlines"), "Missed deadlines",
+        "Ticks that were skipped because their time had passed; shares are of the ticks that were due.", **UNSEEN,
+    ),
+}  # fmt: skip
+CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # of ours, in a line of the terminal
+ERRORS: Final = tuple(name for name, metric in OURS.items() if metric.figure and metric.relative)
+TAKEN: Final = {*RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__, "in_mean", "gap"}  # columns of tables
+
+
+def known_metrics() -> dict[str, Metric]:
+    """All metrics by name: ours, then those of other distributions."""
+    return {**OURS, **_installed()[0]}
+
+
+def swept_metrics() -> dict[str, Metric]:
+    """Metrics that are columns of sweeps."""
+    return {name: metric for name, metric in known_metrics().items() if metric.swept}
+
+
+def foreign_metrics() -> dict[str, Metric]:
+    """Metrics of other distributions."""
+    return _installed()[0]
+
+
+def console_metrics() -> dict[str, Metric]:
+    """Metrics in a line of the terminal."""
+    added = {name: metric for name, metric in foreign_metrics().items() if metric.shown}
+    return {name: OURS[name] for name in CONSOLE} | added
+
+
+def unusable_metrics() -> tuple[str, ...]:
+    """Why registered metrics are left out, a sentence each."""
+    return _installed()[1]
+
+
+def short_name(name: str) -> str:
+    """Name of a metric on the command line: `f` for `f_hz`."""
+    return name.removesuffix("_hz").removesuffix("_s")
+
+
+@cache
+def _installed() -> tuple[dict[str, Metric], tuple[str, ...]]:
+    found, left_out = {}, []
+    for name in registry.names(registry.METRICS):
+        try:
+            found[name] = _made(name)
+        except registry.PluginError as error:
+            left_out.append(f"metric {name} is left out: {' '.join(str(error).split())} (docs/metrics.md)")
+    return found, tuple(left_out)
+
+
+def _made(name: str) -> Metric:
+    """The metric registered under a name; raises PluginError if it cannot be used."""
+    plugin = registry.struct(registry.METRICS, name)
+    columns = {field.name for field in fields(Trace)}
+    allowed = (("per", Per), ("better", Better), ("mean", Mean))
+    wrong = ""
+    if not name.isidentifier() or name != name.lower():
+        wrong = "its name must be of small letters, digits and _"
+    elif name in TAKEN or short_name(name) in {short_name(each) for each in OURS}:
+        wrong = "zenpark has something of this name: register it under another one"
+    elif not issubclass(plugin, Metric):
+        wrong = f"it must inherit from {Metric.__module__}.{Metric.__qualname__}"
+    elif plugin.__struct_fields__:
+        wrong = f"it has parameters ({', '.join(plugin.__struct_fields__)}), and no file gives them"
+    elif not isinstance(plugin.label, str) or not plugin.label or not isinstance(plugin.unit, str):
+        wrong = "label and unit must be texts, and the label not empty"
+    elif bad := [what for what, choice in allowed if getattr(plugin, what) not in get_args(choice)]:
+        wrong = f"{bad[0]} = {getattr(plugin, bad[0])!r} is none of {get_args(dict(allowed)[bad[0]])}"
+    elif bad := [each for each in plugin.needs if each not in columns]:
+        wrong = f"needs names {bad[0]!r}, and a trace has no such field: {registry.did_you_mean(bad[0], columns)}"
+    if wrong:
+        raise registry.PluginError(wrong)
+    return cast(type[Metric], plugin)()
+
+
+def values_of(metrics: Mapping[str, Metric], shared: Measurement) -> tuple[dict[str, list[Number]], tuple[str, ...]]:
+    """Values of metrics by robot, or the single one of a case; and which metrics failed, a sentence each.
+
+    A metric that fails has unknown values. Integers stay integers.
+    """
+    found: dict[str, list[Number]] = {}
+    failed = []
+    for name, metric in metrics.items():
+        count = len(shared.trace.robots) if metric.per == "robot" else 1
+        try:
+            with np.errstate(all="ignore"):
+                found[name] = _numbers(metric, np.asarray(metric.of(shared.trace, shared)), count)
+        except (*registry.FAILURES, NotImplementedError) as error:
+            found[name] = [None] * count
+            at = extract_tb(error.__traceback__)[-1]
+            where = f"{Path(at.filename).name}:{at.lineno}"
+            failed.append(f"metric {name} failed: {type(error).__name__}: {error} ({where})")
+    return found, tuple(failed)
+
+
+def _numbers(metric: Metric, values: Array, count: int) -> list[Number]:
+    shape = (count,) if metric.per == "robot" else ()
+    if values.shape != shape or values.dtype.kind not in "iuf":
+        wanted = f"{count} numbers, one for each robot" if metric.per == "robot" else "one number"
+        raise ValueError(f"it gives {values.dtype} {values.shape}, not {wanted}")
+    return [each if isfinite(each) else None for each in values.reshape(count).tolist()]
+
+
+def case_values(
+    metrics: Mapping[str, Metric], values: Mapping[str, Sequence[Number]], kept: Sequence[int], *, sums: bool = False
+) -> dict[str, Number]:
+    """Each metric of a case: over the robots in the means; with `sums`, what adds up over robots is over all."""
+    found: dict[str, Number] = {}
+    for name, metric in metrics.items():
+        if metric.per == "case":
+            (found[name],) = values[name]
+        elif sums and metric.mean == "sum":
+            known = [value for value in values[name] if value is not None]
+            found[name] = sum(known) if known else None
+        else:
+            found[name] = metric.average([values[name][i] for i in kept])
+    return found

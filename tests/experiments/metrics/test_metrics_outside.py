@@ -1,0 +1,244 @@
+"""The metrics of docs/metrics.md, installed from outside of this repository; and what becomes of wrong ones."""
+
+import csv
+import json
+import re
+
+import msgspec
+import numpy as np
+import pytest
+
+from agents.plugins import registry
+from experiments.file.document import load
+from experiments.file.problems import DocumentError
+from experiments.metrics import metric
+from experiments.metrics.measure import measure
+from experiments.metrics.metric import Metric
+from experiments.metrics.statistics import Spread, ratios
+from experiments.report import figures, metrics_files, tables
+from experiments.sweep import runs
+from experiments.sweep.optimise import Limit, Wish, wish_of
+from experiments.sweep.pareto import front
+from experiments.sweep.table import CellRow
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+from tests.agents.plugins.test_plugins_outside import ROOT, install, zenpark
+
+GUIDE = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+WAY, GAP = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
+BROKEN = """
+
+class Broken(Way, frozen=True):
+    label = "Broken"
+
+    def of(self, trace, shared):
+        return 1 / 0
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The guide's metrics, one that fails, and one that cannot be imported, as an installer would leave them."""
+    folder = tmp_path_factory.mktemp("metrics")
+    (folder / "my_metrics.py").write_text(f"{WAY}\n\n{GAP}{BROKEN}", encoding="utf-8")
+    ((name, made),) = re.findall(r'`(\w+) = "([\w:]+)"` under `\[project\.entry-points\."zenpark\.metrics"\]`', GUIDE)
+    given = {name: made, "gap_m": "my_metrics:Gap", "broken": "my_metrics:Broken", "gone": "no_such_module:Way"}
+    install(folder, "my-metrics", "0.1", {"zenpark.metrics": given})
+    return folder
+
+
+def test_guide_metric_is_short():
+    assert len(WAY.strip().splitlines()) <= 22
+
+
+@pytest.mark.slow
+def test_installed_metric_is_everywhere(installed):
+    listed = zenpark(installed, "list")
+    assert re.search(r"^Metrics: f_hz, .*, broken, gap_m, way_m$", listed.stdout, re.MULTILINE)
+    assert "metric gone is left out: plug-in 'gone' (no_such_module:Way) of my-metrics fails to import" in listed.stderr
+    assert "Length of the path of a robot" in zenpark(installed, "explain", "way_m").stdout
+
+    short = ["--set", "duration_s=5"]
+    run = zenpark(installed, "run", "triangle", "--virtual", "--seeds", "2", *short, "--out", "run")
+    assert run.returncode == 0, run.stderr
+    assert re.search(r"event: f .*, Way \d.* m, .*\(ratios: f .*, Way \d", run.stdout)
+    assert "metric broken failed: ZeroDivisionError: division by zero (my_metrics.py:" in run.stdout
+    with (installed / "run" / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert all(float(row["way_m"]) > 0.1 for row in rows)
+    assert {row["broken"] for row in rows} == {""}
+    assert [bool(row["gap_m"]) for row in rows] == [row["robot"] == "mean" for row in rows]
+    page = (installed / "run" / "report.html").read_text("utf-8")
+    assert all(text in page for text in ("Way [m]", "Length of the path", "Gap [m] of the case", "broken failed"))
+
+    shown = zenpark(installed, "compare", "run").stdout + zenpark(installed, "report", "run", "--markdown").stdout
+    assert "Way [m]" in shown
+    made = json.loads((installed / "run" / "run.json").read_text())["made_by"]
+    assert made["plugins"] == {"my-metrics": "0.1"}
+
+
+@pytest.mark.slow
+def test_installed_metric_is_swept(installed):
+    arguments = ["trigger.threshold=0.01,0.03", "seeds=3", "--set", "duration_s=5", "--out", "swept"]
+    done = zenpark(installed, "sweep", "triangle", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^note: metric broken failed: ZeroDivisionError", done.stdout, re.MULTILINE)
+    assert "Way ratio" in done.stdout
+    cell = json.loads((installed / "swept" / "sweep.json").read_text())["cells"][1]
+    assert cell["mean"]["way_m"]["n"] == cell["ratio"]["way_m"]["n"] == 3
+    assert 0.0 < cell["ratio"]["way_m"]["ci95"] < 0.2
+    assert cell["mean"]["broken"]["n"] == 0
+    assert (installed / "swept" / "figures" / "pareto_way_m.svg").is_file()
+    table = zenpark(installed, "report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
+    assert "| Messages ratio | Way ratio |" in table
+
+
+class Way(Metric, frozen=True):
+    """Length of the path."""
+
+    label = "Way"
+    unit = "m"
+    sums = True
+    figure = True
+
+    def of(self, trace, shared):
+        return np.nansum(np.linalg.norm(np.diff(trace.true_position, axis=0), axis=2), axis=0)
+
+
+class Height(Metric, frozen=True):
+    """Largest height."""
+
+    label = "Height"
+    per = "case"
+    better = "more"
+    needs = ("goal",)
+
+    def of(self, trace, shared):
+        return np.nanmax(trace.goal[..., 2])
+
+
+class Wrong(Metric, frozen=True):
+    """Gives three numbers whatever there is."""
+
+    label = "Wrong"
+
+    def of(self, trace, shared):
+        return np.zeros(30)
+
+
+@pytest.fixture
+def known(monkeypatch):
+    """Metrics that are installed, by name."""
+
+    def put(**metrics):
+        monkeypatch.setattr(metric, "_installed", lambda: (metrics, ()))
+
+    return put
+
+
+@pytest.fixture(scope="module")
+def triangle():
+    return msgspec.structs.replace(load("triangle").cases()["event"], duration_s=2.0)
+
+
+@pytest.fixture(scope="module")
+def trace(triangle):
+    return Logbook(simulate(triangle, 1), triangle, "event").trace()
+
+
+@pytest.fixture(scope="module")
+def older(trace):
+    """A case that was measured before a metric was installed."""
+    return msgspec.json.decode(msgspec.json.encode(measure(trace)), type=type(measure(trace)))
+
+
+def test_metric_of_wrong_shape_is_unknown(known, trace):
+    known(wrong=Wrong(), way_m=Way())
+    found = measure(trace)
+    (fault,) = found.metric_faults
+    assert fault.startswith("metric wrong failed: ValueError: it gives float64 (30,), not 3 numbers")
+    assert found.mean["wrong"] is None
+    assert found.mean["way_m"] == pytest.approx(np.mean([robot.extra["way_m"] for robot in found.robots]))
+
+
+def test_reports_of_older_runs_have_an_empty_column(known, trace, older, tmp_path):
+    known(way_m=Way(), height=Height())
+    assert older.mean.get("way_m") is None
+    assert ratios([measure(trace)], [older], "way_m") == [None]
+    (row,) = [row for row in tables.summary_table([older]).rows if row.cells[0] == "Way [m]"]
+    assert row.cells[1] == tables.NONE
+    (table,) = tables.robot_tables([older])
+    assert {row.cells[table.head.index("Way [m]")] for row in table.rows} == {tables.NONE}
+    assert figures.robot_bars([older]).axes
+    metrics_files.write_csv(tmp_path / "metrics.csv", [older, measure(trace)])
+    with (tmp_path / "metrics.csv").open(newline="", encoding="utf-8") as file:
+        way = [row["way_m"] for row in csv.DictReader(file)]
+    assert [bool(each) for each in way] == [False] * 4 + [True] * 4
+
+
+def test_sweep_keeps_what_metrics_need(known, triangle):
+    seeds = (1,)
+    known(way_m=Way())
+    assert runs.lean_enough()
+    ((lean,), _) = runs._flown(triangle, seeds)
+    known(way_m=Way(), height=Height())
+    assert not runs.lean_enough()
+    ((whole,), _) = runs._flown(triangle, seeds)
+    assert whole.values.items() > lean.values.items()
+    assert whole.values["height"] is not None
+    assert whole.metric_faults == ()
+
+
+def test_store_of_a_sweep_knows_the_metrics(known, triangle, monkeypatch):
+    known()
+    before = runs.code_of(triangle)
+    known(way_m=Way())
+    with_way = runs.code_of(triangle)
+    monkeypatch.setattr(runs, "_file_digest", lambda _file: "changed")
+    assert len({before, with_way, runs.code_of(triangle)}) == 3
+
+
+def test_search_for_more_of_a_metric(known):
+    known(way_m=Way(), height=Height())
+    assert wish_of("height, way_m<=1.02, height>=0.5") == Wish(
+        "height", (Limit("way_m", 1.02), Limit("height", 0.5, least=True))
+    )
+    with pytest.raises(DocumentError, match="'way_m>=1' is no limit"):
+        wish_of("height, way_m>=1")
+
+
+def swept(messages, height):
+    one = {"messages": certain(messages), "height": certain(height)}
+    return CellRow("event", {}, {}, {}, False, 9, 0, {}, one, 1.0, 0.02)
+
+
+def certain(mean):
+    return Spread(mean, 0.0, 0.01, 9)
+
+
+def test_more_is_better_on_the_front_and_in_the_search(known):
+    known(height=Height())
+    low, high = swept(0.5, 0.9), swept(0.5, 1.2)
+    assert front([low, high], "height") == [high]
+    wish = wish_of("height, messages<=0.6")
+    assert wish.rank(high) < wish.rank(low)
+    assert wish_of("messages, height>=1.0").kept(high)
+    assert not wish_of("messages, height>=1.0").kept(low)
+
+
+@pytest.mark.parametrize(
+    ("name", "facts", "message"),
+    [
+        ("iae", {}, "zenpark has something of this name"),
+        ("acquired", {}, "zenpark has something of this name"),
+        ("way-m", {}, "small letters, digits and _"),
+        ("way_m", {"label": ""}, "label and unit must be texts"),
+        ("way_m", {"better": "most"}, "better = 'most' is none of"),
+        ("way_m", {"needs": ("gaol",)}, "did you mean 'goal'?"),
+    ],
+)
+def test_wrong_metric_is_refused(name, facts, message, monkeypatch):
+    made = type(Way)("Made", (Way,), {"__module__": __name__, **facts}, frozen=True)
+    monkeypatch.setattr(registry, "struct", lambda _group, _name: made)
+    with pytest.raises(registry.PluginError, match=re.escape(message)):
+        metric._made(name)
