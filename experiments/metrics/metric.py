@@ -126,7 +126,10 @@ OURS: Final[Mapping[str, Metric]] = {  # by the names of the fields of `RobotMet
 }  # fmt: skip
 CONSOLE: Final = ("f_hz", "iae", "rmse", "acquired_s")  # of ours, in a line of the terminal
 ERRORS: Final = tuple(name for name, metric in OURS.items() if metric.figure and metric.relative)
-TAKEN: Final = {*RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__, "in_mean", "gap"}  # columns of tables
+TAKEN: Final = {  # columns of tables
+    *RobotMetrics.__struct_fields__, *CaseMetrics.__struct_fields__,
+    *("in_mean", "gap", "reference", "seeds", "acquired_share"),
+}  # fmt: skip
 
 
 def known_metrics() -> dict[str, Metric]:
@@ -199,7 +202,7 @@ def _made(name: str) -> Metric:
 def values_of(metrics: Mapping[str, Metric], shared: Measurement) -> tuple[dict[str, list[Number]], tuple[str, ...]]:
     """Values of metrics by robot, or the single one of a case; and which metrics failed, a sentence each.
 
-    A metric that fails has unknown values. Integers stay integers.
+    A metric of another distribution that fails has unknown values. Integers stay integers.
     """
     found: dict[str, list[Number]] = {}
     failed = []
@@ -208,7 +211,9 @@ def values_of(metrics: Mapping[str, Metric], shared: Measurement) -> tuple[dict[
         try:
             with np.errstate(all="ignore"):
                 found[name] = _numbers(metric, np.asarray(metric.of(shared.trace, shared)), count)
-        except (*registry.FAILURES, NotImplementedError) as error:
+        except registry.FAILURES as error:
+            if name in OURS:
+                raise
             found[name] = [None] * count
             at = extract_tb(error.__traceback__)[-1]
             where = f"{Path(at.filename).name}:{at.lineno}"
