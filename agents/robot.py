@@ -20,8 +20,9 @@ from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, IDLE, LANDING, READY, RUNNING, Lifecycle, Phase
 from agents.decision.neighbours import Neighbours
 from agents.decision.perception import Perception
-from agents.decision.position_control import PositionController
+from agents.decision.position_control import PositionController, VelocityFollower
 from agents.decision.situation import ProcessHealth, Situation
+from agents.decision.stepping import Stepping, Words
 from agents.decision.transmission import Transmitter
 from agents.plugins.predictors import HOLD
 from agents.safety.detection import Detector, Status
@@ -41,12 +42,12 @@ class Robot:
 
     FIXED: ClassVar = ("_flies", "_predicts")
     __slots__ = (
-        "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt", "_external",
-        "_filter", "_flies", "_ordered", "_origin", "_perception", "_place", "_pose_every", "_predicts", "_preflight",
-        "_status", "assignment", "avoided", "begun", "causes", "changed", "decision_due", "decisions", "error",
-        "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards", "health", "interventions", "keeping", "landing",
-        "lands", "lifecycle", "neighbours", "now", "sent_position", "sent_velocity", "setpoint", "stops", "takes_off",
-        "tick", "transmitter", "updates",
+        "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt",
+        "_external", "_filter", "_flies", "_follower", "_ordered", "_origin", "_perception", "_place", "_pose_every",
+        "_predicts", "_preflight", "_status", "_stepping", "assignment", "avoided", "begun", "causes", "changed",
+        "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
+        "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position",
+        "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
     )  # fmt: skip
 
     tick: int  # number of the next tick; 0 at the common start, so that robots decide together
@@ -81,7 +82,10 @@ class Robot:
             self.guidance = Guidance(flies=kind.flies, silence_s=limits.link_silence_s)
         self.keeping = StationKeeping(assignment.ground)
         self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration)
-        self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind)
+        stepping = self._stepping = self.goals.stepping
+        self._follower = None if stepping is None else VelocityFollower(kind, assignment.ground)
+        speech = None if stepping is None else stepping.speech
+        self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind, speech)
         self.hazards, self.landing = Hazards(kind, limits), Landing(assignment)
         self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), Status()
         self._controller, self._filter = PositionController(kind), SetpointFilter(kind, limits)
@@ -166,6 +170,17 @@ class Robot:
         """x, y, z [m] and yaw [rad] at which the plan began, by itself or by the start order."""
         return self.goals.origin or self._origin
 
+    @property
+    def words(self) -> Words:
+        """What is said beside the transmitted pose: variables by name."""
+        speech = None if self._stepping is None else self._stepping.speech
+        return () if speech is None else speech.words
+
+    @property
+    def stepping(self) -> Stepping | None:
+        """The law at work, if it is no gradient."""
+        return self._stepping
+
     def missing_neighbours(self) -> list[str]:
         """Neighbours that the robot has never received, or that are lost; likewise its central controller."""
         names, guidance = self.neighbours.missing(), self.guidance
@@ -244,6 +259,8 @@ class Robot:
         # by number, not by remainder: a decision due on a skipped tick is made on the next one
         decision, question = self.tick // self._decide_every, self.tick // self._pose_every
         self.decision_due, self._decided = decision != self._decided, decision
+        if self._stepping is not None and self.decision_due:
+            self._step(t, self._stepping)
         if question == self._asked:
             return False
         self._asked = question
@@ -258,6 +275,23 @@ class Robot:
         if self._predicts:
             due = self._stands_blind() or due
         return due
+
+    def _step(self, t: float, stepping: Stepping) -> None:
+        """Before its first question on a tick: a law that says something steps, so that it says what is new."""
+        life, now = self.lifecycle, self.now
+        stepping.moves, stepping.scan, stepping.tick = not self._holds(), now.state.scan, self.tick
+        if stepping.speech is not None and life.phase == RUNNING and not now.invalid and self.guidance is None:
+            self.goals.step(t, now.position, now.velocity, now.yaw, life.start_at)
+
+    def _renew_goal(self, stepping: Stepping) -> None:
+        """A law gives a velocity: the goal moves on with it on every tick."""
+        follower, velocity, now = self._follower, stepping.velocity, self.now
+        moves = self.lifecycle.phase == RUNNING and not self.keeping.held and self.goals.follows and self.decisions > 0
+        if follower is None or velocity is None or not moves:
+            if follower is not None:
+                follower.reference = UNKNOWN
+        elif not now.invalid:
+            self.goal = follower.goal(velocity, now.position, self._dt)
 
     def _stands_blind(self) -> bool:
         """Whether a robot on wheels has just become blind: it sends that it is at rest, or others would follow it."""
@@ -320,6 +354,8 @@ class Robot:
             self._stay(held or self.keeping.held or life.phase == AIRBORNE)
         if self.guidance is not None:
             self._follow(self.guidance)
+        if self._stepping is not None:
+            self._renew_goal(self._stepping)
         goal = landing.place if landing.aside else self.goal
         self.avoided = False
         if self._perception is not None:
@@ -362,7 +398,7 @@ class Robot:
         if failing:
             life.set_missing(failing)
             return life.phase == READY and not lost
-        if life.phase == IDLE and not is_finite(self.goals.law_offset(t, self.now.position)):
+        if life.phase == IDLE and not self.goals.is_sound(t, self.now.position):
             life.set_missing("its law wants something that is not finite")
             return False
         return True

@@ -10,7 +10,7 @@ from agents.decision.neighbours import Incoming
 from agents.formation.anchors import Anchor
 from agents.formation.changes import Change
 from agents.plugins.avoidance import Avoidance
-from agents.plugins.laws import Gradient
+from agents.plugins.law import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
@@ -24,7 +24,7 @@ class Assignment:
     kind: Kind
     hover: float  # height that a flying robot holds [m]; NaN on wheels
     neighbours: tuple[Incoming, ...]  # links on which it receives, those of its law first
-    law: Gradient
+    law: Law
     trigger: Trigger  # of transmissions
     clamp: float  # largest step of a goal per axis and decision [m]
     tracking_gain: float  # k of (7) [1/(m² decision)]
@@ -33,6 +33,8 @@ class Assignment:
     pose_every: int  # ticks from one question to the trigger to the next
     decide_every: int  # ticks from one goal to the next
     duration: float  # of the experiment [s]
+    number: int = 0  # among all robots of the experiment
+    count: int = 1  # of these
     legs: tuple[Leg, ...] = ()  # its plan
     patience_s: float | None = None  # wait for a missing neighbour [s]; None: without limit
     predictor: Predictor = HOLD  # of neighbours between two messages

@@ -6,31 +6,36 @@ guides from that robot's last received pose. `errors`, `law_offset` and `decide`
 
 from __future__ import annotations
 
-from math import isfinite, nan
-from typing import ClassVar
+from math import isfinite, isnan, nan
+from typing import ClassVar, cast
 
 from agents.decision.assignment import Assignment
 from agents.decision.control_updates import ControlUpdates
 from agents.decision.neighbours import Neighbours
+from agents.decision.stepping import Stepping, is_sound
 from agents.formation.changes import change_target, exists, planned_at
 from agents.formation.link import Link
+from agents.plugins.law import NeighbourView, View
 from agents.plugins.laws import Gradient, goal_position, tracking_offset
 from agents.plugins.planners import Itinerary, Leg, Waypoints
-from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite, norm
+from agents.vectors import UNKNOWN, ZERO, Pose, Vector, difference, is_finite, norm
 
 
 class GoalComputer:
     """Goals of one robot."""
 
-    FIXED: ClassVar = ("_gated", "_reshapes", "follows")
+    FIXED: ClassVar = ("_gated", "_reshapes", "follows", "needs_company")
     __slots__ = (
         "_anchors", "_changes", "_detour", "_detour_since", "_flies", "_gated", "_given", "_predictor", "_reshapes",
-        "_updating", "clamp", "energy", "error", "follows", "goal", "ground", "itinerary", "law", "neighbours",
-        "offset", "tracking_gain", "yaw",
+        "_updating", "clamp", "energy", "error", "follows", "goal", "ground", "itinerary", "law", "needs_company",
+        "neighbours", "offset", "stepping", "tracking_gain", "yaw",
     )  # fmt: skip
 
+    law: Gradient  # where `stepping` is None
+    stepping: Stepping | None  # a law that is no gradient, at work
     neighbours: Neighbours
-    follows: bool  # the law moves it: it has links or anchors
+    follows: bool  # the law moves it: it has links or anchors, or needs none
+    needs_company: bool  # without neighbours it stays in place
     clamp: float  # largest step of a goal per axis and decision [m]
     tracking_gain: float  # k of (7) [1/(m² decision)]
     ground: float  # height that it holds [m]
@@ -43,12 +48,16 @@ class GoalComputer:
     def __init__(self, assignment: Assignment, *, passive: bool = False) -> None:
         """Of a robot with an `assignment`; `passive`: its goals come from elsewhere."""
         links = assignment.neighbours
-        self.law: Gradient = assignment.law
+        self.law = cast(Gradient, assignment.law)
+        self.stepping = None if isinstance(assignment.law, Gradient) else Stepping(assignment)
         self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
         self.neighbours = Neighbours(links, assignment.limits.link_silence_s)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
         self._flies, self.ground = assignment.kind.flies, assignment.ground
-        self.follows = bool(self._anchors) or any(link.in_law for link in links)
+        linked, legs = any(link.in_law for link in links), assignment.legs
+        alone = self.stepping is not None and self.stepping.alone and not (passive or legs)
+        self.follows = bool(self._anchors) or linked or alone
+        self.needs_company = linked and not self._anchors and not assignment.law.ALONE
         self._given = [Link(each.distance, each.gain, each.relative, each.bearing, each.wants) for each in links]
         bounded = [
             sender for sender in self.neighbours.all if not planned_at(sender.since, sender.until, sender.reach, 0.0)
@@ -57,7 +66,6 @@ class GoalComputer:
         self._reshapes = bool(self._changes or bounded or comes_and_goes)
         for sender in self.neighbours.all:
             sender.present = sender.in_law and planned_at(sender.since, sender.until, sender.reach, 0.0)
-        legs = assignment.legs
         self.itinerary: Itinerary | None = None
         if legs or not (self.follows or passive):  # neither law nor plan: stay in place
             self.itinerary = Itinerary(legs, holds_before=not self.follows)
@@ -76,7 +84,7 @@ class GoalComputer:
 
     def without_neighbours(self) -> bool:
         """Whether the law has no input: all neighbours are lost, or not there now."""
-        if not self.follows or self._anchors:
+        if not self.needs_company:
             return False
         for sender in self.neighbours.all:  # noqa: SIM110 - quiet
             if sender.active:
@@ -124,6 +132,8 @@ class GoalComputer:
             velocity: Likewise [m/s].
             yaw: Likewise [rad].
         """
+        if self.stepping is not None:
+            return self._decide_by_steps(t, position, velocity, yaw, start)
         elapsed = t - start
         if self._reshapes:
             self._reshape(elapsed, position, t)
@@ -171,7 +181,13 @@ class GoalComputer:
         return x, y, z
 
     def errors(self, t: float, position: Vector) -> None:
-        """Compute `error` and `energy` of the links at `t` [s], as a robot at `position` [m] knows them."""
+        """Compute `error` and `energy` of the links at `t` [s], as a robot at `position` [m] knows them.
+
+        A law that is no gradient has none: they are NaN.
+        """
+        if self.stepping is not None:
+            self.error = self.energy = nan
+            return
         law, predictor = self.law, self._predictor
         total = energy = 0.0
         for sender in self.neighbours.all:
@@ -182,6 +198,60 @@ class GoalComputer:
             error = anchor.error(position)
             total, energy = total + error, energy + 0.5 * error * error
         self.error, self.energy = total, energy
+
+    def step(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> None:
+        """Let a law that is no gradient step; for the arguments see `decide`. Not quiet."""
+        if self._reshapes:
+            self._reshape(t - start, position, t)
+        if self.stepping is not None:
+            self.stepping.step(self._view(self.stepping, t, position, velocity, yaw, start))
+
+    def is_sound(self, t: float, position: Vector) -> bool:
+        """Whether the law, asked at `t` [s] for a robot that stands at `position` [m], wants what is finite."""
+        if self.stepping is None:
+            return is_finite(self.law_offset(t, position))
+        return is_sound(self.stepping.rehearse(self._view(self.stepping, t, position, ZERO, 0.0, t)))
+
+    def _view(  # noqa: PLR0917 - as `decide`
+        self, stepping: Stepping, t: float, position: Vector, velocity: Vector, yaw: float, start: float
+    ) -> View:
+        view, predictor = stepping.view(), self._predictor
+        view.position, view.velocity, view.yaw, view.leads = position, velocity, yaw, not self.follows
+        if self.itinerary is not None:
+            x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)
+            stepping.aim(view, (x, y, z))
+        view.neighbours = [
+            NeighbourView(
+                sender.sender, sender.name, sender.place(predictor, t), sender.velocity, sender.yaw, t - sender.stamp,
+                stepping.said_by(sender.said), sender.link,
+            )
+            for sender in self.neighbours.all
+            if sender.active
+        ]  # fmt: skip
+        return view
+
+    def _decide_by_steps(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> bool:
+        """As `decide`, for a law that is no gradient; where it gives a velocity, the goal is the robot's place."""
+        stepping = cast(Stepping, self.stepping)
+        if stepping.speech is None:
+            self.step(t, position, velocity, yaw, start)
+        place = position[0], position[1], self.ground
+        goal, goal_yaw = place, stepping.control.yaw
+        if self.follows:
+            if (wanted := stepping.control.goal) is not None:
+                goal = goal_position(place, difference(wanted, place), self.clamp)
+                if not self._flies or isnan(wanted[2]):
+                    goal = goal[0], goal[1], self.ground
+        elif self.itinerary is not None:
+            x, y, z, goal_yaw = self.itinerary.target(t - start, place, yaw)
+            goal = x, y, z
+        if self._detour is not None:
+            x, y, z, goal_yaw = self._detour.target(t - self._detour_since, place, yaw)
+            goal = x, y, z
+        if not self._flies:
+            goal = goal[0], goal[1], self.ground
+        self.goal, self.yaw = goal, goal_yaw
+        return True
 
     def _reshape(self, elapsed: float, position: Vector, t: float) -> None:
         """Set targets and presence of the links `elapsed` [s] after the start."""

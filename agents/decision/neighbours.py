@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import inf, isfinite
+from collections.abc import Mapping, Sequence
+from math import inf, isfinite, nan
+from typing import Final
 
 import msgspec
 
@@ -12,6 +13,8 @@ from agents.formation.changes import Target
 from agents.formation.link import Link
 from agents.plugins.predictors import Predictor
 from agents.vectors import UNKNOWN, ZERO, Vector, difference
+
+NO_WORDS: Final[Mapping[str, tuple[float, ...]]] = {}
 
 
 class Incoming(msgspec.Struct, frozen=True):
@@ -39,13 +42,15 @@ class Neighbour:
 
     __slots__ = (
         "active", "arrival", "available", "awaited", "behind", "doubt", "foreign", "height", "in_law", "lag", "link",
-        "lost_since", "name", "position", "present", "radius", "reach", "release", "sender", "since", "stamp",
-        "targets", "until", "velocity",
+        "lost_since", "name", "position", "present", "radius", "reach", "release", "said", "sender", "since", "stamp",
+        "targets", "until", "velocity", "yaw",
     )  # fmt: skip
 
     link: Link  # its target now
     position: Vector  # last received [m], NaN before; that of a former process until its successor has sent one
     velocity: Vector  # [m/s]
+    yaw: float  # [rad], NaN where unknown
+    said: Mapping[str, tuple[float, ...]]  # variables beside its last pose, by name
     stamp: float  # time of measurement, limited to plausible values [s]; −inf before the first pose
     arrival: float  # time of reception [s]
     lost_since: float  # loss of the sender [s]; inf: alive; −inf: token never seen, a pose is no sign of life
@@ -63,7 +68,7 @@ class Neighbour:
         self.since, self.until = incoming.since, incoming.until
         self.reach, self.release = incoming.reach, incoming.release
         self.link = Link(incoming.distance, incoming.gain, incoming.relative, incoming.bearing, incoming.wants)
-        self.position, self.velocity = UNKNOWN, ZERO
+        self.position, self.velocity, self.yaw, self.said = UNKNOWN, ZERO, nan, NO_WORDS
         self.stamp = self.arrival = self.lost_since = -inf
         self.available = self.active = False
         self.present = incoming.in_law
@@ -104,12 +109,19 @@ class Neighbours:
         self.incomplete, self.lagging, self.refused = True, False, False
         self.foreign_at, self.silence_s = -inf, silence_s
 
-    def receive(self, link: int, position: Vector, velocity: Vector, stamp: float, arrival: float) -> bool:
-        """Store a pose of the sender on a link, if it is newer than the known one; returns whether it is."""
+    def receive(  # noqa: PLR0917 - the fields of a pose
+        self, link: int, position: Vector, velocity: Vector, stamp: float, arrival: float,
+        yaw: float = nan, said: Mapping[str, tuple[float, ...]] = NO_WORDS,
+    ) -> bool:  # fmt: skip
+        """Store a pose of the sender on a link, if it is newer than the known one; returns whether it is.
+
+        `said` are the variables that came with it, by name.
+        """
         sender = self.all[link]
         if not stamp > sender.stamp:
             return False
         sender.position, sender.velocity, sender.stamp, sender.arrival = position, velocity, stamp, arrival
+        sender.yaw, sender.said = yaw, said
         return True
 
     def mark_lost(self, link: int, t: float) -> None:
@@ -127,6 +139,7 @@ class Neighbours:
         """Discard the pose of a sender that was restarted: it stands where it was last."""
         sender = self.all[link]
         sender.velocity, sender.stamp, sender.arrival = ZERO, -inf, -inf
+        sender.yaw, sender.said = nan, NO_WORDS
         self.incomplete = True
 
     def mark_clock_lag(self, link: int, lag: float) -> None:

@@ -9,10 +9,12 @@ from math import atan2, cos, isfinite, isnan, nan, pi, radians, sin, sqrt
 from typing import Final
 
 from agents.body.kinds import Kind
-from agents.vectors import Setpoint, Vector, clamp, wrap
+from agents.vectors import UNKNOWN, Setpoint, Vector, clamp, wrap
 
 REACHED: Final = 0.005  # [m] a ground robot stops nearer than this to its goal; half the threshold of a 1 cm trigger
 TURNED: Final = radians(2.0)  # [rad] and nearer than this to the wanted yaw
+
+LEASH: Final = 0.05  # [m] farthest of a reference from its robot: it does not wind up where the robot is held back
 
 BROADSIDE: Final = 0.02  # cosine of α below which a goal is abeam: wheels turn first, and drive in proportion
 
@@ -56,6 +58,52 @@ class PositionController:
         if -speed <= vx <= speed and -speed <= vy <= speed and -speed <= vz <= speed:
             return vx, vy, vz, turn
         return clamp(vx, -speed, speed), clamp(vy, -speed, speed), clamp(vz, -speed, speed), turn
+
+
+class VelocityFollower:
+    """Goals of a robot that is to move with a velocity, one on every tick: its reference and the way of 1/response.
+
+    The reference of a robot that takes twists is its measured place. That of any other is carried on with the velocity:
+    a measured one would be a random walk.
+    """
+
+    __slots__ = ("_by_twist", "_flies", "_ground", "_response", "_speed", "reference")
+
+    reference: Vector  # [m]; NaN: the next one is the place of the robot
+
+    def __init__(self, kind: Kind, ground: float) -> None:
+        """`ground`: height that the robot holds [m]."""
+        self._by_twist, self._flies, self._ground = kind.takes == "twist", kind.flies, ground
+        self._response, self._speed = kind.response, kind.speed
+        self.reference = UNKNOWN
+
+    def goal(self, velocity: Vector, position: Vector, dt: float) -> Vector:
+        """Goal [m] of a robot at `position` [m] that moves with `velocity` [m/s] for a tick of `dt` [s].
+
+        A velocity beyond the speed of the kind keeps its direction. Where its third number is NaN, or the robot stands
+        on wheels, the height is held.
+        """
+        x, y, z = velocity
+        held = isnan(z) or not self._flies
+        if held:
+            z = 0.0
+        share = min(1.0, self._speed / max(sqrt(x * x + y * y + z * z), self._speed))
+        x, y, z = share * x, share * y, share * z
+        here_x, here_y, here_z = position
+        a, b, c = self.reference
+        if self._by_twist or not (isfinite(a) and isfinite(b) and isfinite(c)):
+            a, b, c = position
+        else:
+            a, b, c = a + x * dt, b + y * dt, c + z * dt
+        if held:
+            c = here_z = self._ground
+        apart = sqrt((a - here_x) * (a - here_x) + (b - here_y) * (b - here_y) + (c - here_z) * (c - here_z))
+        if apart > LEASH:
+            near = LEASH / apart
+            a, b, c = here_x + near * (a - here_x), here_y + near * (b - here_y), here_z + near * (c - here_z)
+        self.reference = a, b, c
+        seconds = 1.0 / self._response
+        return a + seconds * x, b + seconds * y, c + seconds * z
 
 
 def drive(  # noqa: PLR0917 - numbers alone, as the textbook has them

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from math import expm1, inf, isfinite, nan
-from typing import ClassVar, Final
+from typing import ClassVar, Final, cast
 
 from agents.body.kinds import Kind
+from agents.decision.stepping import Speech
 from agents.network.validation import MAX_SPEED
 from agents.plugins.predictors import Predictor
 from agents.plugins.triggers import Trigger, TriggerState
@@ -17,18 +18,20 @@ STILL: Final[Vector] = ZERO
 class Transmitter:
     """Transmissions of one robot."""
 
-    FIXED: ClassVar = ("_smooths",)
-    __slots__ = ("_smooths", "asking", "position", "predictor", "smoothed", "velocity")
+    FIXED: ClassVar = ("_smooths", "_speaks")
+    __slots__ = ("_smooths", "_speaks", "asking", "position", "predictor", "smoothed", "speech", "velocity")
 
     asking: TriggerState
     predictor: Predictor  # of the receivers
     position: Vector  # of the last question: what would be transmitted [m],
     velocity: Vector  # and its velocity [m/s], NaN where unknown
     smoothed: LowPass
+    speech: Speech  # what is said beside the pose, if anything is
 
-    def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind) -> None:
+    def __init__(self, trigger: Trigger, predictor: Predictor, kind: Kind, speech: Speech | None = None) -> None:
         self.asking, self.predictor, self.smoothed = TriggerState(trigger), predictor, LowPass(kind)
-        self._smooths = trigger.smoothing_s > 0.0
+        self._smooths, self._speaks = trigger.smoothing_s > 0.0, speech is not None
+        self.speech = cast(Speech, speech)
         self.position = self.velocity = UNKNOWN
         self.asking.view.reach_s = predictor.reach()
 
@@ -67,9 +70,13 @@ class Transmitter:
             believed = self.predictor.position(last, view.since_event)
             view.deviation = distance(position, believed)
             view.drift = distance(last.velocity, self.predictor.velocity(last, 0.0))
+            if self._speaks:
+                view.deviation = self.speech.deviation(view.deviation)
         due = asking.due() and is_finite(position)
         if due:
             asking.record()
+            if self._speaks:
+                self.speech.record()
         self.position, self.velocity = position, velocity if known else UNKNOWN
         return due
 

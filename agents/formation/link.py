@@ -10,6 +10,7 @@ from agents.vectors import UNKNOWN, Vector
 BY_DISTANCE: Final = 0  # what a link wants
 BY_RELATIVE: Final = 1
 BY_BEARING: Final = 2
+BY_NOTHING: Final = 3  # a link alone
 
 
 class Link:
@@ -24,7 +25,7 @@ class Link:
     gain: float  # of the law
     relative: Vector  # wanted p_i − p_j [m]; NaN for distances and directions
     bearing: Vector  # unit vector along the wanted p_i − p_j, NaN where none; z alone NaN: seen from above
-    wants: int  # BY_DISTANCE, BY_RELATIVE or BY_BEARING
+    wants: int  # BY_DISTANCE, BY_RELATIVE, BY_BEARING or BY_NOTHING
 
     def __init__(
         self,

@@ -32,6 +32,7 @@ class Keys:
     # of each robot, by its name
     pose = _robot_key("pose")  # for the neighbours, sent when the trigger says so
     state = _robot_key("state")  # telemetry for recorder and viewers
+    memory = _robot_key("memory")  # likewise, of laws that remember
     status = _robot_key("status")  # lifecycle and counters, at 1 Hz and on every change
     order = _robot_key("order")  # queryable that takes orders and always replies
     alive = _robot_key("alive")  # liveliness token

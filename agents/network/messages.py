@@ -8,7 +8,7 @@ messages: JSON has no NaN.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from math import inf, isfinite, remainder, tau
 from typing import ClassVar, Final, Literal, TypeVar
@@ -40,8 +40,15 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of everything that is sent by itself."""
 
 
-class Pose(Message, frozen=True, omit_defaults=True):
-    """Pose of a robot for its neighbours."""
+class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Variable of a law."""
+
+    name: str
+    value: list[float]
+
+
+class BarePose(Message, frozen=True, omit_defaults=True):
+    """Pose of a robot."""
 
     robot: str
     seq: int  # grows by one with each pose
@@ -49,6 +56,22 @@ class Pose(Message, frozen=True, omit_defaults=True):
     position: Vector  # [m]
     velocity: Vector | None = None  # [m/s]
     yaw: float | None = None  # [rad]
+
+
+class Pose(BarePose, frozen=True, omit_defaults=True):
+    """Pose of a robot for its neighbours, with what its law says."""
+
+    shared: list[Variable] = []  # left out while the law says nothing
+
+
+class Memory(Message, frozen=True, omit_defaults=True):
+    """What the law of a robot remembers and measures, for recorder and viewers; unknown variables are left out."""
+
+    robot: str
+    seq: int
+    stamp: float  # [s] UTC
+    memory: list[Variable] = []
+    measures: list[Variable] = []  # of one number each
 
 
 class PoseReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -381,10 +404,13 @@ def heading(yaw: float) -> float | None:
     return remainder(yaw, tau) if isfinite(yaw) else None
 
 
-def pose(robot: str, seq: int, stamp: float, position: Sequence[float], velocity: Sequence[float], yaw: float) -> Pose:  # noqa: PLR0917
+def pose(  # noqa: PLR0917 - the fields of a pose
+    robot: str, seq: int, stamp: float, position: Sequence[float], velocity: Sequence[float], yaw: float,
+    words: Iterable[tuple[str, Sequence[float]]] = (),
+) -> Pose:  # fmt: skip
     """A pose to send, rounded to micrometres and microradians: a third fewer bytes, far below any sensor's noise.
 
-    `velocity` [m/s] and `yaw` [rad] are left out of the message if they are not finite.
+    `velocity` [m/s] and `yaw` [rad] are left out of the message if they are not finite. `words` are variables by name.
     """
     x, y, z = position
     moves, toward = vector(velocity), heading(yaw)
@@ -395,7 +421,13 @@ def pose(robot: str, seq: int, stamp: float, position: Sequence[float], velocity
         (round(x, 6), round(y, 6), round(z, 6)),
         None if moves is None else (round(moves[0], 6), round(moves[1], 6), round(moves[2], 6)),
         None if toward is None else round(toward, 6),
+        variables(words) if words else [],
     )
+
+
+def variables(values: Iterable[tuple[str, Sequence[float]]]) -> list[Variable]:
+    """Variables to send, by name; those that are not finite are left out."""
+    return [Variable(name, list(value)) for name, value in values if all(map(isfinite, value))]
 
 
 def position(robot: str, stamp: float, place: Sequence[float], yaw: float) -> Position:

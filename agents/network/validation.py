@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from agents.network.messages import STILL, Command, Goal, Malformed, Pose, Position, Ranges, State, Vector
+from agents.network.messages import STILL, Command, Goal, Malformed, Pose, Position, Ranges, State, Variable, Vector
 
 FUTURE_S: Final = 5.0  # a stamp further ahead comes from a wrong clock or a forgery, and would suppress correct samples
 MAX_SPEED: Final = 50.0  # [m/s]; nothing here moves faster
 ABSURD: Final = 1e6  # [m, m/s, rad, rad/s] no setpoint is that large
+MAX_NUMBERS: Final = 64  # that a robot says beside its pose
+ENORMOUS: Final = 1e12  # no variable of a law is that large, whatever its unit
 MAX_RAYS: Final = 720  # of one sweep; the finest scanner here has 360
 MAX_RANGE: Final = 100.0  # [m]; no range sensor here sees farther
 REACH_M: Final = 1.0  # a position farther outside the arena is refused
@@ -40,6 +42,8 @@ def check_pose(pose: Pose, *, now: float, reach: Vector) -> None:
         raise Malformed(f"sequence number {pose.seq} or stamp {pose.stamp} is impossible")
     _refuse_place(pose.position, reach)
     _refuse_motion(pose.velocity, pose.yaw)
+    if pose.shared:
+        _refuse_words(pose.shared)
 
 
 def check_state(state: State, *, now: float, reach: Vector) -> None:
@@ -125,6 +129,13 @@ def _refuse_place(position: Vector, reach: Vector) -> None:
     (x, y, z), (far_x, far_y, far_z) = position, reach
     if not (abs(x) <= far_x and abs(y) <= far_y and abs(z) <= far_z):
         raise Malformed(f"position {position} is outside the arena")
+
+
+def _refuse_words(shared: list[Variable]) -> None:
+    if sum(len(each.value) for each in shared) > MAX_NUMBERS or len({each.name for each in shared}) < len(shared):
+        raise Malformed(f"more than {MAX_NUMBERS} numbers beside a pose, or a variable that is said twice")
+    if not all(abs(number) <= ENORMOUS for each in shared for number in each.value):
+        raise Malformed("a variable beside a pose is no number")
 
 
 def _refuse_motion(velocity: Vector | None, yaw: float | None) -> None:

@@ -1,28 +1,18 @@
 """Formation laws, the middle level (paper, figure 10): from the positions of neighbours to a goal position.
 
-A law is a frozen struct of its parameters, found by the entry-point group `zenpark.laws`. It is written for one robot
-i, as textbooks write it: u_i = Σ_j of what each link pulls. All of `pull` and `error` runs on quiet ticks.
+They have no memory, and are written for one robot i, as textbooks write it: u_i = Σ_j of what each link pulls. All of
+`pull` and `error` runs on quiet ticks. Laws that remember and say something are `agents.plugins.law.Law`.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
-import msgspec
 from msgspec import Meta
 
 from agents.formation.link import BY_BEARING, BY_DISTANCE, Link
+from agents.plugins.law import Gain, Law, Need
 from agents.vectors import NotNegative, Vector, clamp, difference, norm
-
-Need = Literal["distance", "relative", "bearing", "any"]
-Gain = Literal["gain", "stiffness", "by link"]
-
-
-class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of all laws."""
-
-    NEEDS: ClassVar[Need] = "distance"  # target that it needs of every link
-    PULLS_BY: ClassVar[Gain] = "gain"  # gain of the file for links without their own
 
 
 class Gradient(Law, frozen=True):
@@ -30,6 +20,8 @@ class Gradient(Law, frozen=True):
 
     `apart` is p_i − p̂_j [m], from the sender j to the robot i.
     """
+
+    NEEDS: ClassVar[Need] = "distance"
 
     def pull(self, apart: Vector, link: Link) -> Vector:
         """Contribution of a link to the offset u_i [m]."""

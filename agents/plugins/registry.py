@@ -19,7 +19,7 @@ import msgspec
 
 from agents.errors import ExplainedError
 from agents.plugins.avoidance import Avoidance
-from agents.plugins.laws import Gradient
+from agents.plugins.law import Law
 from agents.plugins.predictors import Predictor
 from agents.plugins.triggers import Trigger
 
@@ -33,7 +33,7 @@ AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
 STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
 CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
-BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Gradient, AVOIDANCES: Avoidance}
+BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Law, AVOIDANCES: Avoidance}
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 

@@ -149,6 +149,7 @@ class SelfTriggered(Trigger, frozen=True):
     known then, and a bounds its growth. A drone's wobble is in a.
     """
 
+    JUDGES_DRIFT: ClassVar[bool] = True
     threshold: Annotated[Positive, Meta(description="δ: deviation of the held position that is allowed [m]")] = 0.01
     acceleration: Annotated[Positive, Meta(description="a: bound on the acceleration of the deviation [m/s²]")] = 0.25
     longest_s: Annotated[Positive, Meta(description="longest planned interval [s]")] = 2.0

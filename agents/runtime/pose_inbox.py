@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
-from math import inf
+from math import inf, nan
 from typing import Final, Protocol
 
 import msgspec
 import zenoh
 
+from agents.decision.neighbours import NO_WORDS
 from agents.network import messages, pubsub, validation
 from agents.network.channel_model import Channel, Conditions
 from agents.network.keys import Keys
@@ -343,7 +344,11 @@ class PoseInbox(ModelledInbox):
         for link, arrival, received in got:
             pose = received.pose
             (row, k), velocity = self._ends[link], pose.velocity or messages.STILL
-            self._robots[row].neighbours.receive(k, pose.position, velocity, received.measured - utc, arrival)
+            yaw = nan if pose.yaw is None else pose.yaw
+            said = {each.name: tuple(each.value) for each in pose.shared} if pose.shared else NO_WORDS
+            self._robots[row].neighbours.receive(
+                k, pose.position, velocity, received.measured - utc, arrival, yaw, said
+            )
             self.news[row].append(
                 messages.PoseReceipt(pose.robot, pose.seq, pose.stamp, utc + arrival, pose.position, velocity)
             )

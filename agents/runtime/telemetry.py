@@ -18,6 +18,7 @@ import zenoh
 
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import Phase
+from agents.decision.stepping import Stepping
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.robot import Robot
@@ -64,6 +65,10 @@ class Telemetry:
         self._encoding = encoding
         names = self._names = tuple(robot.assignment.name for robot in robots)
         mime = messages.MIME[encoding]
+        self._memories = [
+            None if robot.stepping is None else pubsub.publisher(session, keys.memory(robot.assignment.name), mime)
+            for robot in robots
+        ]
         self._states = [pubsub.publisher(session, keys.state(name), mime) for name in names]
         self._statuses = [pubsub.pose_publisher(session, keys.status(name), mime) for name in names]
         self._ranges = [
@@ -108,8 +113,15 @@ class Telemetry:
             )
             for payload in messages.payloads(message, self._encoding):
                 self._states[row].put(payload)
+            if (publisher := self._memories[row]) is not None and robot.stepping is not None:
+                publisher.put(messages.encode(self._memory(row, robot.stepping, t), self._encoding))
             self._neighbours.news[row].clear()
             self._receipts[row].clear()
+
+    def _memory(self, row: int, stepping: Stepping, t: float) -> messages.Memory:
+        measures = ((name, (value,)) for name, value in stepping.measures.items())
+        memory, measured = messages.variables(stepping.memory.items()), messages.variables(measures)
+        return messages.Memory(self._names[row], self._seq, self.utc + t, memory, measured)
 
     def send_ranges(self, states: Sequence[BodyState]) -> None:
         """Sends new range readings of the robots that measure them."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, cast
 
 import msgspec
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from agents.body.kinds import Kind
 from agents.body.limits import Limits
 from agents.decision.position_control import REACHED
+from agents.plugins.law import Law
 from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from experiments.check.findings import FORGIVEN
@@ -90,7 +91,13 @@ class Analysis:
 
     @property
     def law(self) -> Gradient:
-        return self.plan.law
+        """The law, for those who know that it is a gradient."""
+        return cast(Gradient, self.plan.law)
+
+    @property
+    def is_gradient(self) -> bool:
+        """Whether the law pulls toward targets of its links; else there is neither shape nor error."""
+        return isinstance(self.plan.law, Gradient)
 
     @property
     def links(self) -> Links:
@@ -173,7 +180,7 @@ class Analysis:
         return replace(
             self,
             prediction=prediction,
-            error=link_errors(self.law, self.pattern, prediction),
+            error=link_errors(self.plan.law, self.pattern, prediction),
             anchored=anchor_errors(self.anchors, prediction.position),
         )
 
@@ -272,7 +279,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     stages: list[list[Shape]] = []
     shape, planar, spatial, spare, loop = None, None, None, None, None
     asked = targets_of_law(law, links)
-    if standing.any() or len(anchored):
+    if isinstance(law, Gradient) and (standing.any() or len(anchored)):
         for at, wanted in zip((0.0, *(each.at + each.over for each in pattern.changes)), pattern.stages(), strict=True):
             there = pattern.planned_at(at)
             stage = _shapes(plan, targets_of_law(law, wanted), there, prediction, aloft, silent)
@@ -310,7 +317,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
     )
 
 
-def link_errors(law: Gradient, pattern: Pattern, prediction: Prediction) -> Array:
+def link_errors(law: Law, pattern: Pattern, prediction: Prediction) -> Array:
     """Error of each link (T, E) along the motion [m]; 0 while it is not there."""
     return np.nan_to_num(errors_over_time(law, pattern, prediction.time, prediction.position))
 

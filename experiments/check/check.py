@@ -44,6 +44,7 @@ SUBJECTS: Final = (
         theory.rigidity,
         theory.redundancy,
         theory.stability,
+        theory.law,
     ),
     *(surroundings.contacts, surroundings.obstacles, surroundings.perception, surroundings.reality),
     *(motion.flight, motion.starts, motion.formation, motion.anchors, noise.softness, motion.walls, motion.ceiling),
@@ -55,6 +56,12 @@ SUBJECTS: Final = (
     safety.devices,
     chance,
 )
+
+
+OF_SHAPES: Final = (  # a law that is no gradient has no shape to which it pulls
+    theory.lengths, theory.realisation, theory.rigidity, theory.redundancy, theory.stability,
+    motion.formation, motion.anchors, noise.softness,
+)  # fmt: skip
 
 
 def check(given: Document, cases: Sequence[str] = ()) -> list[Finding]:
@@ -100,6 +107,8 @@ def _findings(given: Document, analyses: Mapping[str, Analysis]) -> list[Finding
     holders: dict[Finding, list[str]] = {}
     for name, analysis in analyses.items():
         for subject in SUBJECTS:
+            if subject in OF_SHAPES and not analysis.is_gradient:
+                continue
             for finding in first_of_each_code(subject(analysis)):
                 holders.setdefault(finding, []).append(name)
     source = given.source

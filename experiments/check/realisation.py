@@ -13,7 +13,8 @@ import numpy as np
 
 from agents.body.kinds import Kind
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
-from agents.plugins.laws import Law, Mixed
+from agents.plugins.law import Law
+from agents.plugins.laws import Mixed
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
 from experiments.definition.graph import Links, edges, part_of_rows
 from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity

@@ -284,6 +284,19 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
     return f"it stays rigid without any one {what} but {join_names(needed)}"
 
 
+def law(analysis: Analysis) -> Iterator[Finding]:
+    """What a law that remembers knows of its own theory, and what must not be lost of what it says."""
+    plan, path = analysis.plan, ("formation", "law")
+    channel = plan.experiment.channel
+    losses = [channel.loss, *(each.loss or 0.0 for each in channel.links.values())]
+    if plan.law.SAYS and max(losses) > 0.0 and math.isinf(plan.trigger.maximum_silence_s) and not plan.trigger.TIMED:
+        message = "messages are lost, and the trigger may stay silent for ever: what was said last is not repeated"
+        remedy = "give the trigger maximum_silence_s, such as 1.0"
+        yield Finding("warning", "lost-words", message, remedy, ("trigger",))
+    for severity, message, remedy in plan.law.analyse(plan):
+        yield Finding(severity, "law", message, remedy, path)
+
+
 def strength(analysis: Analysis) -> str:
     """Parameters that make the law ask for more or less: one of `GAIN`, or its own if it goes by these alone."""
     law, links = analysis.law, analysis.asked

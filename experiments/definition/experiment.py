@@ -125,7 +125,7 @@ class Target(Part, frozen=True):
 
 
 class Link(Target, frozen=True):
-    """Link with a target other than a distance, a gain of its own, or a limited time."""
+    """Link with a target other than a distance or without one, a gain of its own, or a limited time."""
 
     gain: Annotated[
         Positive | None,
@@ -135,9 +135,15 @@ class Link(Target, frozen=True):
     until_s: Annotated[Positive | None, Meta(description="and until then [s]; left out: to the end")] = None
 
     def __post_init__(self) -> None:
-        Target.__post_init__(self)
+        if not self.alone:
+            Target.__post_init__(self)
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError("`until_s` must be later than `from_s`; or leave it out")
+
+    @property
+    def alone(self) -> bool:
+        """Whether it has no target, as for laws that need none."""
+        return self.distance is None and self.offset is None and self.bearing is None
 
 
 class Anchor(Part, frozen=True):
@@ -222,7 +228,7 @@ class Formation(Part, frozen=True):
         dict[str, Positive | Link],
         Meta(
             description='"A > B": B receives from A; "A - B": both receive; distance [m], a table with another target,'
-            ' or "shape": as in [formation.shape]'
+            ' "shape": as in [formation.shape], or "link": none, for laws that need no target'
         ),
     ] = {}
     anchors: Annotated[

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from agents.formation import anchors
 from agents.formation.changes import Change, Target, change_target, exists, planned_at
 from agents.formation.link import BY_DISTANCE, Link
+from agents.plugins.law import Law
 from agents.plugins.laws import Distance, Gradient
 from experiments.definition.experiment import Anchor, Experiment
 from experiments.definition.experiment import Change as Described
@@ -157,14 +158,18 @@ def anchor_errors(held: Anchored, position: Array) -> Array:
     return np.array(found, dtype=float).reshape(len(held), len(position)).T
 
 
-def errors_over_time(law: Gradient, pattern: Pattern, time: Array, position: Array) -> Array:
+def errors_over_time(law: Law, pattern: Pattern, time: Array, position: Array) -> Array:
     """Error of each link (T, E) as the law measures it; NaN where the link is not there or an end is unknown.
+
+    A law that is no gradient measures none: all are NaN.
 
     Args:
         time: (T,) since the common start [s].
         position: (T, N, 3) true [m].
     """
     links = pattern.links
+    if not isinstance(law, Gradient):
+        return np.full((len(time), len(links)), np.nan)
     if type(law) is Distance and not pattern.changes:
         step = max(1, AT_ONCE // max(1, len(links)))
         parts = [

@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
-from agents.plugins.laws import Law
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
+from agents.plugins.law import Law
 from experiments.definition.experiment import Experiment, Link, Target
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
@@ -95,6 +95,8 @@ def one_way_links(experiment: Experiment, law: Law) -> list[OneWay]:
 def link_target(experiment: Experiment, text: str, given: Target | float, receiver: str) -> LinkTarget:
     """Target of a link for one of its ends, as distance, offset and bearing."""
     given = given if isinstance(given, Target) else Target(distance=given)
+    if isinstance(given, Link) and given.alone:
+        return LinkTarget(BY_NOTHING, math.nan)
     if given.distance is not None:
         return LinkTarget(BY_DISTANCE, given.distance)
     second, first = link_pairs(text)[0]

@@ -18,7 +18,7 @@ from agents.formation.anchors import Anchor
 from agents.formation.link import Link
 from agents.plugins import registry
 from agents.plugins.avoidance import Avoidance
-from agents.plugins.laws import Gradient
+from agents.plugins.law import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Trigger
@@ -53,8 +53,8 @@ class Plan:
         return kinds(self.experiment, self.names)
 
     @cached_property
-    def law(self) -> Gradient:
-        built: Gradient = registry.build(registry.LAWS, self.experiment.formation.law)
+    def law(self) -> Law:
+        built: Law = registry.build(registry.LAWS, self.experiment.formation.law)
         return built
 
     @cached_property
@@ -76,10 +76,10 @@ class Plan:
 
     @cached_property
     def predictor(self) -> Predictor:
-        """Extrapolation between two transmissions: as the experiment says, else as its trigger needs it."""
+        """Extrapolation between two transmissions: as the experiment says, else as its trigger or its law needs it."""
         chosen = self.experiment.prediction
         if chosen is None:
-            chosen = self.trigger.PREDICTION
+            chosen = self.law.PREDICTION if self.trigger.PREDICTION == "hold" else self.trigger.PREDICTION
         built: Predictor = registry.build(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
@@ -275,6 +275,8 @@ class Plan:
             pose_every=round(rates.body_hz / rates.pose_hz),
             decide_every=round(rates.body_hz / rates.coordination_hz),
             duration=experiment.duration_s,
+            number=row,
+            count=len(self.names),
             patience_s=None if patient else experiment.start.deadline_s,
             start=self.starts[row][1:3] if within else None,
             start_within=within + math.sqrt(2.0) * experiment.start.scatter,

@@ -10,7 +10,8 @@ import numpy as np
 
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import registry
-from agents.plugins.laws import Law
+from agents.plugins.law import Law
+from agents.plugins.laws import Gradient
 from agents.plugins.registry import did_you_mean
 from agents.plugins.triggers import Trigger
 from experiments.definition.bodies import WORLD, driven_kind, own_bodies
@@ -78,6 +79,7 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
     yield from _timeline(experiment)
     yield from _architecture(experiment)
     yield from _triggers(experiment)
+    yield from _remembering(experiment)
     for name in experiment.disturbance:
         known = ("all", *KINDS, *experiment.robots)
         if name not in known:
@@ -279,6 +281,31 @@ def _triggers(experiment: Experiment) -> Iterator[Fault]:
         yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
 
 
+def _remembering(experiment: Experiment) -> Iterator[Fault]:
+    """What a law that is no gradient does not go with: it has no errors, and its memory is the robot's own."""
+    name, _ = registry.split(experiment.formation.law)
+    law = cast(type[Law], registry.struct(registry.LAWS, name))
+    if issubclass(law, Gradient):
+        return
+    if experiment.formation.update is not None:
+        message = f"the law '{name}' is no function of its input alone: a step that is left out would be lost"
+        yield Fault(("formation", "update"), message, "leave update out", on_key=True)
+    if experiment.architecture != "distributed":
+        message = f"a central controller computes no law that remembers or gives velocities, as '{name}' does"
+        yield Fault(("architecture",), message, 'write architecture = "distributed", or take another law', on_key=True)
+    if experiment.formation.anchors:
+        message = f"anchors pull robots of the laws {GRADIENTS}; '{name}' does not know them"
+        yield Fault(("formation", "anchors"), message, "leave anchors out", on_key=True)
+    kind, _ = registry.split(experiment.trigger)
+    trigger = cast(type[Trigger], registry.struct(registry.TRIGGERS, kind))
+    if trigger.JUDGES_ERRORS:
+        message = f"'{kind}' judges errors of links, and the law '{name}' has none"
+        yield Fault(("trigger",), message, "take another trigger, such as send-on-delta")
+    elif trigger.JUDGES_DRIFT and law.SAYS:
+        message = f"'{kind}' waits by how the pose drifts; it does not see the variables that '{name}' says"
+        yield Fault(("trigger",), message, "take another trigger, such as send-on-delta")
+
+
 def _architecture(experiment: Experiment) -> Iterator[Fault]:
     """A hybrid architecture must name some of the robots, and not all."""
     hybrid, path = experiment.architecture, ("architecture", "robots")
@@ -358,11 +385,15 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
         given.update(dict.fromkeys(both, text))
 
 
+GRADIENTS: Final = "distance, displacement, bearing and mixed"
+NO_TARGET: Final = "nothing"  # what a link alone asks for
+
+
 def _kind_of(given: Target | float) -> str:
     """Name of the target of a link."""
     if not isinstance(given, Target):
         return "distance"
-    return next(name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None)
+    return next((name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None), NO_TARGET)
 
 
 def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
@@ -371,6 +402,10 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
     needs, kind = cast(type[Law], registry.struct(registry.LAWS, name)).NEEDS, _kind_of(given)
     can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}
     words = {"distance": "a distance or an offset", "relative": "an offset", "bearing": "a bearing or an offset"}
+    if needs != "nothing" and kind == NO_TARGET:
+        message = f"the law '{name}' needs a target of every link, and {text!r} has none"
+        yield Fault(path, message, f"give {words.get(needs, 'a distance, an offset or a bearing')}")
+        return
     if needs in can and kind not in can[needs]:
         message = f"the law '{name}' needs {words[needs]} of every link; this one asks for a {kind}"
         example = {"relative": "{ offset = [0.6, 0.0] }", "bearing": "{ bearing = [1.0, 0.0] }"}.get(needs, "0.6")

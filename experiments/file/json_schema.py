@@ -17,7 +17,7 @@ import msgspec
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
-from experiments.file.overrides import SHAPE
+from experiments.file.overrides import ALONE, SHAPE
 from experiments.file.problems import Path
 from experiments.file.structure import LARGEST, group_of
 
@@ -57,7 +57,7 @@ def described() -> dict[str, Any]:
                 fields[name] = {**kept, **_choice(group, definitions)}
     for name, field in definitions["LinkChannel"]["properties"].items():  # as at the channel
         field["description"] = definitions["Channel"]["properties"][name]["description"]
-    definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE]})
+    definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE, ALONE]})
     definitions["Robot"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
     del partial["Experiment" + _CASE]["properties"]["cases"]

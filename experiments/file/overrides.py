@@ -12,7 +12,7 @@ from operator import attrgetter
 from typing import Any, Final, cast
 
 from agents.plugins import registry
-from agents.plugins.laws import Law
+from agents.plugins.law import Law
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import link_pairs, pairs_or_none
@@ -23,6 +23,7 @@ _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|
 _KEY: Final = re.compile(rf"(?:{_PART.pattern})++(?<!\.)")
 _SHAPES: Final = frozenset({"box", "radius", "wall"})
 SHAPE: Final = "shape"  # a link with its target from [formation.shape]
+ALONE: Final = "link"  # a link without a target
 _TARGETS: Final = frozenset({"distance", "offset", "bearing"})
 _TARGET_OF: Final = {"relative": "offset", "bearing": "bearing"}  # by what a law needs; else a distance
 _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
@@ -145,6 +146,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
         for text, given in links.items()
         if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
     ]
+    links.update({text: {} for text, given in links.items() if given == ALONE})
     word = _TARGET_OF.get(_needed_target(formation.get("law", _DEFAULTS.formation.law)), "distance")
     for text in bare:
         try:

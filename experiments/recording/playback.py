@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import CentreState, Contact, Event, HostClock, State, Status, WorldState
+from agents.network.messages import CentreState, Contact, Event, HostClock, Memory, State, Status, Variable, WorldState
 from agents.network.validation import ABSURD, FUTURE_S, is_count
 from experiments.arrays import PoseTable, known_rows
 from experiments.definition.experiment import Experiment
@@ -35,7 +35,7 @@ from experiments.recording.losses import (
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
-from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose, Topic
+from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
 from experiments.recording.trace import (
     ROUNDING_S,
     Goals,
@@ -54,7 +54,7 @@ NOWHERE: Final = (math.nan, math.nan, math.nan)
 OPTIONAL: Final = ("attitude", "shadow_position", "shadow_yaw")  # columns that a trace may lack
 
 S = TypeVar("S", bound=msgspec.Struct)
-M = TypeVar("M", State, SentPose, Status)
+M = TypeVar("M", State, SentPose, Status, Memory)
 
 
 class NotStarted(RecordingError):
@@ -192,10 +192,12 @@ class _Content:
                     take(message.data)
                 except Undecodable as error:
                     raise RecordingError(f"{self.records.path}: message {count} is damaged: {error}") from None
+        self[SentPose].extend(self[SpokenPose])
         if self[HostClock]:
             right = Correction(self[HostClock])
             self[State][:] = [right.state(state) for state in self[State]]
             self[SentPose][:] = [replace(pose, stamp=right(pose.robot, pose.stamp)) for pose in self[SentPose]]
+            self[Memory][:] = [replace(each, stamp=right(each.robot, each.stamp)) for each in self[Memory]]
             self[Status][:] = [right.status(status) for status in self[Status]]
             self[SentGoal][:] = [replace(goal, pose=right(goal.robot, goal.pose)) for goal in self[SentGoal]]
         return count
@@ -279,6 +281,13 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
         joined=_joined(states, experiment, start),
+        memory=_memories(_by_robot(content[Memory], robots), start, time, HOLD_PERIODS / rate, "memory"),
+        measures={
+            name: values[..., 0]
+            for name, values in _memories(
+                _by_robot(content[Memory], robots), start, time, HOLD_PERIODS / rate, "measures"
+            ).items()
+        },
         **known,
     )
 
@@ -304,7 +313,7 @@ def _joined(states: list[list[State]], experiment: Experiment, start: float) -> 
     return np.maximum(first, 0.0)
 
 
-def _possible(message: State | SentPose | Status) -> bool:
+def _possible(message: State | SentPose | Status | Memory) -> bool:
     """Whether robots would take the numbers of a message: metrics refuse what robots refuse."""
     match message:
         case SentPose():
@@ -338,6 +347,29 @@ def _sampled(states: list[State], start: float, time: Array, hold: float) -> dic
         "shadow_position": line(t, column("shadow_position", 3), *grid),
         "shadow_yaw": turn(t, column("shadow_yaw", 1), *grid)[:, 0],
     }
+
+
+def _memories(
+    told: list[list[Memory]], start: float, time: Array, hold: float, what: Literal["memory", "measures"]
+) -> dict[str, Array]:
+    """Variables of all robots on the grid `time` (T,), by name: (T, N, k); NaN where one is unknown."""
+    sizes: dict[str, int] = {}
+    for each in (each for own in told for message in own for each in getattr(message, what)):
+        sizes[each.name] = max(sizes.get(each.name, 1), len(each.value))
+    found = {name: np.full((len(time), len(told), size), np.nan) for name, size in sizes.items()}
+    for row, own in enumerate(told):
+        t = np.array([message.stamp for message in own]) - start
+        for name, size in sizes.items():
+            known = [_value(getattr(message, what), name, size) for message in own]
+            if own:
+                found[name][:, row] = step(t, np.array(known), time, hold)
+    return found
+
+
+def _value(variables: Sequence[Variable], name: str, size: int) -> Sequence[float]:
+    """Value of a variable; NaN where it is missing, or of another size."""
+    value = next((each.value for each in variables if each.name == name), ())
+    return value if len(value) == size else (math.nan,) * size
 
 
 def _number(value: float | None) -> float:

@@ -19,14 +19,17 @@ import msgspec
 
 from agents.network.keys import Keys
 from agents.network.messages import (
+    BarePose,
     CentreState,
     Contact,
     Event,
     Goal,
     HostClock,
+    Memory,
     Pose,
     State,
     Status,
+    Variable,
     WorldState,
 )
 
@@ -37,14 +40,20 @@ CHUNK_BYTES: Final = 32 * 1024  # lost at most by a kill: a third of a second of
 DEPTH: Final = 20_000  # samples that may wait while the disk does
 RARE: Final = 1_000  # of those at 1 Hz or rarer: a ring takes its memory as it first goes round
 
-Message = Pose | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
+Message = Pose | Memory | State | Status | Event | Contact | WorldState | Goal | CentreState | HostClock
 
 
-class SentPose(Pose, frozen=True, kw_only=True):
-    """A pose as it was sent to the neighbours."""
+class SentPose(BarePose, frozen=True, kw_only=True):
+    """A pose as it was sent to the neighbours, by a robot whose law says nothing."""
 
     received: float  # [s] UTC, by the recorder
     size: int  # [bytes] of the payload on the network
+
+
+class SpokenPose(SentPose, frozen=True, kw_only=True):
+    """A pose as it was sent to the neighbours, with what the law said."""
+
+    shared: list[Variable]
 
 
 class SentGoal(Goal, frozen=True, kw_only=True):
@@ -67,9 +76,13 @@ class Topic:
     finite: bool = False  # messages with numbers that are not finite are malformed
 
 
+# of poses with what a law says; they come with the others, and older recordings have none
+SPOKEN: Final = Topic(Pose, SpokenPose, "/{robot}/spoken_pose", lambda keys: keys.pose("*"), DEPTH, repeated=True)
 TOPICS: Final = (
     Topic(State, State, "/{robot}/state", lambda keys: keys.state("*"), DEPTH),  # with the poses received since
     Topic(Pose, SentPose, "/{robot}/pose", lambda keys: keys.pose("*"), DEPTH, repeated=True),
+    SPOKEN,
+    Topic(Memory, Memory, "/{robot}/memory", lambda keys: keys.memory("*"), DEPTH),
     Topic(Status, Status, "/{robot}/status", lambda keys: keys.status("*"), repeated=True),
     Topic(Event, Event, "/events", lambda keys: keys.event, repeated=True),
     Topic(Contact, Contact, "/world/contact", lambda keys: keys.contact, finite=True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, TypeVar
 
@@ -166,6 +166,9 @@ class Trace:
     foreign: Index | None = None  # (N,) poses in the name of each robot, refused: not from its process; None if unknown
     goals: Goals | None = None  # of the central controller; None if each robot decides for itself
     clocks: tuple[ClockOffset, ...] = ()  # of the other machines; stamps made there are corrected
+    # of laws that remember, by name: variables (T, N, k), and measures (T, N), NaN where unknown
+    memory: Mapping[str, Array] = field(default_factory=dict)
+    measures: Mapping[str, Array] = field(default_factory=dict)
     joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start
 
     @cached_property

@@ -17,14 +17,14 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, MessageIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
-from agents.network.messages import Event, State, Vector
+from agents.network.messages import BarePose, Event, Pose, State, Vector
 from experiments.definition.experiment import Experiment
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
 from experiments.recording.ros2 import viewers
 from experiments.recording.ros2.cdr import Unencodable, codec
 from experiments.recording.ros2.viewers import Draw
-from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, TOML, TOPICS, Message
+from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, SPOKEN, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
 INDICES: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
@@ -122,6 +122,13 @@ ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 
+BARE: Final = len(BarePose.__struct_fields__)
+
+
+def _spoken(message: Message) -> dict[str, Any]:
+    return {"shared": message.shared} if isinstance(message, Pose) and message.shared else {}
+
+
 class Recording:
     """Writes one recording; used by one thread."""
 
@@ -159,10 +166,11 @@ class Recording:
         self._framed: dict[str, float] = {}  # [s, UTC] stamp of its last transform, by robot
         self._scene_at = -inf  # [s, UTC]
         self._topics = {
-            topic.message: (topic.recorded, _Written(topic.name, made.name, made.schema, made.encode))
+            topic: (topic.recorded, _Written(topic.name, made.name, made.schema, made.encode))
             for topic in TOPICS
             for made in [codec(topic.recorded)]
         }
+        self._topic_of = {topic.message: topic for topic in TOPICS if topic is not SPOKEN}
         self._drawn = _Written(DRAWN, viewers.POSE, viewers.POSE_SCHEMA, viewers.pose)
         self._frames = _Written(FRAMES, viewers.TF, viewers.TF_SCHEMA, viewers.transform)
         self._scene = _Written(
@@ -202,10 +210,15 @@ class Recording:
         Raises:
             RecordingError: If it cannot be written; what was written before stays.
         """
-        recorded, topic = self._topics[type(message)]
-        entry: Any = message
+        chosen, entry = self._topic_of[type(message)], cast(Any, message)
+        if isinstance(message, Pose) and message.shared:
+            chosen = SPOKEN
+        recorded, topic = self._topics[chosen]
         if received is not None:
-            entry = recorded(*msgspec.structs.astuple(message), received=received, size=size)
+            values = msgspec.structs.astuple(message)
+            if isinstance(message, Pose):
+                values = values[:BARE]
+            entry = recorded(*values, received=received, size=size, **_spoken(message))
         logged = message.stamp if received is None else received
         if self._utc is not None and received is None:
             now = self._utc()

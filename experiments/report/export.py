@@ -181,6 +181,8 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
         },
         "units": UNITS | {"metrics": measured | UNITS["metrics"]},
     }
+    if trace.memory or trace.measures:  # of a law that remembers
+        case |= {what: dict(getattr(trace, what)) for what in ("memory", "measures")}
     return {name: _converted(value) for name, value in case.items()}
 
 

@@ -22,6 +22,7 @@ from agents.decision.lifecycle import Phase
 from agents.kinds.khepera4 import KHEPERA4
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
 from experiments.definition import bodies
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Experiment
@@ -256,7 +257,7 @@ class LinkTracker:
         """Error of each link (E,) [m], NaN for those that are not there, at a time since the common start [s]."""
         net, pattern, elapsed = self._stage.links, self._pattern, 0.0 if time is None else max(time, 0.0)
         found = np.full(len(net), np.nan)
-        if self._law is None or pattern is None:
+        if not isinstance(self._law, Gradient) or pattern is None:
             return found
         apart = (position[net.receiver] - position[net.sender]).tolist()
         for k, (link, away) in enumerate(zip(pattern.targets_at(elapsed), apart, strict=True)):

@@ -105,7 +105,7 @@ def read(path: Path) -> Tracks:
             kind, name = topic.recorded, records.channels[channel].topic
             rows = np.flatnonzero(heads["channel"] == channel)
             robot = name.split("/")[1]
-            if kind is SentPose:
+            if issubclass(kind, SentPose):
                 sent.setdefault(robot, []).append(heads["published"][rows] / 1e9)
                 continue
             begins, ends = starts[rows] + HEAD.itemsize, starts[rows] + heads["length"][rows].astype(np.intp) + 9

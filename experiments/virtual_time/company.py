@@ -58,7 +58,7 @@ class Way:
             k, sender = self.first, self.neighbour
             if self.stamps[k] > sender.stamp:
                 sender.position, sender.velocity = self.positions[k], self.velocities[k]
-                sender.stamp, sender.arrival = self.stamps[k], self.arrivals[k]
+                sender.stamp, sender.arrival, sender.yaw = self.stamps[k], self.arrivals[k], self.yaws[k]
             self.first = (k + 1) % self.size
 
 

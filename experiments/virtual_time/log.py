@@ -6,6 +6,7 @@ import heapq
 import math
 from collections.abc import Iterable, Iterator
 from functools import cached_property
+from itertools import accumulate, pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -14,6 +15,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agents.decision.lifecycle import FINISHED, Phase
+from agents.decision.stepping import Words
 from agents.network import messages
 from agents.plugins import registry
 from agents.safety.hazards import Outcome
@@ -110,6 +112,8 @@ class Logbook:
             dropped=self._log.lost,
             foreign=np.zeros(len(log.names), dtype=np.intp),
             goals=None if log.lean else self.goals,
+            memory={name: values[run] for name, values in log.memory.items()},
+            measures={name: values[run] for name, values in log.measures.items()},
             **columns,
         )
 
@@ -136,6 +140,7 @@ class Logbook:
         """All messages, those of a kind in order of time: when each is logged [s, UTC], and its size if it was sent."""
         yield [(EPOCH + t, messages.Event(EPOCH + t, *said), None) for t, *said in self._events()]
         yield ((pose.stamp, pose, len(messages.encode(pose, self._encoding))) for pose in self._poses(self._log.sent))
+        yield ((each.stamp, each, None) for each in self._memories())
         yield ((state.stamp, state, None) for _, states in self._states() for state in states)
         if self._log.centre is not None and self.goals is not None:
             goals = self._goal_messages(self._log.centre)
@@ -152,8 +157,27 @@ class Logbook:
         names = self._log.names
         assert sent.yaw is not None
         columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
+        words = self._words(sent)
         for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
-            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw)
+            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw, next(words))
+
+    def _words(self, sent: PoseTable) -> Iterator[Words]:
+        """What was said beside each pose."""
+        ends = list(accumulate(self._log.says.values(), initial=0))
+        spans = list(zip(self._log.says, pairwise(ends), strict=True))
+        for row in () if sent.extra is None else sent.extra.tolist():
+            yield tuple((name, tuple(row[begin:end])) for name, (begin, end) in spans)
+        while True:
+            yield ()
+
+    def _memories(self) -> Iterator[messages.Memory]:
+        """What the laws remember and measure, at each sample."""
+        log = self._log
+        for k, t in enumerate(log.time.tolist() if log.memory or log.measures else ()):
+            for row, name in enumerate(log.names):
+                memory = ((what, values[k, row].tolist()) for what, values in log.memory.items())
+                measures = ((what, [float(values[k, row])]) for what, values in log.measures.items())
+                yield messages.Memory(name, k + 1, EPOCH + t, messages.variables(memory), messages.variables(measures))
 
     def _goal_messages(self, centre: CentreLog) -> Iterator[tuple[float, messages.Goal]]:
         """Goals, and when they were sent since the common start [s]."""

@@ -9,8 +9,11 @@ from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from agents.decision.centralised import Centre
+from agents.decision.neighbours import NO_WORDS
+from agents.decision.stepping import Words
 from agents.network import messages
 from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
@@ -36,6 +39,7 @@ class Sample(NamedTuple):
     velocity: Vector  # [m/s]
     yaw: float  # [rad]
     pose: float = nan  # of a goal: stamp of the pose on which it rests [s]
+    words: Words = ()  # what is said beside a pose
 
 
 Arrived = tuple[int, float, Sample]  # link or row, arrival [s]
@@ -135,7 +139,9 @@ class _Sizes:
     def of(self, sample: Sample, start: float) -> int:
         """Bytes of a pose; `start` is the common start [s]."""
         stamp = EPOCH + (sample.stamp - start if sample.stamp >= start else 0.0)
-        pose = messages.pose(self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity, sample.yaw)
+        pose = messages.pose(
+            self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity, sample.yaw, sample.words
+        )
         return len(messages.encode(pose, self._encoding))
 
 
@@ -175,6 +181,9 @@ class VirtualNetwork:
         self.seq = [0] * len(robots)  # number of the last pose of each robot
         self._sizes = _Sizes(experiment, names)
         self._sent, self._received = _Samples(), _Samples()
+        self._words: list[Words] = []  # said with the poses, where they say something
+        # names and sizes of the variables that they say
+        self.says = {} if robots[0].stepping is None else robots[0].stepping.says
 
     @property
     def instant(self) -> bool:
@@ -185,8 +194,10 @@ class VirtualNetwork:
         """A robot transmits its pose at `t` [s]. Before the common start at `start` [s] nothing is lost."""
         self.seq[row] += 1
         seq, channel = self.seq[row], self._channel
-        sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw)
+        sample = Sample(row, seq, t, robot.sent_position, robot.sent_velocity, yaw, words=robot.words)
         self._sent.add((row, t, sample))
+        if self.says and not self._lean:
+            self._words.append(sample.words)
         size = self._sizes.of(sample, start) if channel.limited else 0
         for link in self._links[row]:
             channel.send(link, sample, seq, t, start=start, size=size)
@@ -197,7 +208,15 @@ class VirtualNetwork:
         """Delivers poses and goals that have arrived by `t` [s]."""
         for link, arrival, sample in self._channel.due(t):
             robot, k = self.receivers[link]
-            robot.neighbours.receive(k, sample.position, sample.velocity, sample.stamp, arrival)
+            robot.neighbours.receive(
+                k,
+                sample.position,
+                sample.velocity,
+                sample.stamp,
+                arrival,
+                sample.yaw,
+                dict(sample.words) if sample.words else NO_WORDS,
+            )
             if not self._lean:
                 self._received.add((link, arrival, sample))
         if self.centre is not None:
@@ -208,13 +227,22 @@ class VirtualNetwork:
         received = self._received.table(begin)
         received = received.take(np.lexsort((received.link, received.arrival)))  # as a recording has them
         return {
-            "sent": self._sent.table(begin, bare=self._lean),
+            "sent": replace(self._sent.table(begin, bare=self._lean), extra=self._extra()),
+            "says": self.says,
             "received": PoseTable(
                 received.link, received.seq, received.stamp, received.arrival, received.position, received.velocity
             ),
             "lost": np.array(self._channel.dropped, dtype=np.intp),
             "centre": None if self.centre is None else self.centre.logged(begin),
         }
+
+    def _extra(self) -> Array | None:
+        """Variables said with each pose (M, k), in the order of their names in `says`; None: none are."""
+        if not self._words:
+            return None
+        blank = {name: (nan,) * size for name, size in self.says.items()}
+        said = [{**blank, **dict(words)} for words in self._words]
+        return np.array([[number for values in each.values() for number in values] for each in said])
 
     # ------------------------------------------------------------------ compiled stretches
 

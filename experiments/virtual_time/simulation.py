@@ -6,8 +6,8 @@ is only the loop.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from agents.body.interface import BodyState
 from agents.body.shadow_twin import shadowed
 from agents.plugins.calls import explain
+from agents.plugins.law import Memory
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import Incident
@@ -67,6 +68,10 @@ class Log:
     # (K, N, 3) of the twins beside the robots, NaN for robots without one; None if there is none
     shadow_position: Array | None
     shadow_yaw: Array | None  # (K, N) of those twins
+    says: Mapping[str, int] = field(default_factory=dict)  # sizes of variables beside poses, which are `sent.extra`
+    # of laws that remember, by name: variables (K, N, k), and measures (K, N), NaN where unknown; empty if lean
+    memory: Mapping[str, Array] = field(default_factory=dict)
+    measures: Mapping[str, Array] = field(default_factory=dict)
     centre: CentreLog | None = None  # None if each robot decides for itself
     incidents: tuple[tuple[int, Incident], ...] = ()  # hazards, each with the row of its robot, in order of time
 
@@ -137,6 +142,8 @@ class Flight:
         self._samples: list[dict[str, Any]] = []
         self._columns: dict[str, list[Array]] = {}
         self._touches: list[Touch] = []
+        # memory and measures of each robot at each sample
+        self._remembered: list[list[tuple[Memory, Mapping[str, float]]]] = []
 
     @property
     def lonely(self) -> bool:
@@ -220,6 +227,8 @@ class Flight:
             sample["phase"] = [robot.lifecycle.phase for robot in self.robots]
             for what in ("goal", "setpoint", "error"):
                 sample[what] = [getattr(robot, what) for robot in self.robots]
+            laws = [robot.stepping for robot in self.robots if robot.stepping is not None]
+            self._remembered.append([(law.memory, law.measures) for law in laws])
             sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
         self._samples.append(sample)
 
@@ -278,6 +287,8 @@ class Flight:
             ticks=round(self.experiment.duration_s / self.dt),
             airborne=conductor.airborne_at - begin,
             ended=self._tick * self.dt - begin,
+            memory=_columns([[memory for memory, _ in each] for each in self._remembered]),
+            measures=_columns([[measures for _, measures in each] for each in self._remembered]),
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
                 for row, each in sorted(incidents, key=lambda pair: pair[1].time)
@@ -285,3 +296,14 @@ class Flight:
             **self.network.logged(begin),
             **columns,
         )
+
+
+def _columns(samples: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Array]:
+    """Values by name of samples (K) of N robots: (K, N) or (K, N, k); NaN where one is missing."""
+    blank: dict[str, Array] = {}
+    for rows in samples:
+        for row in rows:
+            blank |= {
+                name: np.full_like(value, np.nan, dtype=float) for name, value in row.items() if name not in blank
+            }
+    return {name: np.array([[row.get(name, none) for row in rows] for rows in samples]) for name, none in blank.items()}

@@ -108,6 +108,10 @@ def stretches_of(flight: Flown) -> Stretches | None:
         return None
     if any(robot.goals.changes_shape or robot.guidance is not None for robot in flight.robots):
         return None
+    if flight.robots[0].stepping is not None:
+        law = flight.robots[0].assignment.law
+        REFUSED[type(law).__name__] = f"the law {type(law).__name__} remembers, in tables that are not compiled"
+        return None
     return Stretches(flight)
 
 

@@ -8,6 +8,7 @@ from textwrap import dedent
 import pytest
 
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
 from agents.plugins.registry import AVOIDANCES, LAWS, PREDICTORS, TRIGGERS
 from experiments.virtual_time.source import faults
 
@@ -83,6 +84,8 @@ def plugin_faults(kind):
 def test_registered_plug_ins_and_the_subset(group, name):
     """Ours stay within it; one of others may leave it, and is told: it runs, as plain Python."""
     kind = registry.struct(group, name)
+    if group == LAWS and not issubclass(kind, Gradient):
+        pytest.skip(f"{name} remembers: it is never compiled")
     found = [f"{place}: {method} uses {fault}" for place, method, fault in plugin_faults(kind)]
     if kind.__module__.startswith("agents."):
         assert not found, "\n".join(found)

@@ -24,7 +24,7 @@ from agents.network.messages import M
 from agents.network.shutdown import AFTER_S, end
 from agents.runtime import command_line
 from experiments.real_time.processes.joining import Launch, joined
-from experiments.recording.topics import DEPTH, TOPICS, Message, Topic
+from experiments.recording.topics import DEPTH, SPOKEN, TOPICS, Message, Topic
 from experiments.recording.writer import Recording
 from experiments.scene import markers
 
@@ -47,7 +47,8 @@ class Recorder:
         self.unread: dict[str, tuple[int, str]] = {}  # by key: how many, and why the last
         self._reported: dict[str, int] = {}
         self._alive: set[str] = set()
-        self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in TOPICS]
+        topics = [topic for topic in TOPICS if topic is not SPOKEN]
+        self._inboxes = [(topic, self._inbox(self._subscribe(topic), topic.message)) for topic in topics]
         self._truths = self._inbox(pubsub.subscriber(session, keys.truth("*"), DEPTH), messages.Position)
         self._truth: dict[str, deque[messages.Position]] = {}
         self._waiting: dict[str, deque[tuple[float, messages.State]]] = {}  # for truth, since when

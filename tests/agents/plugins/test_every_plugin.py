@@ -10,8 +10,9 @@ import pytest
 from agents.body.interface import RangeScan
 from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
-from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
 from agents.plugins.planners import Leg
 from agents.plugins.registry import AVOIDANCES, LAWS, PLANNERS, PREDICTORS, TRIGGERS
 from agents.vectors import UNKNOWN
@@ -23,7 +24,13 @@ from tests.agents.things import near, own
 GROUPS = (LAWS, TRIGGERS, PREDICTORS, PLANNERS, AVOIDANCES)
 EVERY = [(group, name) for group in GROUPS for name in registry.names(group)]
 PLACES = {"A": (-0.4, 0.0, 0.0), "B": (0.4, 0.1, 0.0), "C": (0.0, -0.5, 0.0)}
-WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
+WANTS = {
+    "distance": BY_DISTANCE,
+    "any": BY_DISTANCE,
+    "relative": BY_RELATIVE,
+    "bearing": BY_BEARING,
+    "nothing": BY_NOTHING,
+}
 SAMPLES = {float: 0.3, int: 1, bool: False, str: "a", list: [[0.3, 0.2], [-0.2, 0.4]]}
 
 
@@ -151,6 +158,82 @@ def test_losses_restarts_and_unknown_positions(group, name):
     bench.step(0.3, watched)
     assert len(setpoints) > 300
     assert all(isfinite(number) for setpoint in setpoints[1:] for number in setpoint)
+
+
+REMEMBERING = [name for name in registry.names(LAWS) if not issubclass(registry.struct(LAWS, name), Gradient)]
+
+
+def talk(bench, order=1):
+    """Neighbours wander, and say variables that move by themselves; within a tick they may come in any order."""
+    stepping = bench.robot.stepping
+    for link in range(len(bench.neighbours.all))[::order]:
+        if round(bench.t / 0.01) % (7 + 3 * link) == 0:
+            swing = 0.1 * sin(3.0 * bench.t + link)
+            said = {name: tuple(swing + 0.1 * k for k in range(size)) for name, size in stepping.says.items()}
+            x, y, z = PLACES[bench.neighbours.all[link].name]
+            bench.neighbours.receive(link, (x + swing, y, z), (0.1, 0.0, 0.0), bench.t, bench.t, 0.3, said)
+    drive(bench)
+
+
+def known(memory):
+    return {name for name, values in memory.items() if all(map(isfinite, values))}
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_laws_that_remember_keep_what_they_know(name):
+    """Whatever is lost: what was known stays known, and setpoints stay finite."""
+    bench = Bench(replace(assignment(LAWS, name), start=None, starts=()), PLACES["A"])
+    bench.running(talk).step(0.5, talk)
+    stepping = bench.robot.stepping
+    at_first = known(stepping.memory)
+
+    def bear(seconds, every_tick):
+        bench.step(seconds, every_tick)
+        assert at_first <= known(stepping.memory)
+        assert all(map(isfinite, bench.robot.setpoint))
+
+    for link in (0, 1):  # one, then all
+        bench.neighbours.mark_lost(link, bench.t)
+        bear(1.5, drive)
+    for link in (0, 1):
+        bench.neighbours.mark_alive(link)
+        bear(0.5, talk)
+    bench.neighbours.discard_pose(1)
+    bear(0.5, drive)
+    bear(0.5, hear)  # poses without words
+    place, bench.position = bench.position, UNKNOWN
+    bear(0.3, talk)
+    bench.position = place
+    bear(0.5, talk)
+    words = {name: (nan,) * size for name, size in stepping.says.items()}
+    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, nan, words)
+    bear(0.5, drive)
+    old = {name: (9.0,) * size for name, size in stepping.says.items()}
+    before = bench.neighbours.all[0].said
+    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t - 1.0, bench.t, nan, old)
+    assert bench.neighbours.all[0].said == before
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_laws_that_remember_do_not_depend_on_the_order_of_arrival(name):
+    ends = []
+    for order in (1, -1):
+        bench = Bench(replace(assignment(LAWS, name), start=None, starts=()), PLACES["A"])
+        bench.running(lambda bench, order=order: talk(bench, order)).step(2.0, lambda b, order=order: talk(b, order))
+        ends.append(repr((bench.robot.stepping.memory, bench.robot.stepping.measures, bench.robot.setpoint)))
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("name", REMEMBERING)
+def test_laws_that_remember_bear_a_period_of_three_times_the_length(name):
+    given = assignment(LAWS, name)
+    given = replace(given, decide_every=3 * given.decide_every, start=None, starts=())
+    bench = Bench(given, PLACES["A"])
+    bench.running(talk).step(10.0, talk)
+    stepping = bench.robot.stepping
+    assert all(abs(number) < 1e6 for values in stepping.memory.values() for number in values if isfinite(number))
+    assert all(map(isfinite, bench.robot.setpoint))
+    assert bench.life.phase == RUNNING, bench.life.reason
 
 
 def turned(random, distance):

@@ -141,7 +141,7 @@ def test_did_you_mean(word, known, answer):
 
 
 @pytest.mark.parametrize(
-    ("group", "base"), [(LAWS, "laws.Gradient"), (TRIGGERS, "triggers.Trigger"), (PREDICTORS, "predictors.Predictor")]
+    ("group", "base"), [(LAWS, "law.Law"), (TRIGGERS, "triggers.Trigger"), (PREDICTORS, "predictors.Predictor")]
 )
 @pytest.mark.usefixtures("foreign")
 def test_plug_in_inherits_from_its_base(group, base):

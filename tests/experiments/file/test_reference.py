@@ -122,7 +122,7 @@ def test_a_metric_is_told_from_a_key_of_the_file(metric):
         ("battery", "safety.battery_low"),
         ("noise", "disturbance.KIND.position_sigma"),
         ("obstacle", "arena.obstacles"),
-        ("consensus", "formation.law(displacement)"),
+        ("linear", "formation.law(displacement)"),
         ("latency", "channel.delay_s"),
         ("camera", "positioning"),
         ("crash", "safety.separation"),

@@ -1,0 +1,193 @@
+"""Laws that remember and say something, at work for one robot: memory, words, and what the last step decided.
+
+Memory belongs to the decision, never to the law: a step returns it, and it is kept only where the robot was due.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import dist, inf, isfinite, nan
+from numbers import Real
+from typing import Any, Final
+
+from agents.decision.assignment import Assignment
+from agents.network.validation import ENORMOUS, MAX_NUMBERS
+from agents.plugins.calls import failure, wrong
+from agents.plugins.law import Control, Law, Memory, RobotFacts, Values, View, is_known
+from agents.plugins.registry import FAILURES, PluginError
+from agents.vectors import Vector, is_finite
+
+Words = tuple[tuple[str, Values], ...]  # what a robot says beside its pose: variables by name
+
+MOST_STEPS: Final = 3.0  # a pause counts as so many periods at most: integrals would leap
+DIGITS: Final = 7  # significant ones of what is said: units are unknown
+
+
+class Speech:
+    """What a robot says beside its pose; triggers ask how far neighbours are from it."""
+
+    __slots__ = ("_metres", "now", "said")
+
+    now: dict[str, Values]  # variables as they are
+    said: dict[str, Values]  # and as said last
+
+    def __init__(self, law: Law, memory: Memory) -> None:
+        self._metres = {name: said.metre for name, said in law.SAYS.items()}
+        self.update(memory)
+        self.said = self.now
+
+    def update(self, memory: Memory) -> None:
+        self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
+
+    def deviation(self, of_pose: float) -> float:
+        """Largest deviation of what neighbours know, in metres, of pose and variables; infinite if one is new."""
+        worst = of_pose
+        for name, metre in self._metres.items():
+            now, said = self.now[name], self.said[name]
+            if is_known(now):
+                worst = max(worst, dist(now, said) / metre if is_known(said) else inf)
+        return worst
+
+    def record(self) -> None:
+        """It is said now."""
+        self.said = self.now
+
+    @property
+    def words(self) -> Words:
+        """Variables as said last, those that are known."""
+        return tuple((name, values) for name, values in self.said.items() if is_known(values))
+
+
+class Stepping:
+    """A law at work for one robot."""
+
+    __slots__ = (
+        "_law", "_stepped", "_target", "alone", "control", "facts", "measures", "memory", "moves", "scan", "speech",
+        "tick", "tick_s",
+    )  # fmt: skip
+
+    memory: dict[str, Values]
+    measures: dict[str, float]  # of the last step
+    control: Control  # of the last step
+    alone: bool  # the law moves a robot without neighbours
+    speech: Speech | None  # None: the law says nothing
+    moves: bool  # the robot may move; set by its caller, and likewise
+    scan: Any  # range readings
+    tick: int  # number of the tick since the common start
+
+    def __init__(self, assignment: Assignment) -> None:
+        """Begin; raises PluginError if `begin` of the law fails or gives what cannot be used."""
+        law, kind = assignment.law, assignment.kind
+        self._law, self.alone, self.tick_s = law, law.ALONE, 1.0 / assignment.body_hz
+        self.facts = RobotFacts(
+            assignment.name, assignment.number, assignment.count, kind.flies, kind.speed,
+            assignment.decide_every * self.tick_s,
+        )  # fmt: skip
+        self.memory = self._begin()
+        self.speech = Speech(law, self.memory) if law.SAYS else None
+        self.control, self.measures = Control(), {}
+        self.moves, self.scan, self.tick, self._stepped = True, None, 0, -1
+        self._target: Vector = (nan, nan, nan)
+
+    def _begin(self) -> dict[str, Values]:
+        law = self._law
+        try:
+            memory = {name: tuple(map(float, values)) for name, values in law.begin(self.facts).items()}
+        except FAILURES as error:
+            raise failure("law", law, error) from error
+        if missing := [name for name in law.SAYS if name not in memory]:
+            raise PluginError(f"`begin` of the law {type(law).__name__} lacks {', '.join(missing)}, which it SAYS")
+        count = sum(len(memory[name]) for name in law.SAYS)
+        if count > MAX_NUMBERS:
+            raise PluginError(f"the law {type(law).__name__} says {count} numbers; a pose carries {MAX_NUMBERS}")
+        return memory
+
+    @property
+    def says(self) -> dict[str, int]:
+        """Sizes of the variables that it says, by name."""
+        return {name: len(self.memory[name]) for name in self._law.SAYS}
+
+    def said_by(self, words: Mapping[str, Values]) -> dict[str, Values]:
+        """Variables that a neighbour said; NaN for those that it did not say, or that have another size."""
+        found = {}
+        for name in self._law.SAYS:
+            said, size = words.get(name, ()), len(self.memory[name])
+            found[name] = said if len(said) == size else (nan,) * size
+        return found
+
+    def view(self) -> View:
+        """View for the next step, without what is not known here."""
+        view = View(self.facts, {} if self.speech is None else self.speech.said, ())
+        view.time, view.moves, view.scan = self.tick * self.tick_s, self.moves, self.scan
+        if self._stepped >= 0:
+            passed = (self.tick - self._stepped) * self.tick_s
+            view.step_s = min(max(passed, self.tick_s), MOST_STEPS * self.facts.step_s)
+        return view
+
+    def aim(self, view: View, target: Vector) -> None:
+        """Tell the view where the plan is now, and how fast it moves."""
+        last, view.target = self._target, target
+        if is_finite(last) and is_finite(target):
+            s = view.step_s
+            view.target_velocity = (
+                (target[0] - last[0]) / s, (target[1] - last[1]) / s, (target[2] - last[2]) / s
+            )  # fmt: skip
+        self._target = target
+
+    def step(self, view: View) -> None:
+        """Step, and keep what the law decided."""
+        self.control = control = self.rehearse(view)
+        self.memory = {name: tuple(map(float, values)) for name, values in control.memory.items()}
+        self.measures = {name: float(value) for name, value in control.measures.items()}
+        self._stepped = self.tick
+        if self.speech is not None:
+            self.speech.update(self.memory)
+
+    def rehearse(self, view: View) -> Control:
+        """What the law decides; nothing is kept. Raises PluginError where a result is not what it must be."""
+        law, memory = self._law, self.memory
+        control = law.step(view, memory)
+        if not isinstance(control, Control):
+            raise wrong("law", law, "step", control, "a Control")
+        sizes = {name: len(values) for name, values in memory.items()}
+        if {name: _size(values) for name, values in control.memory.items()} != sizes:
+            wanted = ", ".join(f"{name} ({size})" for name, size in sizes.items()) or "no variables"
+            raise wrong("law", law, "step", dict(control.memory), f"a memory of the variables and sizes {wanted}")
+        for way in (control.velocity, control.goal):
+            if way is not None and _size(way) != len(self._target):
+                raise wrong("law", law, "step", way, "three numbers as velocity or goal")
+        if not (isinstance(control.yaw, Real) and all(isinstance(each, Real) for each in control.measures.values())):
+            raise wrong("law", law, "step", control, "a number as yaw and as each of its measures")
+        return control
+
+    @property
+    def velocity(self) -> Vector | None:
+        """Velocity that the law decided [m/s]; None: it gave a goal."""
+        control = self.control
+        if control.velocity is None:
+            return None if control.goal is not None else (0.0, 0.0, nan)
+        return control.velocity
+
+    @property
+    def sound(self) -> bool:
+        """Whether all that the last step decided for the body is finite, or a height that is left out."""
+        return is_sound(self.control)
+
+
+def is_sound(control: Control) -> bool:
+    """Whether a velocity or goal is finite, but for a height that is left out."""
+    ways = (way for way in (control.velocity, control.goal) if way is not None)
+    return all(isfinite(x) and isfinite(y) and abs(z) != inf for x, y, z in ways)
+
+
+def rounded(value: float) -> float:
+    """A number of `DIGITS` significant digits; NaN where it is none that can be said."""
+    return float(f"{value:.{DIGITS}g}") if abs(value) <= ENORMOUS else nan
+
+
+def _size(values: object) -> int:
+    """Count of numbers; −1 if they are none."""
+    if not isinstance(values, Iterable) or isinstance(values, str):
+        return -1
+    numbers = list(values)
+    return len(numbers) if all(isinstance(each, Real) for each in numbers) else -1

@@ -1,0 +1,4 @@
+"""Laws of the literature, each with the theorem that its test shows.
+
+May import: agents.plugins, agents.vectors.
+"""

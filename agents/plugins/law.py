@@ -1,0 +1,153 @@
+"""Control and communication laws: what a robot remembers, what it says beside its pose, and how it moves.
+
+A law is a frozen struct of its parameters, found by the entry-point group `zenpark.laws`. It is written for one robot,
+as textbooks write it (F. Bullo, J. Cortés, S. Martínez, *Distributed Control of Robotic Networks*, 2009, chapter 3): a
+state of the processor, messages, a transition of that state, and a motion control. Formation laws without memory are
+its subclass `agents.plugins.laws.Gradient`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite, nan
+from typing import Any, ClassVar, Literal, TypeVar
+
+import msgspec
+
+from agents.formation.link import Link
+from agents.vectors import UNKNOWN, ZERO, Vector
+
+Need = Literal["distance", "relative", "bearing", "any", "nothing"]
+Gain = Literal["gain", "stiffness", "by link"]
+Severity = Literal["error", "warning", "note"]
+Values = tuple[float, ...]  # of a variable; NaN: not known yet
+Memory = Mapping[str, Values]  # variables by name
+
+T = TypeVar("T")
+
+
+class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How neighbours get a variable of the memory."""
+
+    unit: str = "1"
+    metre: float = 1.0  # change of it that counts, for every trigger, as one metre of deviation of the pose
+    place: int | None = None  # index at which a place x, y (, z) [m] begins, if it has one
+
+
+class RobotFacts:
+    """A robot as its law knows it before anything happens."""
+
+    __slots__ = ("count", "flies", "name", "number", "speed", "step_s")
+
+    name: str
+    number: int  # among all robots of the experiment, from 0 on
+    count: int  # of all robots
+    flies: bool
+    speed: float  # of its kind [m/s]
+    step_s: float  # from one step to the next [s]
+
+    def __init__(  # noqa: PLR0917 - one for each attribute
+        self, name: str, number: int, count: int, flies: bool, speed: float, step_s: float
+    ) -> None:
+        self.name, self.number, self.count, self.flies = name, number, count, flies
+        self.speed, self.step_s = speed, step_s
+
+    def of(self, table: Mapping[str, T], default: T | None = None) -> T:
+        """Value of this robot in a table by names; raises ValueError if it has none and there is no default."""
+        value = table.get(self.name, default)
+        if value is None:
+            raise ValueError(f"a table of the law has no value for {self.name}")
+        return value
+
+
+class NeighbourView:
+    """A neighbour as the robot believes it, with the link to it."""
+
+    __slots__ = ("age", "link", "name", "number", "position", "said", "velocity", "yaw")
+
+    number: int  # among all robots of the experiment
+    name: str
+    position: Vector  # predicted for now [m]
+    velocity: Vector  # as sent last [m/s]
+    yaw: float  # as sent last [rad], NaN where unknown
+    age: float  # of its last pose [s]
+    said: Memory  # variables as it said them last; NaN before the first
+    link: Link  # its target and gain
+
+    def __init__(  # noqa: PLR0917 - one for each attribute
+        self, number: int, name: str, position: Vector, velocity: Vector, yaw: float, age: float, said: Memory,
+        link: Link,
+    ) -> None:  # fmt: skip
+        self.number, self.name, self.position, self.velocity = number, name, position, velocity
+        self.yaw, self.age, self.said, self.link = yaw, age, said, link
+
+
+class View:
+    """What a robot knows at a step of its law."""
+
+    __slots__ = (
+        "leads", "moves", "neighbours", "position", "robot", "said", "scan", "step_s", "target", "target_velocity",
+        "time", "velocity", "yaw",
+    )  # fmt: skip
+
+    robot: RobotFacts
+    time: float  # since the common start, by ticks [s]
+    step_s: float  # since the last step, by ticks [s]
+    position: Vector  # own, measured [m]
+    velocity: Vector  # own, measured [m/s]
+    yaw: float  # own [rad]
+    target: Vector  # of the robot's plan now [m]; NaN without one
+    target_velocity: Vector  # of that target [m/s]; 0 at first
+    scan: Any  # range readings, see `agents.body.interface.RangeScan`; None without
+    leads: bool  # the law does not move it: it has no links, and follows a plan or stays
+    moves: bool  # False while safety holds it: integrals of what its motion must mend stop then
+    said: Memory  # own variables, as said last: what the neighbours believe of this robot
+    neighbours: Sequence[NeighbourView]  # those of its links that are there, in the order of their numbers
+
+    def __init__(self, robot: RobotFacts, said: Memory, neighbours: Sequence[NeighbourView]) -> None:
+        self.robot, self.said, self.neighbours = robot, said, neighbours
+        self.time, self.step_s, self.yaw = 0.0, robot.step_s, 0.0
+        self.position, self.velocity, self.target, self.target_velocity = UNKNOWN, ZERO, UNKNOWN, ZERO
+        self.scan = None
+        self.leads, self.moves = False, True
+
+    def known(self, *names: str) -> list[NeighbourView]:
+        """Neighbours that have said all variables of these names."""
+        return [each for each in self.neighbours if all(is_known(each.said[name]) for name in names)]
+
+
+class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a step of a law decides; with neither velocity nor goal the robot stays where it is."""
+
+    memory: Memory = {}  # all variables, as they are from now on
+    velocity: Vector | None = None  # [m/s]; the third NaN: the height is held
+    goal: Vector | None = None  # [m]; likewise
+    yaw: float = nan  # wanted [rad], NaN for any
+    measures: Mapping[str, float] = {}  # numbers by name for figures and metrics, never said
+
+
+class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all laws."""
+
+    NEEDS: ClassVar[Need] = "nothing"  # target that it needs of every link
+    PULLS_BY: ClassVar[Gain] = "gain"  # gain of the file for links without their own
+    SAYS: ClassVar[Mapping[str, Said]] = {}  # variables of the memory that go out with the pose
+    ALONE: ClassVar[bool] = False  # moves a robot without neighbours, which else stays in place
+    PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
+
+    def begin(self, robot: RobotFacts) -> Memory:
+        """Variables at the start, each with as many numbers as it ever has."""
+        return {}
+
+    def step(self, view: View, memory: Memory) -> Control:
+        """State transition, messages and motion of one robot; pure."""
+        raise TypeError(f"{type(self).__name__} must define `step`")
+
+    def analyse(self, plan: Any) -> Iterable[tuple[Severity, str, str]]:  # noqa: ANN401 - plug-ins know no experiment
+        """Theory for `check`: findings on a compiled case, `experiments.definition.plan.Plan`, each with its remedy."""
+        return ()
+
+
+def is_known(values: Iterable[float]) -> bool:
+    """Whether all numbers of a variable are known."""
+    return all(isfinite(each) for each in values)

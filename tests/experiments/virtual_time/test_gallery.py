@@ -1,0 +1,92 @@
+"""Theorems of the laws of the gallery, in virtual time: periodic, by events, and with a fifth of the messages lost."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from experiments.catalogue import index
+from experiments.file import document
+from experiments.recording import playback
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+
+CASES = ("periodic", "event", "event-loss")
+
+
+@cache
+def flown(name, case, *changes):
+    """Log and logbook of a catalogue entry."""
+    experiment = document.read(index.find_file(name), changes).cases()[case]
+    log = simulate(experiment, experiment.seed)
+    return log, Logbook(log, experiment, case)
+
+
+def trace(name, case, *changes):
+    return flown(name, case, *changes)[1].trace()
+
+
+@pytest.mark.parametrize(("case", "most"), [("periodic", 1e-4), ("event", 0.015), ("event-loss", 0.02)])
+def test_average_of_constant_signals_has_no_error(case, most):
+    known = trace("average", case)
+    assert np.abs(known.memory["x"][-1] - 3.0).max() < most
+    assert np.abs(known.memory["x"][0] - 3.0).max() > 1.0
+    assert known.measures["disagreement"].shape == (len(known.time), 6)
+
+
+def test_average_of_ramps_has_a_bounded_error():
+    known = trace("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60")
+    error = known.memory["x"][..., 0] - 3.0 - known.time[:, None] * 0.2 / 6
+    later = np.abs(error[known.time > 30.0])
+    assert later.max() < 0.3
+    assert np.abs(later - later[-1]).max() < 0.01  # it grows no more
+
+
+def test_events_save_messages():
+    counts = [len(trace("average", case).sent) for case in CASES]
+    assert counts[1] < counts[0] / 4
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_consensus_meets_at_the_mean_at_the_rate_of_the_graph(case):
+    known = trace("consensus", case)
+    offset = np.array([*known.experiment.formation.law["offset"].values()])
+    place = known.true_position[..., :2] - offset
+    mean = place.mean(axis=1)
+    assert np.abs(mean - mean[0]).max() < 0.01
+    apart = np.linalg.norm(place - mean[:, None], axis=(1, 2))
+    assert apart[-1] < 0.02
+    window = (known.time > 1.0) & (known.time < 6.0)
+    rate = -np.polyfit(known.time[window], np.log(apart[window]), 1)[0]
+    assert rate == pytest.approx(0.3 * (2.0 - 2.0 * np.cos(2.0 * np.pi / 5.0)), rel=0.1)
+
+
+def test_followers_go_into_the_hull_of_their_leaders():
+    links = {"CF01 > CF03": "link", "CF03 - CF04": "link", "CF04 - CF05": "link", "CF02 > CF05": "link"}
+    words = ", ".join(f'"{name}" = "{kind}"' for name, kind in links.items())
+    bare = "\n".join(line for line in index.find_file("consensus").read_text().splitlines() if " - CF0" not in line)
+    given = document.loads(bare, f"formation.links={{ {words} }}", 'formation.law={ kind = "consensus" }')
+    experiment = given.cases()["periodic"]
+    end = Logbook(simulate(experiment, 1), experiment, "periodic").trace().true_position[-1, :, :2]
+    first, second = end[:2]
+    for share, place in zip((0.25, 0.5, 0.75), end[2:], strict=True):
+        assert place == pytest.approx((1.0 - share) * first + share * second, abs=0.02)
+
+
+def test_the_same_twice_and_another_seed_elsewhere():
+    experiment = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
+    first, again, other = (simulate(experiment, seed) for seed in (1, 1, 2))
+    assert all(np.array_equal(first.memory[name], again.memory[name]) for name in first.memory)
+    assert any(not np.array_equal(first.memory[name], other.memory[name]) for name in first.memory)
+
+
+def test_a_recording_has_memory_measures_and_words(tmp_path):
+    _, logbook = flown("average", "event", "duration_s=5")
+    logbook.record(tmp_path / "run.mcap", "")
+    known, back = logbook.trace(), playback.read(tmp_path / "run.mcap").trace
+    assert {name: values.shape for name, values in back.memory.items()} == dict.fromkeys("xqn", (251, 6, 1))
+    for name, values in known.memory.items():
+        assert back.memory[name] == pytest.approx(values)
+    assert back.measures["disagreement"] == pytest.approx(known.measures["disagreement"])
+    assert len(back.sent) == len(known.sent)
+    assert back.sent.bytes.tolist() == known.sent.bytes.tolist()
