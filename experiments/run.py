@@ -10,13 +10,17 @@ import importlib
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from agents.errors import ExplainedError
+from experiments.cores import KILLED, cores, pool
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
 from experiments.file import document
@@ -56,6 +60,7 @@ def folder(default: str) -> Path:
     return Path(given[0]) if given else CHECKOUT / default
 
 
+SHARED: Final = 1e6  # robot ticks that are shared between processes, which take a second or two to begin
 MOST_SAMPLES: Final = 2e7  # states of one robot; each takes about 300 bytes
 
 
@@ -166,23 +171,64 @@ def simulate_seeds(
     if folder is not None:
         with suppress(OSError):  # the recording says so
             folder.mkdir(parents=True, exist_ok=True)
+    works = {name: standby.without_standby(case) for name, case in chosen(read, cases).items()}
+    first, *others = seeds
     traces: list[dict[str, Trace]] = [{} for _ in seeds]
-    for name, experiment in chosen(read, cases).items():
-        experiment = standby.without_standby(experiment)  # noqa: PLW2901
-        shown = watch(name, experiment)
-        for k, seed in enumerate(seeds):
-            log = simulation.simulate(
-                experiment,
-                seed,
-                progress=partial(_pass_progress, progress, name, experiment.duration_s),
-                watch=shown if k == 0 else None,
-            )
+    metrics: list[dict[str, CaseMetrics]] = [{} for _ in seeds]
+    with _processes(works, len(others)) as processes:
+        shared = (
+            {}
+            if processes is None
+            else {(name, seed): processes.submit(_flown, name, works[name], seed) for name in works for seed in others}
+        )
+        for name, experiment in works.items():
+            passing = partial(_pass_progress, progress, name, experiment.duration_s)
+            log = simulation.simulate(experiment, first, progress=passing, watch=watch(name, experiment))
             logbook = Logbook(log, experiment, name)
-            traces[k][name] = logbook.trace()
-            if folder is not None and k == 0:
+            traces[0][name] = logbook.trace()
+            metrics[0][name] = measure.measure(traces[0][name])
+            if folder is not None:
                 logbook.record(folder / f"{name}.mcap", read.text)
-        _pass_progress(progress, name, experiment.duration_s, math.inf)
-    return [_measured(read.experiment.title, mine, folder, read.listing) for mine in traces]
+            for k, seed in enumerate(others, 1):
+                future = shared.get((name, seed))
+                found = _flown(name, experiment, seed, passing) if future is None else _result(future)
+                traces[k][name], metrics[k][name] = found
+                passing(experiment.duration_s * (k + 1) / len(seeds))
+            passing(math.inf)
+    title, text = read.experiment.title, read.listing
+    return [
+        Run(title, seed, flown, measured, folder, text)
+        for seed, flown, measured in zip(seeds, traces, metrics, strict=True)
+    ]
+
+
+Flown = tuple[Trace, CaseMetrics]
+
+
+def _flown(name: str, experiment: Experiment, seed: int, progress: Callable[[float], object] = lambda _: None) -> Flown:
+    """Trace and metrics of a run of a case."""
+    trace = Logbook(simulation.simulate(experiment, seed, progress=progress), experiment, name).trace()
+    return trace, measure.measure(trace)
+
+
+def _result(future: Future[Flown]) -> Flown:
+    """What another process has flown; raises ExplainedError if it was killed."""
+    try:
+        return future.result()
+    except BrokenProcessPool:
+        raise ExplainedError(f"a process of the run {KILLED}: take fewer --seeds, or `./zenpark sweep`") from None
+
+
+@contextmanager
+def _processes(works: Mapping[str, Experiment], seeds: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Processes for so many more seeds of these cases, None where to begin them would take longer."""
+    ticks = sum(case.duration_s * case.rates.body_hz * len(case.robots) for case in works.values())
+    count = min(cores(), len(works) * seeds)
+    if count < 2 or seeds * ticks < SHARED:
+        yield None
+        return
+    with pool(count) as processes:
+        yield processes
 
 
 def _refuse_too_much(experiment: Experiment, seeds: int) -> None:

@@ -32,7 +32,7 @@ twins.engines
 twins.sensing
 twins.body
 bridges twins.devices
-experiments.arrays experiments.catalogue
+experiments.arrays experiments.catalogue experiments.cores
 experiments.definition
 experiments.file
 experiments.recording

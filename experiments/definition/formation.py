@@ -49,7 +49,7 @@ class Pattern:
             tuple(zip(*after, strict=True)) if after else ((),) * len(there),
         )
 
-    @property
+    @cached_property
     def bounded(self) -> bool:
         """Whether a link comes or goes."""
         return any(link.since > 0.0 or min(link.until, link.reach, link.release) < math.inf for link in self.one_way)
@@ -60,10 +60,11 @@ class Pattern:
 
     def targets_at(self, elapsed: float) -> list[Link]:
         """Targets of the links `elapsed` [s] after the common start."""
+        if not self.changes:
+            return self._given
         found = [_link(each) for each in self.one_way]
-        if self.changes:
-            for link, given, targets in zip(found, self._given, self.targets, strict=True):
-                change_target(link, given, self.changes, targets, elapsed)
+        for link, given, targets in zip(found, self._given, self.targets, strict=True):
+            change_target(link, given, self.changes, targets, elapsed)
         return found
 
     def at(self, elapsed: float) -> Links:

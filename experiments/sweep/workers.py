@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import re
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Executor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -18,11 +14,10 @@ from typing import Any, Final
 import msgspec
 
 from agents.errors import ExplainedError
+from experiments.cores import KILLED, cores, pool
 from experiments.sweep.runs import WorkResult, fly
 
-ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 ADDRESS: Final = re.compile(r"(tcp|tls)://[^\s/]+:[0-9]{1,5}")
-KILLED: Final = "a process of the sweep was killed, perhaps for want of memory (then: fewer --processes)"
 ANSWER_S: Final = 10.0  # a scheduler that does not answer for so long is not there
 
 
@@ -88,27 +83,13 @@ def workers(scheduler: str | None, processes: int | None) -> AbstractContextMana
 @contextmanager
 def _local(processes: int | None) -> Iterator[Workers]:
     """Processes on this machine, one for each core if no number is given; with 1 the work is done in this one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = cores if processes is None else processes
+    count = cores() if processes is None else processes
     if count == 1:
         yield Workers(None, lambda: 1, "this machine")
         return
-    others = frozenset(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
-    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # for the processes
-    pool = ProcessPoolExecutor(count, context, initializer=_prepare)
-    try:
-        yield Workers(pool, lambda: count, "this machine", (BrokenProcessPool,), lambda _: KILLED)
-    finally:
-        for name in ONE_THREAD:
-            os.environ.pop(name)
-        os.environ.update(before)
-        for child in multiprocessing.active_children():
-            if child not in others:
-                child.terminate()
-        # once, and waiting: a thread of the pool that still runs when the interpreter ends may print a traceback
-        pool.shutdown(cancel_futures=True)
+    with pool(count) as made:
+        words = f"a process of the sweep {KILLED} (then: fewer --processes)"
+        yield Workers(made, lambda: count, "this machine", (BrokenProcessPool,), lambda _: words)
 
 
 @contextmanager
@@ -144,19 +125,6 @@ def _cluster(address: str) -> Iterator[Workers]:
 
         failures = (distributed.KilledWorker, CancelledError, OSError)
         yield Workers(client.get_executor(pure=False, retries=1), threads, "a worker", failures, reason)
-
-
-def _prepare() -> None:
-    """In each process: Ctrl-C is the sweep's, and the process ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def _first_line(error: BaseException) -> str:

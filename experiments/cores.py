@@ -1,0 +1,54 @@
+"""Processes of this machine that share work: one for each core, which end with the process that began them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Final
+
+ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+KILLED: Final = "was killed, perhaps for want of memory"  # what happened to a process of a `BrokenProcessPool`
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def pool(count: int) -> Iterator[ProcessPoolExecutor]:
+    """So many processes, started as the work comes in; the end of the block ends them, and their work."""
+    others = frozenset(multiprocessing.active_children())
+    context = multiprocessing.get_context("spawn")  # a fork would take our threads' locks along
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # for the processes
+    made = ProcessPoolExecutor(count, context, initializer=_prepare)
+    try:
+        yield made
+    finally:
+        for name in ONE_THREAD:
+            os.environ.pop(name)
+        os.environ.update(before)
+        for child in multiprocessing.active_children():
+            if child not in others:
+                child.terminate()
+        # once, and waiting: a thread of the pool that still runs when the interpreter ends may print a traceback
+        made.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    """In each process: Ctrl-C is the parent's, and the process ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
