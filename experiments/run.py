@@ -163,6 +163,7 @@ def simulate_seeds(
 ) -> list[Run]:
     """As `simulate`, once for each seed; recordings are made of the first seed only.
 
+    Many seeds are shared between processes, which import the script: there under `if __name__ == "__main__"`.
     `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see
     `simulation.simulate`.
     """
