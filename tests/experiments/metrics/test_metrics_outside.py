@@ -2,7 +2,11 @@
 
 import csv
 import json
+import os
 import re
+import shlex
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -91,6 +95,31 @@ def test_installed_metric_is_swept(installed):
     assert (installed / "swept" / "figures" / "pareto_way_m.svg").is_file()
     table = zenpark(installed, "report", "swept", "--markdown", "--metrics", "messages,way_m").stdout
     assert "| Messages ratio | Way ratio |" in table
+
+
+@pytest.mark.slow
+def test_installed_metric_is_a_limit_of_a_search(installed):
+    (line,) = re.findall(r"^    \./zenpark (sweep .*--optimize.*)$", GUIDE, re.MULTILINE)
+    words = [word for word in shlex.split(line) if not word.startswith(("seeds=", "tuning="))]
+    short = ["seeds=1:2", "tuning=1001:1006", "--set", "duration_s=1", "--anyway", "--no-report", "--out", "tuned"]
+    done = zenpark(installed, *words, *short)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^event threshold=.*: keeps Way ratio <= 1.02$", done.stdout, re.MULTILINE)
+
+
+@pytest.mark.slow
+def test_installed_metric_is_in_a_notebook(installed):
+    code = (
+        "from experiments.file.document import load\n"
+        "from experiments.run import simulate\n"
+        "run = simulate(load('triangle', 'duration_s=1.0'))\n"
+        "found = run.metrics['event']\n"
+        "print(found.mean['way_m'] > 0.0, found.robots[0].value('way_m') > 0.0, 'Way [m]' in run._repr_html_())"
+    )
+    path = os.pathsep.join([str(installed), str(ROOT)])
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True", "True"]
 
 
 class Way(Metric, frozen=True):
