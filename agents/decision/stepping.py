@@ -24,24 +24,33 @@ DIGITS: Final = 7  # significant ones of what is said: units are unknown
 
 
 class Speech:
-    """What a robot says beside its pose; triggers ask how far neighbours are from it."""
+    """What a robot says beside its pose; triggers ask how far neighbours are from it.
 
-    __slots__ = ("_metres", "now", "said")
+    Before its first step it says nothing: a robot that joins a run under way would draw the others to values that do
+    not move yet.
+    """
+
+    __slots__ = ("_metres", "_stepped", "now", "said", "spoken")
 
     now: dict[str, Values]  # variables as they are
-    said: dict[str, Values]  # and as said last
+    said: dict[str, Values]  # and as said last; at first as they begin
+    spoken: bool  # it has said something
 
     def __init__(self, law: Law, memory: Memory) -> None:
         self._metres = {name: said.metre for name, said in law.SAYS.items()}
         self.update(memory)
-        self.said = self.now
+        self.said, self.spoken, self._stepped = self.now, False, False
 
     def update(self, memory: Memory) -> None:
+        """The variables are these after a step."""
+        self._stepped = True
         self.now = {name: tuple(map(rounded, memory[name])) for name in self._metres}
 
     def deviation(self, of_pose: float) -> float:
         """Largest deviation of what neighbours know, in metres, of pose and variables; infinite if one is new."""
-        worst = of_pose
+        if not self._stepped:
+            return of_pose
+        worst = of_pose if self.spoken else inf
         for name, metre in self._metres.items():
             now, said = self.now[name], self.said[name]
             if is_known(now):
@@ -50,11 +59,14 @@ class Speech:
 
     def record(self) -> None:
         """It is said now."""
-        self.said = self.now
+        if self._stepped:
+            self.said, self.spoken = self.now, True
 
     @property
     def words(self) -> Words:
         """Variables as said last, those that are known."""
+        if not self.spoken:
+            return ()
         return tuple((name, values) for name, values in self.said.items() if is_known(values))
 
 

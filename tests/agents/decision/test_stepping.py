@@ -151,6 +151,13 @@ def test_velocity_that_is_not_finite_holds_and_lands():
 
 def test_deviation_counts_in_metres():
     speech = Speech(Counting(), {"count": (0.0,)})
+    speech.record()
+    assert speech.deviation(0.1) == 0.1  # before the first step there is nothing to say
+    assert speech.words == ()
+    speech.update({"count": (0.0,)})
+    assert speech.deviation(0.1) == inf
+    speech.record()
+    assert speech.words == (("count", (0.0,)),)
     speech.update({"count": (50.0,)})
     assert speech.deviation(0.1) == 0.5
     assert speech.deviation(0.7) == 0.7
