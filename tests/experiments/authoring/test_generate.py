@@ -26,10 +26,10 @@ def written(tmp_path, what, size, wanted=None):
     ("what", "size", "kind"),
     [
         ("polygon", "3", "khepera4"),
-        ("polygon", "9", "crazyflie"),
-        ("grid", "3x4", "turtlebot3"),
+        pytest.param("polygon", "9", "crazyflie", marks=pytest.mark.nightly),
+        pytest.param("grid", "3x4", "turtlebot3", marks=pytest.mark.nightly),
         ("hemisphere", "4", "crazyflie"),
-        ("hemisphere", "40", "crazyflie"),
+        pytest.param("hemisphere", "40", "crazyflie", marks=pytest.mark.nightly),
         ("hemisphere", "12", "tello"),
     ],
 )

@@ -109,6 +109,7 @@ def test_robots_with_sensors_alone_keep_clear(kind, sensors):
     assert outcome.arrived.all()
 
 
+@pytest.mark.nightly
 def test_bad_network_causes_no_collision():
     bad = Channel(delay_s=0.02, jitter_s=0.02, loss=0.2)
     for kinds in (("tello", "tello"), ("crazyflie", "turtlebot3")):
