@@ -39,7 +39,24 @@ class Flight:
     tilt: Vector
 
 
-Motion = Wheels | Flight
+@dataclass(frozen=True)
+class Holonomic:
+    """Wheels that drive in any direction, such as Mecanum ones; velocities follow with the `lag` of the kind."""
+
+    acceleration: float = inf  # largest [m/s²]
+
+
+@dataclass(frozen=True)
+class Steered:
+    """Two axles, of which the front one is steered; the position is that of the middle of the rear one."""
+
+    base: float  # distance between the axles [m]
+    angle: float  # largest steering angle [rad]
+    angle_rate: float  # largest steering speed [rad/s]
+    acceleration: float  # largest, along the heading [m/s²]
+
+
+Motion = Wheels | Flight | Holonomic | Steered
 
 
 @dataclass(frozen=True)
@@ -110,7 +127,10 @@ class Kind:
     # time constant with which its velocity follows what is commanded [s]
     lag: float = 0.1  # of a robot on wheels at 2 m/s², from 0.3 m/s, and a tick or two
     overshoot: float = 0.0  # of a take-off of the real robot, share of its height, at most
-    motion: Motion | None = None  # of its twin; None: it has no twin
+    turn_radius: float = 0.0  # smallest, of one that cannot turn on the spot [m]
+    steering: Steering | None = None  # of one that takes twists; None: as two wheels turn
+    # of its twin, or a `module:class`, see `twins.models.ground.Ground`; None: it has no twin
+    motion: Motion | str | None = None
     sensors: tuple[str, ...] = ()  # range sensors that each has, see `twins.sensing.range_sensors.SENSORS`
     airframe: Airframe | None = None  # for the engine mujoco; None: that engine refuses it
     # how it is known
@@ -134,12 +154,12 @@ class Kind:
         for name in positive:
             if not (isfinite(value := getattr(self, name)) and value > 0.0):
                 raise ValueError(f"{name} of the kind {self.name!r} is {value!r}: give a positive number")
-        if not 0.0 <= self.lag < inf:
-            raise ValueError(f"lag of the kind {self.name!r} is {self.lag!r}: give seconds, not negative")
-        if self.flies == (self.takes == "twist"):
-            if self.flies:
-                raise ValueError(f"the kind {self.name!r} flies: let it take positions or velocities")
-        elif self.takes == "position" and not self.flies:
+        for name in ("lag", "turn_radius"):
+            if not 0.0 <= (value := getattr(self, name)) < inf:
+                raise ValueError(f"{name} of the kind {self.name!r} is {value!r}: give 0 or a positive number")
+        if self.flies and self.takes == "twist":
+            raise ValueError(f"the kind {self.name!r} flies: let it take positions or velocities")
+        if not self.flies and self.takes == "position":
             raise ValueError(f"the kind {self.name!r} drives: let it take velocities or twists")
 
 

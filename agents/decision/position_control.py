@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import atan2, cos, isfinite, isnan, nan, pi, radians, sin, sqrt
 from typing import Final
 
-from agents.body.kinds import Kind
+from agents.body.kinds import Kind, Steering
 from agents.vectors import UNKNOWN, Setpoint, Vector, clamp, wrap
 
 REACHED: Final = 0.005  # [m] a ground robot stops nearer than this to its goal; half the threshold of a 1 cm trigger
@@ -22,10 +22,12 @@ BROADSIDE: Final = 0.02  # cosine of α below which a goal is abeam: wheels turn
 class PositionController:
     """Position controller of a robot of any kind."""
 
-    __slots__ = ("_drives", "_flies_to", "_response", "_speed", "_turn_rate", "_turn_response")
+    __slots__ = ("_drives", "_flies", "_flies_to", "_response", "_speed", "_steering", "_turn_rate", "_turn_response")
 
     _flies_to: bool  # its body takes positions, and closes in on them by itself
     _drives: bool  # its body takes twists; one that takes neither takes velocities
+    _flies: bool
+    _steering: Steering  # of a kind that takes twists
     _response: float  # of its kind [1/s], and likewise
     _turn_response: float  # [1/s]
     _speed: float  # [m/s]
@@ -33,6 +35,7 @@ class PositionController:
 
     def __init__(self, kind: Kind) -> None:
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
+        self._flies, self._steering = kind.flies, kind.steering or TwoWheels()
         self._response, self._turn_response = kind.response, kind.turn_response
         self._speed, self._turn_rate = kind.speed, kind.turn_rate
 
@@ -47,14 +50,16 @@ class PositionController:
         here_x, here_y, here_z = position
         response, speed = self._response, self._speed
         if self._drives:
-            v, omega = drive(
+            v, omega = self._steering.twist(
                 x - here_x, y - here_y, yaw, goal_yaw, response, self._turn_response, speed, self._turn_rate
             )
             return v, omega, 0.0, 0.0
         turn = 0.0 if isnan(goal_yaw) else self._turn_response * wrap(goal_yaw - yaw)
         if isnan(turn):
             turn = 0.0
-        vx, vy, vz = response * (x - here_x), response * (y - here_y), response * (z - here_z)
+        vx, vy, vz = response * (x - here_x), response * (y - here_y), 0.0
+        if self._flies:
+            vz = response * (z - here_z)
         if -speed <= vx <= speed and -speed <= vy <= speed and -speed <= vz <= speed:
             return vx, vy, vz, turn
         return clamp(vx, -speed, speed), clamp(vy, -speed, speed), clamp(vz, -speed, speed), turn
@@ -146,3 +151,20 @@ def drive(  # noqa: PLR0917 - numbers alone, as the textbook has them
     elif omega < -turn_rate:
         omega = -turn_rate
     return -v if backward else v, omega
+
+
+class TwoWheels(Steering, frozen=True):
+    """Steering of a robot that turns on the spot: `drive`."""
+
+    def twist(  # noqa: PLR0917 - as its base
+        self,
+        x: float,
+        y: float,
+        yaw: float,
+        goal_yaw: float,
+        response: float,
+        turn_response: float,
+        speed: float,
+        turn_rate: float,
+    ) -> tuple[float, float]:
+        return drive(x, y, yaw, goal_yaw, response, turn_response, speed, turn_rate)

@@ -26,8 +26,8 @@ class SetpointFilter:
     """Filter for the setpoints of a robot."""
 
     __slots__ = (
-        "_closes_s", "_cut_outside", "_drives", "_far", "_flies_to", "_high", "_low", "_own_silence_s",
-        "_speed", "_step", "_turn_rate", "_walls_high", "_walls_low", "avoided", "changed", "not_finite",
+        "_closes_s", "_cut_outside", "_drives", "_far", "_flies_to", "_high", "_low", "_own_silence_s", "_speed",
+        "_step", "_turn_radius", "_turn_rate", "_walls_high", "_walls_low", "avoided", "changed", "not_finite",
     )  # fmt: skip
 
     changed: bool  # the last setpoint differs from the decided one
@@ -43,6 +43,7 @@ class SetpointFilter:
     _own_silence_s: float  # [s] of the limits
     _speed: float  # [m/s]
     _turn_rate: float  # [rad/s]
+    _turn_radius: float  # smallest [m]; 0: it turns on the spot
     _closes_s: float  # time in which the body closes a position error [s]: it goes as fast as its goal is far
     _far: float  # way that it can drive in that time, and as long as a pose is valid [m]
     _step: float  # longest way to a goal [m]
@@ -50,6 +51,7 @@ class SetpointFilter:
     def __init__(self, kind: Kind, limits: Limits) -> None:
         self._flies_to, self._drives = kind.takes == "position", kind.takes == "twist"
         self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate
+        self._turn_radius = kind.turn_radius
         self._closes_s = 1.0 / kind.response
         self._far = self._speed * (self._closes_s + limits.own_silence_s)
         self._step = min(limits.goal_step, self._speed * self._closes_s)
@@ -123,6 +125,7 @@ class SetpointFilter:
             speed, turn, far = self._speed, self._turn_rate, self._far
             return (
                 -speed <= a <= speed and -turn <= b <= turn and c == 0.0 and d == 0.0
+                and abs(b) * self._turn_radius <= abs(a)
                 and low_x + far < x < high_x - far and low_y + far < y < high_y - far
             )  # fmt: skip
         if self._flies_to:
@@ -179,7 +182,7 @@ class SetpointFilter:
         )
 
     def _drive(self, twist: Setpoint, now: Situation) -> Setpoint:
-        """Twist within the limits, and not out of the arena, as `_slow`: turning on the spot is always allowed."""
+        """Twist within the limits, and not out of the arena, as `_slow`; one that can may always turn on the spot."""
         speed, turn = self._speed, self._turn_rate
         v, omega = clamp(twist[0], -speed, speed), clamp(twist[1], -turn, turn)
         (x, y, _), (low_x, low_y, _), (high_x, high_y, _) = now.position, self._low, self._high
@@ -195,6 +198,8 @@ class SetpointFilter:
             if abs(move_y) > most_y:
                 share = min(share, most_y / max(abs(move_y), ROUNDING))
             v *= share
+        if self._turn_radius > 0.0:
+            omega = clamp(omega, -abs(v) / self._turn_radius, abs(v) / self._turn_radius)
         return v, omega, twist[2], twist[3]
 
 

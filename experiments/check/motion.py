@@ -11,6 +11,7 @@ import numpy as np
 from agents.decision.position_control import REACHED
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
 from agents.plugins import registry
+from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
 from experiments.check import noise
@@ -324,6 +325,23 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
     if not problems and fastest is not None:
         asked = fastest[2].speed()
         yield Finding("note", "speeds", f"no plan asks for more than the robots have ({asked:.2g} m/s at most)")
+
+
+def turning(analysis: Analysis) -> Iterator[Finding]:
+    """Report robots that cannot turn on the spot and follow goals that a gradient law moves a little at a time."""
+    if not isinstance(analysis.law, Gradient):
+        return
+    rows = sorted(set(analysis.plan.links.receiver.tolist()))
+    wide = [row for row in rows if analysis.kinds[row].turn_radius > 0.0]
+    if wide:
+        names = [analysis.names[row] for row in wide]
+        radius = max(analysis.kinds[row].turn_radius for row in wide)
+        message = (
+            f"{join_names(names)} cannot turn on the spot (radius up to {radius:g} m), and the goals of a gradient law "
+            "are nearer: shuffling"
+        )
+        remedy = "lead by a plan, or choose a law that gives velocities, or another kind"
+        yield Finding("warning", "turning-circle", message, remedy, ("robots", names[0], "kind"))
 
 
 def rates(analysis: Analysis) -> Iterator[Finding]:

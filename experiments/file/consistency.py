@@ -8,6 +8,7 @@ from typing import Final, cast
 
 import numpy as np
 
+from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.plugins import registry
 from agents.plugins.law import Law
@@ -20,6 +21,7 @@ from experiments.definition.links import FORM, held_height, link_pairs
 from experiments.file import consistency_network
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 from twins import scene as outlines
+from twins.engines.engine import require_carried
 from twins.engines.point_mass import TWINLESS, has_model
 from twins.scene import Scene
 from twins.sensing.range_sensors import SENSORS
@@ -196,6 +198,8 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
             yield Fault((*path, "body"), f"'{body}' drives a {driven.name}, and {name} is a {kind.name}", hint)
         elif body in ("twin", WORLD) and not has_model(kind):
             yield Fault((*path, "kind"), f"no twin of '{kind.name}'", TWINLESS)
+        elif body in ("twin", WORLD):
+            yield from _engine(experiment, path, kind)
         yield from _hover(experiment, path, robot, kind)
     for number, sensor in enumerate(robot.sensors or []):
         if sensor not in SENSORS:
@@ -208,6 +212,16 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
     if len(robot.start) == 3 and abs(robot.start[2]) > 2 * math.pi:
         radians = math.remainder(math.radians(robot.start[2]), 2 * math.pi)
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
+
+
+def _engine(experiment: Experiment, path: tuple[str, str], kind: Kind) -> Iterator[Fault]:
+    try:
+        require_carried(registry.load(registry.ENGINES, registry.split(experiment.world.engine)[0]), [kind])
+    except BodyError as error:
+        message, _, hint = str(error).partition(": ")
+        yield Fault((*path, "kind"), message, hint)
+    except registry.PluginError:  # the engine's own fault is told elsewhere
+        return
 
 
 def _known(name: str) -> Kind | None:

@@ -5,11 +5,11 @@ Engines are found by the entry-point group `zenpark.engines`: a frozen struct of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from agents.body.interface import NO_ATTITUDE, Attitude
+from agents.body.interface import NO_ATTITUDE, Attitude, BodyError
 from agents.body.kinds import Kind
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
 
@@ -174,9 +174,19 @@ class EngineFactory(Protocol):
     """Parameters of an engine.
 
     The class variable `contacts = True` declares that the engine detects contacts: a run without recorded contacts then
-    had none. For other engines contacts are computed from the recorded positions.
+    had none. For other engines contacts are computed from the recorded positions. An engine with the class variable
+    `carries`, motions of `agents.body.kinds`, carries these only.
     """
 
     def build(self, stage: Stage) -> Engine:
         """Build an engine; raises BodyError with the remedy if a kind has no twin, or a library is missing."""
         ...
+
+
+def require_carried(engine: type[EngineFactory], kinds: Iterable[Kind]) -> None:
+    """Raises BodyError for kinds whose motion an engine does not carry."""
+    carries: tuple[type, ...] = getattr(engine, "carries", (object,))
+    if refused := sorted({kind.name for kind in kinds if not isinstance(kind.motion, carries)}):
+        known = ", ".join(motion.__name__ for motion in carries)
+        which = ", ".join(map(repr, refused))
+        raise BodyError(f"{which} does not move in this engine, which carries {known} alone: choose point-mass")

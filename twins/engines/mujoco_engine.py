@@ -23,8 +23,7 @@ from twins.arrays import Array, Index, Mask, clamp, norm, some
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
 from twins.engines.engine import Mirrored, Planar, Pose, Stage, Touch
 from twins.engines.mujoco_model import mjcf
-from twins.engines.point_mass import Orders, require_models
-from twins.models.differential import Differential
+from twins.engines.point_mass import Moving, Orders, model, require_models
 from twins.models.onboard_flight import OnboardFlight
 from twins.models.quadrotor import GRAVITY
 from twins.scene import Scene
@@ -50,7 +49,7 @@ class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return RigidBodyEngine(stage, self.motor_lag_s)
 
 
-class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
+class RigidBodyEngine(Orders["Drone | Moving"]):
     """Implements `twins.engines.engine.Engine`; ground robots are those of the point-mass engine."""
 
     def __init__(self, stage: Stage, motor_lag: float) -> None:
@@ -59,7 +58,7 @@ class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
         self._dt, self._scene = stage.dt, stage.scene
         self._air = [row for row, kind in enumerate(stage.kinds) if kind.flies and not stage.mirrored[row]]
         self.drones = Drones([stage.kinds[row] for row in self._air], stage.dt, scene=stage.scene, motor_lag=motor_lag)
-        self.motions: list[Drone | Differential | Mirrored] = []
+        self.motions: list[Drone | Moving] = []
         for row, kind in enumerate(stage.kinds):
             start, yaw = stage.start[row], stage.yaw[row]
             if stage.mirrored[row]:
@@ -67,7 +66,7 @@ class RigidBodyEngine(Orders["Drone | Differential | Mirrored"]):
             elif kind.flies:
                 self.motions.append(self.drones.add(kind, start, yaw))
             else:
-                self.motions.append(Differential(kind, start, yaw))
+                self.motions.append(model(kind, start, yaw))
         self.obstacles: list[Pose] = stage.scene.start
         self._update_attitudes()
 

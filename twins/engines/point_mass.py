@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
 import msgspec
 
 from agents.body.interface import BodyError
-from agents.body.kinds import Flight, Kind, Wheels
+from agents.body.kinds import Flight, Holonomic, Kind, Steered, Wheels
+from agents.plugins import registry
 from agents.vectors import Setpoint, Vector
 from twins.engines.engine import Mirrored, Motion, Planar, Pose, Stage, Touch
 from twins.models.differential import Differential
+from twins.models.ground import Bicycle, Ground, Omni
 from twins.models.quadrotor import Quadrotor
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
     from twins.scene import Scene
 
-Moving = Quadrotor | Differential | Mirrored
+Moving = Quadrotor | Differential | Ground | Mirrored
 
 
 class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -32,9 +34,21 @@ class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 TWINLESS: Final = "give the kind a `motion` (docs/plugins.md), or name another body"  # if `has_model` is false
 
 
+MODELS: Final[dict[type, type[Quadrotor | Differential | Ground]]] = {
+    Flight: Quadrotor,
+    Wheels: Differential,
+    Holonomic: Omni,
+    Steered: Bicycle,
+}
+SETPOINTS: Final = {Flight: ("position", "velocity"), Wheels: "twist", Holonomic: "velocity", Steered: "twist"}
+
+
 def has_model(kind: Kind) -> bool:
-    """Whether a model moves as the kind: a quadrotor flies, a differential drive takes a twist on the floor."""
-    return isinstance(kind.motion, Flight if kind.flies else Wheels) and kind.flies == (kind.takes != "twist")
+    """Whether a model moves as the kind, by the setpoints that it takes."""
+    motion = kind.motion
+    if motion is None or isinstance(motion, str):
+        return motion is not None
+    return kind.flies == isinstance(motion, Flight) and kind.takes in SETPOINTS[type(motion)]
 
 
 def require_models(kinds: Iterable[Kind]) -> None:
@@ -43,9 +57,14 @@ def require_models(kinds: Iterable[Kind]) -> None:
         raise BodyError(f"no twin of {', '.join(map(repr, unknown))}; {TWINLESS}")
 
 
-def model(kind: Kind, start: Vector, yaw: float) -> Quadrotor | Differential:
-    """Motion model of a robot at rest at `start` [m], `yaw` [rad]."""
-    return Quadrotor(kind, start, yaw) if kind.flies else Differential(kind, start, yaw)
+def model(kind: Kind, start: Vector, yaw: float) -> Quadrotor | Differential | Ground:
+    """Motion model of a robot at rest at `start` [m], `yaw` [rad]; raises PluginError if its kind names none."""
+    motion = kind.motion
+    assert motion is not None
+    if isinstance(motion, str):
+        made: Ground = registry.find(motion, f"motion of the kind {kind.name!r}")(kind, start, yaw)
+        return made
+    return MODELS[type(motion)](kind, start, yaw)
 
 
 def moving_models(stage: Stage) -> list[Moving]:

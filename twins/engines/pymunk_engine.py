@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Final
@@ -11,11 +12,11 @@ import pymunk
 import pymunk.batch
 from msgspec import Meta
 
-from agents.body.kinds import Kind
+from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
-from twins.engines.engine import Mirrored, Pose, Stage, Touch
+from twins.engines.engine import Mirrored, Pose, Stage, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
-from twins.engines.point_mass import Moving, Orders, moving_models
+from twins.engines.point_mass import Moving, Orders, moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
 from twins.engines.pymunk_space import Place, Surfaces
 from twins.models.differential import Differential
@@ -54,6 +55,7 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
 
     contacts: ClassVar[bool] = True
+    carries: ClassVar[tuple[type, ...]] = (Wheels, Flight)
 
     def build(self, stage: Stage) -> PlanarEngine:
         return PlanarEngine(stage, self)
@@ -69,7 +71,9 @@ class PlanarEngine(Orders[Moving]):
     """
 
     def __init__(self, stage: Stage, choice: Planar) -> None:
-        """Raises BodyError for a kind without a twin."""
+        """Raises BodyError for a kind without a twin, or with a motion that is not carried."""
+        require_models(stage.kinds)
+        require_carried(Planar, itertools.compress(stage.kinds, (not each for each in stage.mirrored)))
         self.motions = moving_models(stage)
         self._dt, self.steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
         self._step = stage.dt / self.steps
@@ -112,7 +116,7 @@ class PlanarEngine(Orders[Moving]):
                 self._push_flying(row, robot, motion, wobble[row])
             elif isinstance(motion, Differential):
                 robot.drive(motion, dt)
-            else:
+            elif isinstance(motion, Mirrored):
                 self._show_mirrored(row, robot, motion)
         if self._planned:
             self._move_planned(t)

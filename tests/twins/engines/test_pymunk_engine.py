@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from agents.body.interface import BodyError
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
+from agents.kinds.omni import OMNI
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.plugins import registry
@@ -280,7 +281,12 @@ def test_placed_robot_is_at_rest():
 
 def test_kind_without_twin_is_refused():
     with pytest.raises(BodyError, match="no twin of 'hovercraft'"):
-        Planar().build(stage([replace(KHEPERA4, name="hovercraft")], [[0, 0]]))
+        Planar().build(stage([replace(KHEPERA4, name="hovercraft", motion=None)], [[0, 0]]))
+
+
+def test_kind_with_another_motion_is_refused():
+    with pytest.raises(BodyError, match="'omni' does not move in this engine, which carries Wheels, Flight"):
+        Planar().build(stage([OMNI], [[0, 0]]))
 
 
 def test_engine_has_a_name_and_checked_parameters():
