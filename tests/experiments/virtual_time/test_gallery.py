@@ -73,6 +73,22 @@ def test_followers_go_into_the_hull_of_their_leaders():
         assert place == pytest.approx((1.0 - share) * first + share * second, abs=0.02)
 
 
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("share", [0.6, 1.0, 1.2])
+def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
+    angle, gain, half = share * np.pi / 6.0, 0.3, np.pi / 6.0
+    known = trace("cyclic-pursuit", case, f"formation.law.angle={angle:.5f}", "duration_s=10")
+    place = known.true_position[..., 0] + 1j * known.true_position[..., 1]
+    mean = place.mean(axis=1)
+    assert np.abs(mean - mean[0]).max() < 0.01
+    late = known.time > 2.0
+    turning = (place * np.exp(-2j * half * np.arange(6))).mean(axis=1)[late]  # the slowest motion of six
+    rate = np.polyfit(known.time[late], np.log(np.abs(turning)), 1)[0]
+    assert rate == pytest.approx(2.0 * gain * np.sin(half) * np.sin(angle - half), abs=0.008)
+    speed = np.polyfit(known.time[late], np.unwrap(np.angle(turning)), 1)[0]
+    assert speed == pytest.approx(2.0 * gain * np.sin(half) * np.cos(angle - half), rel=0.03)
+
+
 def test_the_same_twice_and_another_seed_elsewhere():
     experiment = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
     first, again, other = (simulate(experiment, seed) for seed in (1, 1, 2))
