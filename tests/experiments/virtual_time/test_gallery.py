@@ -89,6 +89,29 @@ def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
     assert speed == pytest.approx(2.0 * gain * np.sin(half) * np.cos(angle - half), rel=0.03)
 
 
+LAG_SHAPE = np.array([[0.0, 0.0], [-0.5, 0.5], [-0.5, -0.5], [-1.0, 0.0], [-1.0, -0.7]])
+
+
+def lag(known):
+    """Distance of each robot from its place behind the leader [m], with a row for each time."""
+    place = known.true_position[..., :2] - LAG_SHAPE
+    return np.linalg.norm(place - place[:, :1], axis=2)
+
+
+@pytest.mark.parametrize(("case", "most"), [("periodic", 0.001), ("event", 0.005), ("event-loss", 0.008)])
+def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
+    known = trace("leader-observer", case)
+    window = (known.time > 20.0) & (known.time < 38.0)
+    assert np.abs(known.memory["v"][window] - [0.12, 0.0]).max() < 1e-3
+    assert lag(known)[window].max() < most
+    assert lag(known)[0].max() > 0.2
+
+
+def test_followers_that_do_not_know_the_velocity_lag_by_speed_over_gain():
+    known = trace("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
+    assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
+
+
 def test_the_same_twice_and_another_seed_elsewhere():
     experiment = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
     first, again, other = (simulate(experiment, seed) for seed in (1, 1, 2))
