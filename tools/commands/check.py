@@ -446,8 +446,6 @@ def import_(
 def list_(as_json: AsJson = False) -> None:
     """List the ready-made experiments and the plugins."""
     from agents.plugins import registry
-    from experiments.file import json_schema
-    from experiments.metrics.metric import known_metrics, unusable_metrics
 
     plugins = {
         "Kinds of robots": registry.ROBOTS,
@@ -459,10 +457,15 @@ def list_(as_json: AsJson = False) -> None:
         "Planners": registry.PLANNERS,
         "Avoidances": registry.AVOIDANCES,
         "Engines": registry.ENGINES,
+        "Added metrics": registry.METRICS,
     }
-    warn([*json_schema.unusable(), *unusable_metrics()])
+    if registry.distributions():  # others' plug-ins may be unusable; to find out takes numpy, half a second
+        from experiments.file import json_schema
+        from experiments.metrics.metric import unusable_metrics
+
+        warn([*json_schema.unusable(), *unusable_metrics()])
     experiments = index.titles()
-    found = {title: registry.names(group) for title, group in plugins.items()} | {"Metrics": [*known_metrics()]}
+    found = {title: registry.names(group) for title, group in plugins.items()}
     width = max(len(name) for name in experiments)
     print_result(
         {"experiments": [{"name": name, "title": title} for name, title in experiments.items()]}
