@@ -410,6 +410,8 @@ class Robot:
         def words(cause: Cause) -> str:
             if cause is Cause.BELOW:
                 return self.landing.robot_below()
+            if cause is Cause.SETPOINT and self._stepping is not None and not self._stepping.sound:
+                return f"the law {type(self.assignment.law).__name__} decides what is not finite"
             return self._detector.words(cause, now, status, self.neighbours, self.health)
 
         serious = self.hazards.update(now.t, self.causes, words, active=life.active, landing=life.phase == LANDING)

@@ -145,6 +145,7 @@ def test_velocity_that_is_not_finite_holds_and_lands():
     assert bench.life.phase == RUNNING
     bench.step(0.5, hear)
     assert bench.robot.setpoint == (0.0, 0.0, 0.0, 0.0)
+    assert any("the law Lost decides what is not finite" in each.text for each in bench.robot.hazards.incidents)
     bench.step(30.0, hear)
     assert bench.life.phase >= LANDING
 
