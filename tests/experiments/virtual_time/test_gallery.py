@@ -5,6 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from agents.plugins.gallery.coverage import Coverage
+from agents.plugins.law import NeighbourView, RobotFacts, View
+from agents.vectors import ZERO
 from experiments.catalogue import index
 from experiments.file import document
 from experiments.recording import playback
@@ -110,6 +113,45 @@ def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
 def test_followers_that_do_not_know_the_velocity_lag_by_speed_over_gain():
     known = trace("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
     assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
+    known = trace("coverage", case)
+    edge = np.linspace(-1.79, 1.79, 180)
+    spots = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
+    weight = 1.0 + 8.0 * np.exp(-((spots - 0.8) ** 2).sum(axis=1) / (2.0 * 0.5**2))
+    weight *= (edge[1] - edge[0]) ** 2
+
+    def squares(places):
+        return ((spots[:, None] - places) ** 2).sum(axis=2)
+
+    ways = known.true_position[::25, :, :2]
+    costs = np.array([squares(places).min(axis=1) @ weight for places in ways])
+    assert np.diff(costs).max() < 0.005
+    assert costs[-1] < 0.15 * costs[0]
+    assert known.measures["cost"][-1].sum() == pytest.approx(costs[-1], rel=0.02)
+    owner = squares(ways[-1]).argmin(axis=1)
+    for robot, place in enumerate(ways[-1]):
+        cell = owner == robot
+        assert weight[cell] @ spots[cell] / weight[cell].sum() == pytest.approx(place, abs=0.03)
+
+
+def test_cells_share_the_area_and_make_up_for_a_lost_robot():
+    law, places = Coverage(), {"A": (-1.0, 0.5), "B": (0.3, -1.2), "C": (0.8, 0.9), "D": (0.1, 0.2)}
+    for names in ("ABCD", "ABC", "A"):
+        total = 0.0
+        for own in names:
+            others = [NeighbourView(0, n, (*places[n], 0.0), ZERO, 0.0, 0.0, {}, None) for n in names if n != own]
+            view = View(RobotFacts(own, 0, 4, False, 1.0, 0.1), {}, others)
+            view.position = (*places[own], 0.0)
+            total += law.step(view, {}).measures["mass"]
+        assert total == pytest.approx(16.0)
+
+
+def test_an_area_that_is_not_convex_is_refused():
+    with pytest.raises(ValueError, match="convex"):
+        Coverage(area=[(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
 
 
 def test_the_same_twice_and_another_seed_elsewhere():
