@@ -163,6 +163,29 @@ class Kind:
             raise ValueError(f"the kind {self.name!r} drives: let it take velocities or twists")
 
 
+class Figures(msgspec.Struct, frozen=True):
+    """Figures of a kind, with which a recording is shown and measured where the kind is not installed."""
+
+    name: str
+    takes: Takes
+    flies: bool
+    radius: float
+    height: float
+    mass: float
+    endurance_s: float
+    speed: float
+    turn_rate: float
+    response: float
+    turn_response: float
+    lag: float
+    turn_radius: float
+    colour: str
+
+    @classmethod
+    def of(cls, kind: Kind) -> Figures:
+        return cls(**{name: getattr(kind, name) for name in cls.__struct_fields__})
+
+
 class Kinds(Mapping[str, Kind]):
     """Kinds of robots by name; each is loaded when it is asked for."""
 
@@ -194,6 +217,11 @@ class Kinds(Mapping[str, Kind]):
 
     def __len__(self) -> int:
         return len(list(iter(self)))
+
+    def remember(self, figures: Figures) -> None:
+        """Know a kind that is not installed by its figures, without a twin; raises ValueError for absurd ones."""
+        if figures.name not in {kind.name for kind in self.usable()}:
+            self.loaded[figures.name] = Kind(**msgspec.structs.asdict(figures))
 
     def usable(self) -> list[Kind]:
         """Those that can be used."""

@@ -87,6 +87,11 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
         raise PluginError(f"{_origin(entry)} fails to import: {type(error).__name__}: {error}") from error
 
 
+def module(group: str, name: str) -> str:
+    """Name of the module in which a plug-in that was loaded stands; raises KeyError for one that is not registered."""
+    return _registered(group)[name][0].module
+
+
 def unusable(use: Callable[[str, str], object]) -> list[str]:
     """Why what a file may name cannot be used: a line for each plug-in that `use(group, name)` refuses."""
     lines = []

@@ -6,6 +6,7 @@ the same annotations and lets msgspec judge one value at a time, so that everyth
 
 from __future__ import annotations
 
+import importlib
 import math
 import pathlib
 import re
@@ -17,6 +18,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 
+from agents.body.kinds import KINDS
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
@@ -82,9 +84,16 @@ def group_of(path: Path) -> str | None:
 
 
 def plugin_files(experiment: Experiment) -> set[pathlib.Path]:
-    """Modules of the plug-ins that an experiment chooses; other modules that they import are not among them."""
+    """Modules of the plug-ins and kinds that an experiment chooses; what those import is not among them."""
     chosen = _choices(msgspec.to_builtins(experiment), ())
-    return {pathlib.Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen}
+    kinds = {KINDS[robot.kind] for robot in (*experiment.robots.values(), *experiment.spares.values())}
+    modules = {registry.module(registry.ROBOTS, kind.name) for kind in kinds}
+    modules |= {kind.motion.partition(":")[0] for kind in kinds if isinstance(kind.motion, str)}
+    modules |= {type(kind.steering).__module__ for kind in kinds if kind.steering is not None}
+    files = {pathlib.Path(getfile(importlib.import_module(name))) for name in modules}
+    return files | {
+        pathlib.Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen
+    }
 
 
 def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document

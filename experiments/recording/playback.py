@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from agents.body.kinds import KINDS, Figures
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, Memory, State, Status, Variable, WorldState
 from agents.network.validation import ABSURD, FUTURE_S, is_count
@@ -35,7 +36,7 @@ from experiments.recording.losses import (
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.resample import HOLE_S, attitude, line, step, turn
 from experiments.recording.ros2.cdr import Undecodable, codec
-from experiments.recording.topics import JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
+from experiments.recording.topics import JSON, KINDS_JSON, METADATA, TOPICS, SentGoal, SentPose, SpokenPose, Topic
 from experiments.recording.trace import (
     ROUNDING_S,
     Goals,
@@ -96,8 +97,11 @@ class AboutRun:
         """Content of `records`, whose messages were read."""
         about = next((record.metadata for record in records.metadata if record.name == METADATA), {})
         attached = next((record.data for record in records.attachments if record.name == JSON), b"")
+        kinds = next((record.data for record in records.attachments if record.name == KINDS_JSON), b"[]")
         try:
             announced = float(about["started"]) if "started" in about else None
+            for each in msgspec.json.decode(kinds, type=list[Figures]):
+                KINDS.remember(each)
             experiment = msgspec.json.decode(attached, type=Experiment)
             _ = Plan(experiment).one_way_links  # names of robots are not in the types
             return cls(about["case"], int(about["seed"]), about["clock"], announced, experiment)

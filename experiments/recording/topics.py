@@ -5,7 +5,8 @@ types that every viewer draws: `/<robot>/true_pose` (geometry_msgs/PoseStamped),
 frame `map` to a frame of each robot's name) and `/scene` (visualization_msgs/MarkerArray: arena, obstacles, robots,
 links in the colours of their errors).
 
-Attached are the experiment as it was written (`experiment.toml`) and this case with its overrides (`experiment.json`);
+Attached are the experiment as it was written (`experiment.toml`), this case with its overrides (`experiment.json`), and
+the figures of its kinds of robots (`kinds.json`), for readers without them;
 the metadata record `zenpark` has case, seed, clock, and the code, versions and machine that made it.
 """
 
@@ -35,6 +36,7 @@ from agents.network.messages import (
 
 TOML: Final = "experiment.toml"
 JSON: Final = "experiment.json"
+KINDS_JSON: Final = "kinds.json"
 METADATA: Final = "zenpark"
 CHUNK_BYTES: Final = 32 * 1024  # lost at most by a kill: a third of a second of seven robots
 DEPTH: Final = 20_000  # samples that may wait while the disk does

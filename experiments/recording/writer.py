@@ -17,6 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, MessageIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
+from agents.body.kinds import KINDS, Figures
 from agents.network.messages import BarePose, Event, Pose, State, Vector
 from experiments.definition.experiment import Experiment
 from experiments.recording import version
@@ -24,7 +25,7 @@ from experiments.recording.reader import RecordingError
 from experiments.recording.ros2 import viewers
 from experiments.recording.ros2.cdr import Unencodable, codec
 from experiments.recording.ros2.viewers import Draw
-from experiments.recording.topics import CHUNK_BYTES, JSON, METADATA, SPOKEN, TOML, TOPICS, Message
+from experiments.recording.topics import CHUNK_BYTES, JSON, KINDS_JSON, METADATA, SPOKEN, TOML, TOPICS, Message
 
 BLOCK_BYTES: Final = 1024 * 1024
 INDICES: Final = "_Writer__chunk_indices"  # as of mcap 1.6; the library has no public place for it
@@ -272,6 +273,9 @@ class Recording:
         self._writer.start(profile="ros2", library="zenpark")
         self._writer.add_attachment(0, 0, TOML, "application/toml", document.encode())
         self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))
+        names = sorted({robot.kind for robot in (*experiment.robots.values(), *experiment.spares.values())})
+        figures = [Figures.of(KINDS[name]) for name in names if name in KINDS]
+        self._writer.add_attachment(0, 0, KINDS_JSON, "application/json", msgspec.json.encode(figures))
         self._writer.add_metadata(METADATA, about)
 
     def _record(self, topic: _Written, message: Message, entry: object, logged: float) -> bool:

@@ -35,7 +35,7 @@ REGISTERED = re.findall(
 
 
 def source_of(name):
-    (source,) = [block for block in BLOCKS if f"class {name}" in block]
+    (source,) = [block for block in BLOCKS if f"class {name}" in block or f"\n{name} = " in block]
     return source
 
 
@@ -75,7 +75,7 @@ def zenpark(folder, *arguments):
 def test_every_group_has_an_example():
     assert {group for _, _, _, group in REGISTERED} | {"zenpark.laws"} == {
         *("zenpark.triggers", "zenpark.predictors", "zenpark.laws", "zenpark.planners"),
-        *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies"),
+        *("zenpark.avoidances", "zenpark.engines", "zenpark.bodies", "zenpark.kinds"),
     }
 
 
@@ -154,6 +154,43 @@ def rovers(*addresses):
         yaw=(0.0,) * count,
     )
     return names["Rovers"](request)
+
+
+@pytest.mark.slow
+def test_kind_of_the_docs_is_known_everywhere(installed, tmp_path):
+    assert re.search(r"Kinds of robots: .*\bhovercraft\b", zenpark(installed, "list").stdout)
+    assert "0.8 kg" in zenpark(installed, "explain", "hovercraft").stdout
+    assert '"hovercraft"' in zenpark(installed, "schema").stdout
+    words = ["triangle", "--set", "robots.KH01.kind=hovercraft", "--set", "duration_s=8"]
+    assert zenpark(installed, "check", *words).returncode == 0
+    refused = zenpark(installed, "check", *words, "--set", "world.engine=pymunk")
+    assert "'hovercraft' does not move in this engine" in refused.stderr + refused.stdout
+    run = zenpark(installed, "run", *words, "--virtual", "--no-report", "--out", str(tmp_path / "run"))
+    assert run.returncode == 0, run.stderr
+    uninstalled = installed.parent / "none"
+    uninstalled.mkdir()
+    assert "hovercraft" not in zenpark(uninstalled, "list").stdout
+    report = zenpark(uninstalled, "report", str(tmp_path / "run"))
+    assert report.returncode == 0, report.stderr
+    unknown = zenpark(uninstalled, "check", *words)
+    assert "no 'hovercraft' among the kinds of robots" in unknown.stderr + unknown.stdout
+
+
+@pytest.mark.slow
+def test_broken_kind_is_left_out(tmp_path):
+    """It spoils neither the help nor experiments without it."""
+    about = tmp_path / "broken-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[zenpark.kinds]\nwreck = wrecks:WRECK\n")
+    (tmp_path / "wrecks.py").write_text("raise LookupError('on purpose')\n")
+    assert zenpark(tmp_path, "--help").returncode == 0
+    listed = zenpark(tmp_path, "list")
+    assert listed.returncode == 0
+    assert re.search(r"left out: .*wreck.*on purpose", listed.stderr)
+    assert zenpark(tmp_path, "check", "triangle").returncode == 0
+    refused = zenpark(tmp_path, "check", "triangle", "--set", "robots.KH01.kind=wreck")
+    assert "the kind 'wreck' cannot be used" in refused.stderr + refused.stdout
 
 
 def test_body_of_the_docs_drives_over_udp(rover):
