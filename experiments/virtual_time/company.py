@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 from array import array
-from typing import ClassVar, Final
+from typing import Final
 
 from agents.decision.neighbours import Neighbour
 from agents.network.channel_model import ROUNDING_S
 from agents.plugins.planners import NO_TARGET
 from agents.robot import Robot
-from agents.vectors import UNKNOWN, Pose, Vector
+from agents.vectors import Pose, Vector
 from twins.body import Twin
 
 WIDTH: Final = 19  # numbers of a robot in a sample
@@ -28,38 +28,38 @@ AT_END, AT_PHASES, AT_HAZARDS = 0, 1, 2
 class Way:
     """Link of constant delay, with the samples that are on it."""
 
-    __slots__ = (
-        "arrivals", "delay", "first", "neighbour", "next", "positions", "seqs", "size", "stamps", "velocities", "yaws",
-    )  # fmt: skip
+    __slots__ = ("delay", "first", "neighbour", "next", "samples", "size")
 
     neighbour: Neighbour  # the sender, as the receiver knows it
     delay: float  # [s]
     size: int  # samples for which there is room, and one more
     first: int  # index of the first sample
     next: int  # index behind the last one
+    samples: array[float]  # time of arrival [s], number, stamp [s], position [m], velocity [m/s] and yaw [rad] of each
 
     def __init__(self, neighbour: Neighbour, delay: float, size: int) -> None:
         self.neighbour, self.delay, self.size, self.first, self.next = neighbour, delay, size, 0, 0
-        self.arrivals, self.stamps, self.yaws = [0.0] * size, [0.0] * size, [0.0] * size
-        self.seqs = [0] * size
-        self.positions: list[Vector] = [UNKNOWN] * size
-        self.velocities: list[Vector] = [UNKNOWN] * size
+        self.samples = array("d", bytes(8 * SENT * size))
 
     def put(self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float) -> None:
         """A sample sets out."""
-        k = self.next
-        self.arrivals[k], self.stamps[k], self.seqs[k] = stamp + self.delay, stamp, seq
-        self.positions[k], self.velocities[k], self.yaws[k] = position, velocity, yaw
-        self.next = (k + 1) % self.size
+        k, samples = self.next * SENT, self.samples
+        samples[k], samples[k + 1], samples[k + 2] = stamp + self.delay, float(seq), stamp
+        samples[k + 3], samples[k + 4], samples[k + 5] = position
+        samples[k + 6], samples[k + 7], samples[k + 8] = velocity
+        samples[k + 9] = yaw
+        self.next = (self.next + 1) % self.size
 
     def deliver(self, t: float) -> None:
         """The receiver gets the samples that have arrived by `t` [s]."""
-        while self.first != self.next and self.arrivals[self.first] <= t + ROUNDING_S:
-            k, sender = self.first, self.neighbour
-            if self.stamps[k] > sender.stamp:
-                sender.position, sender.velocity = self.positions[k], self.velocities[k]
-                sender.stamp, sender.arrival, sender.yaw = self.stamps[k], self.arrivals[k], self.yaws[k]
-            self.first = (k + 1) % self.size
+        samples = self.samples
+        while self.first != self.next and samples[self.first * SENT] <= t + ROUNDING_S:
+            k, sender = self.first * SENT, self.neighbour
+            if samples[k + 2] > sender.stamp:
+                sender.position = samples[k + 3], samples[k + 4], samples[k + 5]
+                sender.velocity = samples[k + 6], samples[k + 7], samples[k + 8]
+                sender.stamp, sender.arrival, sender.yaw = samples[k + 2], samples[k], samples[k + 9]
+            self.first = (self.first + 1) % self.size
 
 
 class Member:
@@ -97,7 +97,6 @@ class Planned:
 class Ledger:
     """What a run notes."""
 
-    FIXED: ClassVar = ("lean",)
     __slots__ = ("count", "lean", "reason", "rows", "sample", "samples", "sent", "times")
 
     lean: bool  # of samples true positions alone

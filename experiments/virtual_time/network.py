@@ -276,8 +276,8 @@ class VirtualNetwork:
             robot, number = self.receivers[link]
             while way.first != way.next:
                 k, row = way.first, robot.neighbours.all[number].sender
-                sample = Sample(row, way.seqs[k], way.stamps[k], way.positions[k], way.velocities[k], way.yaws[k])
-                under_way.append((sample.stamp, row, link, sample))
+                _, seq, stamp, x, y, z, vx, vy, vz, yaw = way.samples[k * SENT : (k + 1) * SENT]
+                under_way.append((stamp, row, link, Sample(row, int(seq), stamp, (x, y, z), (vx, vy, vz), yaw)))
                 way.first = (k + 1) % way.size
         for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
@@ -292,10 +292,13 @@ class VirtualNetwork:
         first = np.array([_row(sample) for _, _, sample in before]).reshape(-1, SENT)
         links = [np.array([link for link, _, _ in before], dtype=float)]
         rows = [first]
+        by_row = sent[np.argsort(sent[:, 0], kind="stable")]
+        begins = np.searchsorted(by_row[:, 0], np.arange(len(self._robots) + 1)).tolist()
         for link, (robot, k) in enumerate(self.receivers):
-            mine = sent[sent[:, 0] == robot.neighbours.all[k].sender]
-            rows.append(mine)
-            links.append(np.full(len(mine), float(link)))
+            sender = robot.neighbours.all[k].sender
+            part = by_row[begins[sender] : begins[sender + 1]]
+            rows.append(part)
+            links.append(np.full(len(part), float(link)))
         every, on = np.concatenate(rows), np.concatenate(links)
         arrival = every[:, 2] + np.array(self.delays)[on.astype(np.intp)] if len(on) else np.zeros(0)
         order = np.lexsort((on, every[:, 0], every[:, 2], arrival))

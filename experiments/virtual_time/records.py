@@ -7,11 +7,12 @@ each. Which attributes a record has follows from the values that an object has; 
 from __future__ import annotations
 
 import hashlib
+import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from itertools import chain
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -39,10 +40,12 @@ class Layout:
     def __init__(self, owner: type, fields: dict[str, Any], fixed: dict[str, Any], name: str) -> None:
         """`fixed`: attributes that are constants, with their values; `name` tells layouts apart in any process."""
         self.owner, self.fields, self.fixed, self.name = owner, fields, fixed, name
+        self.frozen = is_frozen(owner)
         self.offset, words = dict[str, int](), 0
         for field, kind in fields.items():
             self.offset[field], words = words, words + width(kind)
         self.words = max(words, 1)
+        self.store, self.load = _storing(self), _loading(self)
 
     def __repr__(self) -> str:
         return self.name
@@ -86,15 +89,6 @@ class Layouts:
         """Look at all objects anew."""
         self._of.clear()
         self.guessed = False
-
-    def hold(self) -> bool:
-        """Whether all constant attributes of the objects are what they were."""
-        for thing, layout in self._of.values():
-            for name, value in () if layout is None else layout.fixed.items():
-                now = getattr(thing, name)
-                if now is not value and (value is None or now is None or now != value):
-                    return False
-        return True
 
     def kind(self, value: Any, where: tuple[type, str] | None = None) -> Any:
         """Kind of a value, None if it has no place in a record; `where`: class and name of the attribute."""
@@ -152,7 +146,7 @@ class Layouts:
             if kind is not None:
                 fields[name] = kind
             elif value is None or name in names or (isinstance(value, list | tuple) and not value):
-                fixed[name] = value
+                fixed[name] = value[:0] if isinstance(value, list) else value  # it may be filled later
         key = (owner, tuple(fields.items()), repr(fixed) if fixed else "")
         layout = LAYOUTS.get(key)
         if layout is None:
@@ -166,101 +160,162 @@ class Layouts:
 class Image:
     """Objects stored in memory, for as long as compiled functions work on them."""
 
-    def __init__(self, layouts: Layouts, roots: Sequence[tuple[Any, Any]]) -> None:
-        """Store `roots`, each with its kind, and all objects that they lead to."""
-        self._layouts = layouts
-        self._objects: dict[str, tuple[Layout, list[Any]]] = {}  # by layout
-        self._lists: list[tuple[Sequence[Any], Any]] = []
-        self._seen = set[int]()
-        for thing, kind in roots:
-            self._collect(thing, kind)
-        self._word: dict[int, int] = {}
-        word = 0
-        for layout, things in self._objects.values():
-            for thing in things:
-                self._word[id(thing)], word = word, word + layout.words
-        for items, kind in self._lists:
-            self._word[id(items)], word = word, word + len(items) * width(kind)
-        self.words = np.zeros(word + 1, dtype=np.int64)
-        self._floats = self.words.view(np.float64)
-        self._base = self.words.ctypes.data
-        self.store()
+    def __init__(self, roots: Sequence[tuple[Any, Any]], words: int = 1 << 12) -> None:
+        """Store `roots`, each with its kind, and all objects that they lead to.
+
+        Args:
+            words: About as many as they take.
+
+        Raises:
+            TypeError: If an object is not as its layout says.
+        """
+        self._roots, self._size = roots, words
+        while not self._store():
+            self._size *= 2
+
+    @property
+    def places(self) -> list[int]:
+        """Addresses of the roots, each with the number of objects there."""
+        return [number for thing, kind in self._roots for number in (self.address(thing), _count(thing, kind))]
 
     def address(self, thing: Any) -> int:
-        if isinstance(thing, array):
-            return thing.buffer_info()[0]
-        return int(self._base + WORD * self._word[id(thing)])
-
-    def _collect(self, thing: Any, kind: Any) -> None:
-        if id(thing) in self._seen or isinstance(thing, array):
-            return
-        self._seen.add(id(thing))
-        if isinstance(kind, Items):
-            self._lists.append((thing, kind.item))
-            if isinstance(kind.item, Layout | Items):
-                for each in thing:
-                    self._collect(each, kind.item)
-            return
-        self._objects.setdefault(kind.name, (kind, []))[1].append(thing)
-        for name, field in kind.fields.items():
-            if isinstance(field, Layout | Items):
-                self._collect(getattr(thing, name), field)
-
-    def store(self) -> None:
-        """Write the values of all objects."""
-        for layout, things in self._objects.values():
-            begin = self._word[id(things[0])]
-            for name, kind in layout.fields.items():
-                values = list(map(attrgetter(name), things))
-                try:
-                    self._write(values, kind, begin + layout.offset[name], layout.words)
-                except (KeyError, TypeError) as error:
-                    raise TypeError(f"{name} of {layout.owner.__name__} has changed its type: {error}") from error
-        for items, kind in self._lists:
-            if len(items):
-                self._write(items, kind, self._word[id(items)], width(kind))
-
-    def _write(self, values: Sequence[Any], kind: Any, begin: int, step: int) -> None:
-        """Write values of a kind, one for each `step` words."""
-        at = slice(begin, begin + step * len(values), step)
-        if kind == FLOAT:
-            self._floats[at] = values
-        elif isinstance(kind, Floats):
-            for k in range(kind.size):
-                self._floats[begin + k : begin + k + step * len(values) : step] = [value[k] for value in values]
-        elif isinstance(kind, Items):
-            self.words[at] = [self.address(value) for value in values]
-            self.words[begin + 1 : begin + 1 + step * len(values) : step] = [len(value) for value in values]
-        elif isinstance(kind, Layout):
-            self.words[at] = [self.address(value) for value in values]
-        else:
-            found = np.array(values)
-            if found.dtype.kind not in "ib":
-                raise TypeError(f"whole numbers or truths were expected, not {values[:3]}")
-            self.words[at] = found
+        return self._known[id(thing)]
 
     def load(self) -> None:
         """Read the values of all objects that can change back."""
-        for layout, things in self._objects.values():
-            if is_frozen(layout.owner):
-                continue
-            begin = self._word[id(things[0])]
-            for name, kind in layout.fields.items():
-                if not isinstance(kind, Layout | Items):
-                    values = self._read(len(things), kind, begin + layout.offset[name], layout.words)
-                    for thing, value in zip(things, values, strict=True):
-                        setattr(thing, name, value)
-        for items, kind in self._lists:
-            if isinstance(items, list) and not isinstance(kind, Layout | Items):
-                items[:] = self._read(len(items), kind, self._word[id(items)], width(kind))
+        memory = self.memory
+        for thing, layout, at in self._things:
+            layout.load(thing, memory, at)
+        for items, kind, at in self._lists:
+            items[:] = _items(memory, at, len(items), kind)
 
-    def _read(self, count: int, kind: Any, begin: int, step: int) -> list[Any]:
-        end = begin + step * count
-        if isinstance(kind, Floats):
-            columns = (self._floats[begin + k : end + k : step].tolist() for k in range(kind.size))
-            return list(zip(*columns, strict=True))
-        if kind == FLOAT:
-            found: list[Any] = self._floats[begin:end:step].tolist()
+    def _store(self) -> bool:
+        """Write the values of all objects; returns whether there is room for them."""
+        self.words = np.zeros(self._size, dtype=np.int64)
+        self.memory, self._base = self.words.data.cast("B"), self.words.ctypes.data
+        self._known: dict[int, int] = {}  # address by identity
+        self._things: list[tuple[Any, Layout, int]] = []
+        self._lists: list[tuple[list[Any], Any, int]] = []
+        self.used = 0
+        try:
+            for thing, kind in self._roots:
+                self.put_items(thing, kind) if isinstance(kind, Items) else self.put(thing, kind)
+        except _FullError:
+            return False
+        return True
+
+    def take(self, thing: Any, words: int) -> int:
+        """Room for an object of so many words: its place in the memory [bytes]."""
+        at, self.used = WORD * self.used, self.used + words
+        if self.used > self._size:
+            raise _FullError
+        self._known[id(thing)] = self._base + at
+        return at
+
+    def put(self, thing: Any, layout: Layout) -> int:
+        """Store an object, and what it leads to, unless it is there already; returns its address."""
+        found = self._known.get(id(thing))
+        if found is not None:
             return found
-        found = self.words[begin:end:step].tolist()
-        return [bool(value) for value in found] if kind == BOOL else found
+        at = self.take(thing, layout.words)
+        try:
+            layout.store(self, thing, at)
+        except (struct.error, AttributeError) as error:
+            raise TypeError(f"{layout.owner.__name__} has an attribute that has changed its type: {error}") from error
+        if not layout.frozen:
+            self._things.append((thing, layout, at))
+        return self._base + at
+
+    def put_items(self, items: Any, kind: Items) -> tuple[int, int]:
+        """Store a list unless it is there already; returns its address and its length."""
+        count, item = len(items), kind.item
+        if isinstance(items, array):
+            return items.buffer_info()[0], count
+        found = self._known.get(id(items))
+        if found is None:
+            at = self.take(items, count * width(item))
+            found = self._base + at
+            values: Iterable[Any] = items
+            if isinstance(item, Layout):
+                values = [self.put(each, item) for each in items]
+            elif isinstance(item, Items):
+                values = chain.from_iterable([self.put_items(each, item) for each in items])
+            else:
+                if isinstance(item, Floats):
+                    values = chain.from_iterable(items)
+                if isinstance(items, list):
+                    self._lists.append((items, item, at))
+            struct.pack_into(_format(item, count), self.memory, at, *values)
+        return found, count
+
+
+def _count(thing: Any, kind: Any) -> int:
+    return len(thing) if isinstance(kind, Items) else 1
+
+
+class _FullError(Exception):
+    """There is no room for an object."""
+
+
+def _format(kind: Any, count: int = 1) -> str:
+    """Format of `struct` of so many values of a kind."""
+    code = "d" if kind == FLOAT or isinstance(kind, Floats) else "q"
+    return f"{count * width(kind)}{code}"
+
+
+def _items(memory: memoryview, at: int, count: int, kind: Any) -> list[Any]:
+    """Numbers, truths or tuples of numbers of a list."""
+    values = struct.unpack_from(_format(kind, count), memory, at)
+    if isinstance(kind, Floats):
+        return list(zip(*[iter(values)] * kind.size, strict=True))
+    return [value != 0 for value in values] if kind == BOOL else list(values)
+
+
+def _storing(layout: Layout) -> Callable[[Image, Any, int], None]:
+    """Function that writes an object at a place of an image; raises TypeError for one of another layout."""
+    values, conditions, space = [], ["type(thing) is owner"], {"owner": layout.owner}
+    for name, kind in layout.fields.items():
+        space[f"kind_{name}"] = kind
+        if isinstance(kind, Layout):
+            values.append(f"image.put(thing.{name}, kind_{name})")
+        elif isinstance(kind, Items):
+            values.append(f"*image.put_items(thing.{name}, kind_{name})")
+        else:
+            values.append(f"*thing.{name}" if isinstance(kind, Floats) else f"thing.{name}")
+    for name, value in layout.fixed.items():
+        space[f"fixed_{name}"] = value
+        conditions.append(f"thing.{name} is None" if value is None else f"thing.{name} == fixed_{name}")
+    pack = struct.Struct("".join(map(_format, layout.fields.values()))).pack_into
+    source = f"""
+def store(image, thing, at):
+    if not ({" and ".join(conditions)}):
+        raise TypeError(f"{{type(thing).__name__}} is not as before")
+    pack({", ".join(["image.memory", "at", *values])})
+"""
+    return cast("Callable[[Image, Any, int], None]", _made(source, "store", pack=pack, **space))
+
+
+def _loading(layout: Layout) -> Callable[[Any, memoryview, int], None]:
+    """Function that reads the numbers of an object back from a place in the memory of an image."""
+    targets, statements, formats = list[str](), list[str](), list[str]()
+    for name, kind in layout.fields.items():
+        if isinstance(kind, Layout | Items):
+            formats.append(f"{WORD * width(kind)}x")
+            continue
+        formats.append(_format(kind))
+        if isinstance(kind, Floats):
+            parts = [f"new_{name}_{k}" for k in range(kind.size)]
+            targets += parts
+            statements.append(f"thing.{name} = ({', '.join(parts)},)")
+        else:
+            targets.append(f"new_{name}")
+            statements.append(f"thing.{name} = new_{name}" + " != 0" * (kind == BOOL))
+    unpack = struct.Struct("".join(formats)).unpack_from
+    got = f"({', '.join(targets)},) = unpack(memory, at)" if targets else "pass"
+    source = "\n    ".join(["def load(thing, memory, at):", got, *statements])
+    return cast("Callable[[Any, memoryview, int], None]", _made(source, "load", unpack=unpack))
+
+
+def _made(source: str, name: str, **space: Any) -> Any:
+    exec(source, space)
+    return space[name]

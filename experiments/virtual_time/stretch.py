@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from inspect import isfunction
@@ -20,6 +21,7 @@ from pathlib import Path
 from time import time
 from typing import Any, Final, Protocol
 
+import msgspec
 import numpy as np
 
 from agents.decision.lifecycle import READY
@@ -38,9 +40,11 @@ from twins.body import TwinBody
 TICK_S: Final = 15e-6  # of CPU for a tick of a robot in plain Python: 10 to 20 µs
 PAYS_S: Final = 1.0  # for less work in a process plain Python is quicker than to load numba and a loop (0.6 s),
 COMPILES_S: Final = 20.0  # or to compile (15 to 20 s), which is kept
-LONGEST: Final = 2000  # ticks of a stretch: noise is drawn for all of them beforehand
+LONGEST: Final = 10_000  # ticks of a stretch,
+ROBOT_TICKS: Final = 1_000_000  # and of all robots in it: noise is drawn, and room kept, for all of them beforehand
 LEAST: Final = 20  # after a stretch of fewer ticks
-PAUSE: Final = 100  # so many are flown in plain Python
+PAUSE: Final = 10  # so many are flown in plain Python, twice as many after the next one,
+LONGEST_PAUSE: Final = 160  # at most
 ROOM: Final = 2  # more samples on a link than its delay asks for
 STEPS: Final = ("advance", "deliver", "observe", "transmit", "detect", "pursue", "note")
 DRIVER: Final = """
@@ -76,6 +80,8 @@ WORK: Final = [0.0]  # seconds of plain Python that the flights of this process 
 COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")  # of a compiler's messages
 REFUSED: Final[dict[str, str]] = {}  # by driver, why it cannot be compiled
 DRIVERS: Final[dict[tuple[Any, ...], Any]] = {}  # compiled loops of this process; None: it cannot be compiled
+RECENT: Final[dict[bytes, Prepared]] = {}  # of cases that this process has flown; a few
+MOST: Final = 8  # of those
 STEADY: Final = frozenset({"numpy", "msgspec"})  # of others, but no plug-ins
 
 
@@ -115,13 +121,24 @@ def stretches_of(flight: Flown) -> Stretches | None:
     return Stretches(flight)
 
 
+@dataclass
+class Prepared:
+    """How the robots of a case are stored, and their compiled loop."""
+
+    rows: list[list[int]]  # of robots of the same layout
+    kinds: tuple[Items, ...]  # of each of those
+    of_ledger: Layout
+    run: Any
+    words: int = 1 << 12  # that all objects take
+
+
 class Stretches:
     """Compiled ticks of the robots of a flight."""
 
     flown: int  # ticks so far
 
     def __init__(self, flight: Flown) -> None:
-        self._flight, self._layouts = flight, Layouts()
+        self._flight, self._case = flight, msgspec.json.encode(flight.experiment)
         twins = flight.twin.twins
         self._members = [Member(row, *each) for row, each in enumerate(zip(flight.robots, twins, strict=True))]
         network, rates = flight.network, flight.experiment.rates
@@ -132,7 +149,7 @@ class Stretches:
             self._members[sender.sender].ways.append(way)
             self._ways.append(way)
         self._plans: dict[int, Planned] = {}
-        self._paused_until, self._refused, self.flown = 0, False, 0
+        self._paused_until, self._pause, self._refused, self._misfit, self.flown = 0, PAUSE, False, "", 0
 
     def fly(self, k: int, end: int) -> tuple[int, int]:
         """Fly the ticks from `k` on to before `end`; returns the tick at which the stretch ended, and why.
@@ -140,7 +157,8 @@ class Stretches:
         Of a tick that is half done the rest is left to the caller, see `Ledger.reason`.
         """
         flight = self._flight
-        end = min(end, k + LONGEST, self._next_leg())
+        longest = max(min(LONGEST, ROBOT_TICKS // len(flight.robots)), LEAST)
+        end = min(end, k + longest, self._next_leg())
         waits = any(robot.lifecycle.phase <= READY and not robot.lifecycle.climbing for robot in flight.robots)
         if self._refused or k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
             return k, AT_END
@@ -154,11 +172,12 @@ class Stretches:
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
-            self._paused_until = k + LONGEST
+            self._paused_until = end
             flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
             return k, AT_END
+        self._pause = PAUSE if last - k >= LEAST else min(2 * self._pause, LONGEST_PAUSE)
         if last - k < LEAST:
-            self._paused_until = last + PAUSE
+            self._paused_until = last + self._pause // 2
         self.flown += last - k
         done = last - 1 if ledger.reason == AT_END else last
         flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)
@@ -168,40 +187,60 @@ class Stretches:
 
     def _run(self, ledger: Ledger, k: int, end: int) -> int:
         """Run the compiled loop; returns the tick at which it ended, −1 without one."""
-        layouts, groups = self._layouts, dict[str, list[Member]]()
-        if not layouts.hold():
-            layouts.forget()
-        for member in self._members:
-            layouts.of(member)
-        if layouts.guessed:  # the kinds of lists that are empty for some robots are known now
-            layouts.forget()
-        for member in self._members:
-            groups.setdefault(str(layouts.of(member)), []).append(member)
-        kinds = tuple(Items(layouts.of(group[0])) for group in groups.values())
-        of_ledger = Layouts().of(ledger)
-        assert of_ledger is not None
+        flight = self._flight
         try:
-            run = driver(kinds, of_ledger)
+            prepared = RECENT.get(self._case)
+            image = None if prepared is None else self._image(prepared, ledger)
+            if prepared is None or image is None:
+                prepared = self._prepared(ledger)
+                if prepared is None:
+                    return -1
+                image = self._image(prepared, ledger)
         except LookupError:
             self._refused = True
             return -1
-        if run is None:
+        if image is None:
+            REFUSED[str(prepared.of_ledger)], self._refused = self._misfit, True
             return -1
-        flight = self._flight
-        try:
-            image = Image(layouts, [*zip(groups.values(), kinds, strict=True), (ledger, of_ledger)])
-        except TypeError as error:
-            REFUSED[str(of_ledger)], self._refused = str(error), True
-            return -1
-        numbers = [number for group in groups.values() for number in (image.address(group), len(group))]
         instant = flight.network.instant
         try:
-            found = run(*numbers, image.address(ledger), 1, k, end, flight.dt, flight.log_every, instant)
+            found = prepared.run(*image.places, k, end, flight.dt, flight.log_every, instant)
         except (ArithmeticError, LookupError, ValueError):  # of a plug-in: flown plain, the error tells where
             self._refused = True
             return -1
         image.load()
         return int(found)
+
+    def _image(self, prepared: Prepared, ledger: Ledger) -> Image | None:
+        """All objects in memory, None if they are not of these layouts."""
+        groups = [[self._members[row] for row in rows] for rows in prepared.rows]
+        try:
+            image = Image([*zip(groups, prepared.kinds, strict=True), (ledger, prepared.of_ledger)], prepared.words)
+        except TypeError as error:
+            self._misfit = str(error)
+            return None
+        prepared.words = image.used
+        return image
+
+    def _prepared(self, ledger: Ledger) -> Prepared | None:
+        """Layouts and compiled loop of these robots, None as long as that does not pay; raises LookupError if never."""
+        layouts, groups = Layouts(), dict[str, list[int]]()
+        for member in self._members:
+            layouts.of(member)
+        if layouts.guessed:  # the kinds of lists that are empty for some robots are known now
+            layouts.forget()
+        for member in self._members:
+            groups.setdefault(str(layouts.of(member)), []).append(member.row)
+        kinds = tuple(Items(layouts.of(self._members[rows[0]])) for rows in groups.values())
+        of_ledger = Layouts().of(ledger)
+        assert of_ledger is not None
+        run = driver(kinds, of_ledger)
+        if run is None:
+            return None
+        while len(RECENT) >= MOST:
+            del RECENT[next(iter(RECENT))]
+        RECENT[self._case] = made = Prepared([*groups.values()], kinds, of_ledger, run)
+        return made
 
     def _next_leg(self) -> int:
         """Tick on which the next leg of a plan begins, or a later one; those of a decision around it are plain."""
