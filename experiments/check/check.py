@@ -16,13 +16,14 @@ from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
 from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, Figures, Finding, first_of_each_code
-from experiments.check.ideal_run import predict
+from experiments.check.ideal_run import predict, ticking_plugins
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
 from experiments.definition.experiment import Experiment
 from experiments.definition.graph import edges
 from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
+from experiments.virtual_time.source import outside
 
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 
@@ -33,6 +34,13 @@ def chance(analysis: Analysis) -> Iterator[Finding]:
         message = "nothing in this file is random: runs of other seeds are the same"
         remedy = "add what nature adds, such as [disturbance.all] with position_sigma = 0.0005"
         yield Finding("warning", NOT_RANDOM, message, remedy, ("disturbance",))
+
+
+def compilation(analysis: Analysis) -> Iterator[Finding]:
+    """Say what a plug-in that cannot be compiled costs."""
+    for text in (text for plugin in ticking_plugins(analysis.plan) for text in outside(plugin)[:1]):
+        cost = "runs in virtual time and sweeps take 10 to 20 times as long as compiled ones"
+        yield Finding("note", "uncompiled", f"{text}, which is not compiled: {cost} (docs/plugins.md, the subset)")
 
 
 SUBJECTS: Final = (
@@ -54,7 +62,7 @@ SUBJECTS: Final = (
     safety.batteries,
     safety.libraries,
     safety.devices,
-    chance,
+    *(chance, compilation),
 )
 
 

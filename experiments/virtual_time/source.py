@@ -12,6 +12,8 @@ import inspect
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import cache
 from types import CodeType
 from typing import Any, Final
 
@@ -47,6 +49,27 @@ def faults(definition: ast.FunctionDef) -> Iterator[tuple[int, str]]:
                 yield getattr(node, "lineno", statement.lineno), found
 
 
+@cache
+def outside(owner: type) -> tuple[str, ...]:
+    """What the methods of a plug-in of others have that is outside of the subset, each with its place."""
+    found = []
+    for function in {name: getattr(owner, name, None) for name in dir(owner) if name != "__init__"}.values():
+        if inspect.isfunction(function) and is_foreign(function):
+            with suppress(OSError, SyntaxError):  # has no source; the compiler says so
+                definition = _definition(function)
+                name = function.__qualname__
+                found += [f"{place(function, line)}: {name} uses {fault}" for line, fault in faults(definition)]
+    return tuple(found)
+
+
+def _definition(function: Callable[..., Any]) -> ast.FunctionDef:
+    """A function in its source; raises SyntaxError or OSError for one without a source of its own."""
+    definition = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
+    if not isinstance(definition, ast.FunctionDef):
+        raise SyntaxError(f"{function.__qualname__} is no plain function")
+    return definition
+
+
 def _is_text(statement: ast.stmt) -> bool:
     return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
@@ -79,10 +102,8 @@ def specialised(function: Callable[..., Any], fixed: Mapping[str, Any]) -> tuple
     `fixed`: constant attributes of its first argument, with their values. Raises SyntaxError or OSError for a function
     without source of its own, or outside of the subset.
     """
-    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    definition = tree.body[0]
-    if not isinstance(definition, ast.FunctionDef):
-        raise SyntaxError(f"{function.__qualname__} is no plain function")
+    definition = _definition(function)
+    tree = ast.Module([definition], [])
     if is_foreign(function):
         tree = Powers().visit(tree)
     arguments = definition.args

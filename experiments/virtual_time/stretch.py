@@ -110,15 +110,20 @@ def stretches_of(flight: Flown) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
     ticks = flight.experiment.duration_s * flight.experiment.rates.body_hz
     WORK[0] += TICK_S * ticks * len(flight.robots)
-    if WORK[0] < PAYS_S or not flight.lonely or find_spec("numba") is None:
-        return None
+    return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight)
+
+
+def possible(flight: Flown) -> bool:
+    """Whether the robots of a flight can be flown by compiled functions, unless their compiler refuses a plug-in."""
+    if not flight.lonely or find_spec("numba") is None:
+        return False
     if any(robot.goals.changes_shape or robot.guidance is not None for robot in flight.robots):
-        return None
-    if flight.robots[0].stepping is not None:
-        law = flight.robots[0].assignment.law
-        REFUSED[type(law).__name__] = f"the law {type(law).__name__} remembers, in tables that are not compiled"
-        return None
-    return Stretches(flight)
+        return False
+    if flight.robots[0].stepping is None:
+        return True
+    law = flight.robots[0].assignment.law
+    REFUSED[type(law).__name__] = f"the law {type(law).__name__} remembers, in tables that are not compiled"
+    return False
 
 
 @dataclass

@@ -139,6 +139,23 @@ class Undefined(Steep, frozen=True):
         return ZERO if self.error(apart, link) > 1e-3 else UNKNOWN
 
 
+class Listing(Steep, frozen=True):
+    """A law that is not compiled."""
+
+    def error(self, apart, link):
+        return abs(link.distance - sum([each * each for each in apart]) ** 0.5)
+
+
+def test_a_law_that_is_not_compiled_is_noted_once(monkeypatch):
+    installed = registry._registered
+    mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:Listing", registry.LAWS)]}}
+    monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
+    found = [each for each in check(document.read(TRIANGLE, ["formation.law=mine"])) if each.code == "uncompiled"]
+    assert [each.severity for each in found] == ["note"]
+    assert "Listing.error uses" in found[0].message
+    assert "test_check.py:" in found[0].message
+
+
 @pytest.mark.parametrize(
     ("law", "code", "message", "remedy"),
     [

@@ -9,12 +9,13 @@ import pytest
 from agents.body.interface import Disturbance, Jitter
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.plugins.laws import Distance
+from experiments.check import ideal_run
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
 from experiments.file import document
 from experiments.sweep.runs import run_metrics
-from experiments.virtual_time import conductor, simulation
+from experiments.virtual_time import conductor, simulation, stretch
 from experiments.virtual_time.log import Logbook
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
 from twins.models.quadrotor import Quadrotor
@@ -71,7 +72,7 @@ def test_the_remedy_for_weak_links_names_the_key_that_the_law_goes_by(monkeypatc
     assert "(h·k·λ)" in found["stable"].message
 
 
-def test_prediction_is_a_flight_without_noise():
+def test_prediction_is_a_flight_without_noise(monkeypatch):
     park = document.read(PARK).cases()["event"]
     assert isolated(park).duration_s == 45.0
     flown = predict(park)
@@ -81,7 +82,20 @@ def test_prediction_is_a_flight_without_noise():
     assert not flown.incidents
     assert not flown.stuck
     many = msgspec.structs.replace(park, robots={f"R{k}": park.robots["KH01"] for k in range(1000)}, duration_s=600.0)
+    monkeypatch.setattr(ideal_run, "SPEED_UP", 1.0)
     assert isolated(many).duration_s == 2.0  # of many robots the beginning
+
+
+@pytest.mark.parametrize(("compiled", "flown_s"), [(False, 11.0), (True, 165.0)])
+def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
+    """Of two hundred robots."""
+    monkeypatch.setattr(stretch, "possible", lambda _: compiled)
+    park = document.read(PARK).cases()["event"]
+    formation = msgspec.structs.replace(park.formation, links={}, leader=None)
+    robots = {f"R{k}": park.robots["KH01"] for k in range(200)}
+    many = msgspec.structs.replace(park, robots=robots, formation=formation, timeline=[], duration_s=600.0)
+    assert isolated(many).duration_s == flown_s
+    assert isolated(msgspec.structs.replace(many, duration_s=30.0)).duration_s == 11.0  # to compile takes longer
 
 
 def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:

@@ -135,7 +135,7 @@ def test_legs_and_several_stretches(lean):
         Leg(at_s=11.3, robot="A", plan={"kind": "circle", "radius": 0.3, "period_s": 9.0}),
     ]
     _, ticks = same(pair(duration_s=25.0, timeline=legs), lean=lean)
-    assert ticks > stretch.LONGEST
+    assert ticks > 2000
 
 
 def test_hazard_in_mid_run():

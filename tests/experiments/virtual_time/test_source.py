@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from agents.plugins.laws import Distance
 from experiments.virtual_time import source
 from experiments.virtual_time.source import specialised
 
@@ -135,3 +136,8 @@ def test_strict_functions_are_those_of_python(name):
         if abs(x) > 2.0**62 and name in {"floor", "ceil", "int", "trunc", "round"}:
             continue  # it has no place in a word
         assert ours(x) == expected or (isnan(ours(x)) and isnan(expected))
+
+
+def test_faults_of_a_plugin_of_others():
+    assert [text.rpartition(" uses ")[2] for text in source.outside(Thing)].count("math.hypot") == 1
+    assert source.outside(Distance) == ()
