@@ -39,7 +39,7 @@ class Way:
 
     def __init__(self, neighbour: Neighbour, delay: float, size: int) -> None:
         self.neighbour, self.delay, self.size, self.first, self.next = neighbour, delay, size, 0, 0
-        self.samples = array("d", bytes(8 * SENT * size))
+        self.samples = array("d", (0.0,)) * (SENT * size)
 
     def put(self, seq: int, stamp: float, position: Vector, velocity: Vector, yaw: float) -> None:
         """A sample sets out."""
@@ -110,9 +110,9 @@ class Ledger:
 
     def __init__(self, rows: int, transmissions: int, samples: int, *, lean: bool) -> None:
         self.rows, self.lean, self.count, self.sample, self.reason = rows, lean, 0, 0, AT_END
-        self.times = array("d", bytes(8 * samples))
-        self.sent = array("d", bytes(8 * SENT * transmissions))
-        self.samples = array("d", bytes(8 * (LEAN if lean else WIDTH) * samples * rows))
+        self.times = array("d", (0.0,)) * samples
+        self.sent = array("d", (0.0,)) * (SENT * transmissions)
+        self.samples = array("d", (0.0,)) * ((LEAN if lean else WIDTH) * samples * rows)
 
     def note_sent(self, member: Member, t: float) -> None:
         robot, sent, k = member.robot, self.sent, self.count * SENT

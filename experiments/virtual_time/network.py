@@ -281,7 +281,7 @@ class VirtualNetwork:
                 way.first = (k + 1) % way.size
         for stamp, _, link, sample in sorted(under_way, key=itemgetter(0, 1, 2)):  # as they were sent
             self._channel.send(link, sample, sample.seq, stamp)
-        sent = np.array(ledger.sent[: ledger.count * SENT]).reshape(-1, SENT)
+        sent = np.frombuffer(ledger.sent)[: ledger.count * SENT].reshape(-1, SENT)
         sent = sent[np.lexsort((sent[:, 0], sent[:, 2]))]  # robots of a kind are flown together
         self._sent.extend(sent, sent[:, 2], sent[:, 0])
         if not self._lean:

@@ -238,13 +238,13 @@ class Flight:
         count, rows, columns = ledger.sample, len(self.robots), self._columns
         columns.setdefault("time", []).append(np.array(ledger.times[:count]))
         wide = LEAN if self.lean else WIDTH
-        numbers = np.array(ledger.samples[: count * rows * wide]).reshape(count, rows, wide)
+        numbers = np.frombuffer(ledger.samples)[: count * rows * wide].reshape(count, rows, wide)
         if self.lean:
-            columns.setdefault("true_position", []).append(numbers)
+            columns.setdefault("true_position", []).append(numbers.copy())
             return
         for what, (begin, end) in PLACES.items():
             column = numbers[:, :, begin] if end == begin + 1 else numbers[:, :, begin:end]
-            columns.setdefault(what, []).append(column)
+            columns.setdefault(what, []).append(column.copy())
         alike = {
             **{what: [getattr(robot.now.state, what) for robot in self.robots] for what in OPTIONAL},
             "phase": [robot.lifecycle.phase for robot in self.robots],
@@ -271,6 +271,7 @@ class Flight:
                 columns[what] = None if what in OPTIONAL else np.zeros((len(time), len(names), 0))
                 continue
             columns[what] = np.concatenate(self._columns[what])
+            self._columns[what] = [columns[what]]  # of many robots its parts take as much as it does
             if what in OPTIONAL and np.isnan(columns[what]).all():
                 columns[what] = None
         incidents = [(row, each) for row, robot in enumerate(self.robots) for each in robot.hazards.incidents]
