@@ -177,12 +177,13 @@ class Stretches:
         with self._planned(k, end):
             last = self._run(ledger, k, end)
         if last < 0:
-            self._paused_until = end
+            self._paused_until = k + LONGEST
             flight.network.leave(self._ways, self._members, ledger, before, -np.inf)
             return k, AT_END
-        self._pause = PAUSE if last - k >= LEAST else min(2 * self._pause, LONGEST_PAUSE)
         if last - k < LEAST:
-            self._paused_until = last + self._pause // 2
+            self._paused_until, self._pause = last + self._pause, min(2 * self._pause, LONGEST_PAUSE)
+        else:
+            self._pause = PAUSE
         self.flown += last - k
         done = last - 1 if ledger.reason == AT_END else last
         flight.network.leave(self._ways, self._members, ledger, before, done * flight.dt)

@@ -249,6 +249,7 @@ def test_cache_folder_that_cannot_be_made(monkeypatch, tmp_path):
     file.write_text("", encoding="utf-8")
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(file / "folder"))
     stretch.DRIVERS.clear()
+    stretch.RECENT.clear()
     _, ticks = same(pair(duration_s=1.0))
     assert ticks == 0
     stretch.DRIVERS.clear()
