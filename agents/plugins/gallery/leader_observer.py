@@ -22,25 +22,29 @@ class LeaderObserver(Law, frozen=True):
     L. Bushnell, "Distributed observers design for leader-following control of multi-agent networks", Automatica 44(3),
     2008; Y. Cao, W. Ren, "Distributed coordinated tracking with reduced interaction via a variable structure approach",
     IEEE Transactions on Automatic Control 57(1), 2012). No integral of an error: a robot that is held winds nothing up.
+    All say how many links they are from a leader: where none is left the count grows to that of robots, and v̂ is 0.
     """
 
     NEEDS: ClassVar[Need] = "relative"
     PREDICTION: ClassVar[str] = "constant-velocity"
-    SAYS: ClassVar[Mapping[str, Said]] = {"v": Said(unit="m/s", metre=0.1)}  # 1 cm of threshold: 1 mm/s
+    SAYS: ClassVar[Mapping[str, Said]] = {
+        "v": Said(unit="m/s", metre=0.1),  # 1 cm of threshold: 1 mm/s
+        "links": Said(metre=1e-3),
+    }
 
     gain: Annotated[Positive, Meta(description="k [1/s]")] = 0.5
     observer: Annotated[Positive, Meta(description="γ [1/s]; steps of 0.1 s bear up to 10")] = 2.0
 
     def begin(self, robot: RobotFacts) -> Memory:
-        """v: velocity of the leader [m/s], 0 at first."""
-        return {"v": (0.0, 0.0)}
+        """v: velocity of the leader [m/s], 0 at first; links to it, as many as robots: none is known."""
+        return {"v": (0.0, 0.0), "links": (float(robot.count),)}
 
     def step(self, view: View, memory: Memory) -> Control:
         """Step of Euler's method, on the shares of what is heard."""
         v_x, v_y = memory["v"]
         if view.leads:
-            return Control(memory={"v": view.target_velocity[:2]})
-        heard = view.known("v")
+            return Control(memory={"v": view.target_velocity[:2], "links": (0.0,)})
+        heard, most = view.known(*self.SAYS), float(view.robot.count)
         share, x, y, apart_x, apart_y = 1.0 / max(len(heard), 1), 0.0, 0.0, 0.0, 0.0
         for each in heard:
             x += share * (view.position[0] - each.position[0] - each.link.relative[0])
@@ -48,9 +52,10 @@ class LeaderObserver(Law, frozen=True):
             apart_x += share * (v_x - each.said["v"][0])
             apart_y += share * (v_y - each.said["v"][1])
         rate = min(self.observer * view.step_s, 1.0)
-        v_x, v_y = v_x - rate * apart_x, v_y - rate * apart_y
+        links = min([most, *(each.said["links"][0] + 1.0 for each in heard)])
+        v_x, v_y = (v_x - rate * apart_x, v_y - rate * apart_y) if links < most else (0.0, 0.0)
         return Control(
-            memory={"v": (v_x, v_y)},
+            memory={"v": (v_x, v_y), "links": (links,)},
             velocity=(v_x - self.gain * x, v_y - self.gain * y, nan),
             measures={"lag": (x * x + y * y) ** 0.5},
         )

@@ -5,7 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from agents.formation.link import Link
 from agents.plugins.gallery.coverage import Coverage
+from agents.plugins.gallery.leader_observer import LeaderObserver
 from agents.plugins.law import NeighbourView, RobotFacts, View
 from agents.vectors import ZERO
 from experiments.catalogue import index
@@ -152,6 +154,23 @@ def test_cells_share_the_area_and_make_up_for_a_lost_robot():
 def test_an_area_that_is_not_convex_is_refused():
     with pytest.raises(ValueError, match="convex"):
         Coverage(area=[(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])
+
+
+def test_followers_without_any_leader_stop():
+    law = LeaderObserver()
+    facts = [RobotFacts(name, number, 3, flies=False, speed=0.2, step_s=0.1) for number, name in enumerate("AB")]
+    places = [(0.25, 0.0, 0.0), (-0.25, 0.0, 0.0)]
+    links = [Link(relative=(0.5, 0.0, 0.0)), Link(relative=(-0.5, 0.0, 0.0))]
+    memory = [{"v": (0.12, 0.0), "links": (1.0,)}] * 2  # as of a leader that both heard
+    for _ in range(3):
+        controls = []
+        for own, other in ((0, 1), (1, 0)):
+            heard = NeighbourView(other, facts[other].name, places[other], ZERO, 0.0, 0.0, memory[other], links[own])
+            view = View(facts[own], memory[own], [heard])
+            view.position = places[own]
+            controls.append(law.step(view, memory[own]))
+        memory = [control.memory for control in controls]
+    assert [control.velocity[:2] for control in controls] == [(0.0, 0.0)] * 2
 
 
 def test_the_same_twice_and_another_seed_elsewhere():
