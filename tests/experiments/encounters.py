@@ -28,7 +28,7 @@ SPEED: Final = {"twist": 0.2, "velocity": 0.4, "position": 0.4}  # [m/s] of the 
 PATIENCE: Final = 3.0  # times the time that the way would take alone; avoiding each other takes up to 2.6 of them
 IN_THE_AIR: Final = 0.5  # [m] height of drones among themselves
 ANGLES: Final = (math.pi, 0.5 * math.pi)  # head-on, and across
-PAIRS: Final = tuple(itertools.combinations_with_replacement(KINDS, 2))
+PAIRS: Final = tuple(itertools.combinations_with_replacement(("crazyflie", "tello", "khepera4", "turtlebot3"), 2))
 
 
 @dataclass(frozen=True)

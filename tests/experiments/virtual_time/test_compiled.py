@@ -127,6 +127,14 @@ def test_every_plugin_and_model(assigned):
     assert ticks > 500
 
 
+def test_every_motion_on_the_floor():
+    kinds = ("omni", "ackermann", "double-integrator")
+    robots = {f"R{k}": Robot(kind=kind, start=[0.9 * k - 0.9, 0.3 * k]) for k, kind in enumerate(kinds)}
+    formation = Formation(law="distance", links={"R0 - R1": 0.7, "R1 - R2": 0.7, "R2 - R0": 0.7})
+    _, ticks = same(pair(robots=robots, formation=formation))
+    assert ticks > 300
+
+
 @pytest.mark.parametrize("lean", [False, True])
 def test_legs_and_several_stretches(lean):
     line = {"kind": "line", "move_by": [0.2, 0.1], "speed": 0.1}
