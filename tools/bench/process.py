@@ -17,7 +17,7 @@ from typing import Final
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from experiments.definition.plan import Plan
-from experiments.file.document import load
+from experiments.file.document import Document, load
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import Conductor
 from experiments.real_time.conductor.run_view import Progress
@@ -58,13 +58,15 @@ class Meter:
         return {name: 100.0 * (b.cpu_s - a.cpu_s) / (end - begin) for name, begin, a, end, b in pairs if end > begin}
 
 
-def process() -> Iterator[Figure]:
-    """Robot processes of the reference experiment in flight, each beside a bare process: CPU and memory of both.
+def process(read: Document | None = None) -> Iterator[Figure]:
+    """Robot processes in flight, in real time, each beside a bare process: CPU and memory of both.
 
-    In real time, with periodic poses at 50 Hz and no plan of the leader.
+    Args:
+        read: Its first case is flown, with periodic poses and for `FLIGHT_S`; None: the reference experiment, with
+            poses at 50 Hz and no plan of the leader.
     """
-    read = load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
-    experiment = read.cases()["periodic"]
+    read = read or load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
+    case, experiment = next(iter(read.cases().items()))
     plan = Plan(experiment)
     robots, bare = Meter(), Meter()
     first, last = dict[str, messages.Status](), dict[str, messages.Status]()
@@ -96,18 +98,20 @@ def process() -> Iterator[Figure]:
                 beside[robot] = started.handle.pid
             source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
             source.write_text(read.text, encoding="utf-8")
-            context = CaseContext(experiment, "periodic", folder, source, endpoints, launcher, hosts)
+            context = CaseContext(experiment, case, folder, source, endpoints, launcher, hosts)
             result = Conductor(context, look).run()
     assert result.ready_s is not None
-    yield Figure("process", "seven robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s")
+    pose_hz, body_hz = experiment.rates.pose_hz, experiment.rates.body_hz
+    yield Figure(
+        "process", f"{len(experiment.robots)} robots ready after", result.ready_s, "s", result.ready_s / 3.0, "× 3 s"
+    )
     of_robots, of_bare = robots.shares(), bare.shares()
     cpu = statistics.median(of_bare.values())
-    yield Figure("process", "CPU of a bare process (50 Hz pose)", cpu, "% of a core", 1.0, "yardstick")
+    yield Figure("process", f"CPU of a bare process ({pose_hz:g} Hz pose)", cpu, "% of a core", 1.0, "yardstick")
     rates = {name: (last[name].sent - first[name].sent) / (last[name].stamp - first[name].stamp) for name in of_robots}
-    pose_hz = experiment.rates.pose_hz
     ratio = statistics.median(of_robots[name] / rates[name] * pose_hz / of_bare[name] for name in rates)
     cpu, of = statistics.median(of_robots.values()), "× bare process, each pose"
-    yield Figure("process", "CPU of a robot (50 Hz pose, 100 Hz body)", cpu, "% of a core", ratio, of)
+    yield Figure("process", f"CPU of a robot ({pose_hz:g} Hz pose, {body_hz:g} Hz body)", cpu, "% of a core", ratio, of)
     memory, of_robot = (statistics.median(meter.pss_mb.values()) for meter in (bare, robots))
     yield Figure("process", "memory of a bare process (PSS)", memory, "MB", 1.0, "yardstick")
     yield Figure("process", "memory of a robot (PSS)", of_robot, "MB", of_robot / memory, "× bare process")

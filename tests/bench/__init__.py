@@ -1,0 +1,1 @@
+"""Benchmarks of zenpark beside other simulators, and of its growth; ratios within one run, kept out of the tests."""

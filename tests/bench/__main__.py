@@ -1,0 +1,48 @@
+"""Measure everything again, and put the tables into `docs/results/peers.md`.
+
+python -m tests.bench            # an hour, and 7 GB in the user's cache
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+from experiments.recording.version import SHOWN, provenance
+from tests.bench import growth, peers
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "peers.md"
+
+
+def renewed(page: str, tables: dict[str, str]) -> str:
+    """A page with other text between `<!-- NAME -->` and `<!-- end -->`, by name.
+
+    Raises ValueError if it has no such place.
+    """
+    for name, text in tables.items():
+        place = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+        if not place.search(page):
+            raise ValueError(f"no place for {name!r}")
+        page = place.sub(lambda found, text=text: f"{found[1]}\n{text}\n{found[2]}", page)
+    return page
+
+
+def circumstances() -> str:
+    """Commit, day and machine."""
+    here = provenance()
+    memory = f"{here.cores} cores, {here.memory_gb:.0f} GB, other work on them: load {here.load}"
+    day = time.strftime("%Y-%m-%d")
+    return f"Commit {here.commit[:SHOWN]}, {day}; {here.cpu}, {memory}; Python {here.python}."
+
+
+def main() -> None:
+    where = circumstances()
+    tables = {"peers": peers.report([*peers.OTHERS, peers.ZENOH]), "growth": growth.report()}
+    page = renewed(PAGE.read_text("utf-8"), {"circumstances": where, **tables})
+    PAGE.write_text(page, encoding="utf-8")
+    print(PAGE.read_text("utf-8"))
+
+
+if __name__ == "__main__":
+    main()

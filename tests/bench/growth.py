@@ -1,0 +1,86 @@
+"""Growth of a run in virtual time with the number of robots: CPU time of an agent-step and of all around it, memory.
+
+    python -m tests.bench.growth
+    python -m tests.bench.growth --robots 7 1000
+
+Each number has two processes of its own, plain and compiled, measured in turns with two of seven robots; figures are
+medians, and those that are no agent-steps of the compiled flights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+from tests.bench.drivers.peer_zenpark import DURATION_S
+from tests.bench.peers import COMPILED_WHEELS, WHEELS, Driver
+
+# simulated time [s] by number of robots: a compiled flight of seven takes milliseconds for ten seconds
+DURATIONS = {7: 300.0, 30: 70.0, 100: 21.0, 300: 10.0, 1000: 5.0, 3000: 3.0, 10_000: 3.0}
+COMPLETE = 300  # robots up to which metrics are taken as well
+ROUNDS = 3
+MANY = 1000  # so many and more are measured once
+SETTINGS = (WHEELS, COMPILED_WHEELS)
+COLUMNS = {  # figure of the driver: heading, format
+    "read_s": ("read [s]", ".2f"),
+    "start_s": ("before [s]", ".2f"),
+    "cpu_s": ("loop [s]", ".2f"),
+    "metrics_s": ("metrics [s]", ".2f"),
+    "memory_mb": ("memory [MB]", ".0f"),
+}
+
+
+def report(sizes: Sequence[int] = tuple(DURATIONS), rounds: int = ROUNDS, settings: Sequence[str] = SETTINGS) -> str:
+    """The table, in Markdown."""
+    headings = ["robots", "simulated [s]"]
+    for name in settings:
+        headings += [f"{name.split()[-1]}: µs per agent-step", "ratio to 7 robots"]
+    headings += [heading for heading, _ in COLUMNS.values()]
+    lines = [f"| {' | '.join(headings)} |", f"|{'---|' * len(headings)}"]
+    lines += [line(robots, rounds, settings) for robots in sizes]
+    return "\n".join(lines)
+
+
+def line(robots: int, rounds: int, settings: Sequence[str]) -> str:
+    """The line of a number of robots."""
+    simulated_s, complete = DURATIONS.get(robots, DURATION_S), robots <= COMPLETE
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in settings}
+    ratios: dict[str, list[float]] = {name: [] for name in settings}
+    with ExitStack() as stack:
+        pairs = {}
+        for name in settings:
+            one = Driver(name, robots, f"{simulated_s:g}", "all" if complete else "loop")
+            stack.callback(one.close)
+            seven = Driver(name, 7, f"{DURATIONS[7]:g}")
+            stack.callback(seven.close)
+            pairs[name] = one, seven
+        for _ in range(rounds if robots < MANY else 1):
+            for name, pair in pairs.items():
+                one, seven = (driver.measure() for driver in pair)
+                step_us, of_seven_us = (1e6 * each["cpu_s"] / each["agent_steps"] for each in (one, seven))
+                found[name].append({**one, "step_us": step_us})
+                ratios[name].append(step_us / of_seven_us)
+    cells = [f"{robots:,}", f"{simulated_s:g}"]
+    for name in settings:
+        step_us = statistics.median(each["step_us"] for each in found[name])
+        cells += [f"{step_us:.2g}", f"{statistics.median(ratios[name]):.2g}"]
+    for figure, (_, form) in COLUMNS.items():
+        values = [each[figure] for each in found[settings[-1]] if figure in each]
+        cells.append(f"{statistics.median(values):{form}}" if values else "")
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.growth", description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", type=int, nargs="+", default=tuple(DURATIONS))
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    wanted = parser.parse_args()
+    print(report(wanted.robots, wanted.rounds))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

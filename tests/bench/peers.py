@@ -1,0 +1,323 @@
+"""zenpark beside other simulators: agent-steps per CPU second of the step loop alone, with ratios of the same minutes.
+
+    python -m tests.bench.peers                      # those that are small to install, and bare Zenoh
+    python -m tests.bench.peers vmas crazyflow       # these; VMAS needs torch (5.5 GB), crazyflow JAX (1.2 GB)
+    python -m tests.bench.peers --all
+
+Each simulator gets an environment of its own below `~/.cache/zenpark/peers` (remove its folder for newer versions) and
+flies `tests/bench/drivers/ring.py`: the same ring, starts and law. All processes of one number of robots are started
+and warmed up, and then measured in turns; speeds are medians, ratios medians of the ratios of each turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agents.user_folder import cache_folder
+from experiments.file import document
+from tests.bench.drivers import peer_zenpark, ring
+from tools.bench.process import FLIGHT_S, process
+
+ROOT = Path(__file__).resolve().parents[2]
+DRIVERS = "tests.bench.drivers"
+ROBOTS = (7, 100, 1000)
+ROUNDS = 3
+MANY, SHORT_S = 500, 3.0  # so many robots fly plain for a shorter time [s]: a second takes one of CPU
+COMPILED_ROBOT_S = 2100.0  # robots × simulated time of a compiled flight [s]: ten seconds take milliseconds
+INSTALL_S = 600.0
+# threads of numpy gain nothing on arrays of this size, and would be charged
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# arguments of zenpark's driver: kind, engine, evaluator
+WHEELS, COMPILED_WHEELS = "khepera4 point-mass plain", "khepera4 point-mass compiled"
+DRONES, COMPILED_DRONES = "crazyflie point-mass plain", "crazyflie point-mass compiled"
+RIGID = "crazyflie mujoco plain"
+ZENOH = "zenoh"  # the bare network, in real time
+
+
+class Failed(Exception):
+    """A simulator that cannot be installed, or whose process ended."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A simulator, or a setting of zenpark, which flies the ring."""
+
+    packages: tuple[str, ...]
+    beside: tuple[str, ...]  # settings of zenpark to compare it with
+    bodies: str
+    limit: str  # of its speed
+    most: int = max(ROBOTS)  # robots that it takes
+    heavy: bool = False  # installed by name alone
+
+
+PEERS = {
+    WHEELS: Peer((), (), "two wheels", "calls of Python: some 130 for an agent-step, none above a tenth of it"),
+    COMPILED_WHEELS: Peer((), (WHEELS,), "two wheels", "tables of the poses sent and received; the ticks are a tenth"),
+    DRONES: Peer((), (), "third order on each axis", "the same as plain wheels"),
+    COMPILED_DRONES: Peer((), (DRONES,), "third order on each axis", "the same as compiled wheels"),
+    RIGID: Peer(
+        (), (), "rigid, 1 kHz, firmware's cascade", "the cascade in numpy, ten times a step, and MuJoCo", most=100
+    ),
+    "robotarium": Peer(
+        ("robotarium-python-simulator",),
+        (WHEELS, COMPILED_WHEELS),
+        "unicycles",
+        "asks every pair of robots for a collision, in Python; takes 50 robots at most",
+        most=50,
+    ),
+    "irsim": Peer(
+        ("ir-sim",),
+        (WHEELS, COMPILED_WHEELS),
+        "two wheels; collisions found and ignored",
+        "each robot is a Python object, whose shape is moved and entered into a tree",
+    ),
+    "gym-pybullet-drones": Peer(("gym-pybullet-drones",), (RIGID,), "rigid, 240 Hz", ""),
+    "vmas": Peer(
+        ("vmas", "torchrl"),
+        (WHEELS, COMPILED_WHEELS),
+        "point masses moved by forces; no collisions",
+        "small torch operations for each robot; TorchRL's wrapper; made for thousands of worlds in a batch, has one",
+        heavy=True,
+    ),
+    "crazyflow": Peer(
+        ("crazyflow",),
+        (RIGID, DRONES, COMPILED_DRONES),
+        "rigid, 500 Hz, model of the firmware's controller",
+        "calls of JAX while robots are few; made for thousands of worlds in a batch, has one",
+        heavy=True,
+    ),
+}
+OTHERS = [name for name, peer in PEERS.items() if peer.packages]
+
+
+def duration_s(name: str, robots: int) -> float:
+    """Simulated time of a flight of a setting of zenpark [s]."""
+    if name in {COMPILED_WHEELS, COMPILED_DRONES}:
+        return max(peer_zenpark.DURATION_S, COMPILED_ROBOT_S / robots)
+    return SHORT_S if robots >= MANY else peer_zenpark.DURATION_S
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table."""
+
+    robots: int
+    name: str
+    version: str
+    step_s: float
+    speed: float  # agent-steps per CPU second
+    ratios: dict[str, float]  # to settings of zenpark
+
+
+def python_of(name: str) -> Path:
+    """Interpreter with a simulator, which is installed if it is not.
+
+    Raises Failed with the first error of pip, or if it takes more than `INSTALL_S`.
+    """
+    folder = cache_folder() / "peers" / name
+    python, packages = folder / "bin" / "python", PEERS[name].packages
+    stamp, wanted = folder / "installed", " ".join(packages)
+    if stamp.exists() and stamp.read_text("utf-8") == wanted:
+        return python
+    base = getattr(sys, "_base_executable", None) or sys.executable  # not our environment, which has other packages
+    subprocess.run([base, "-m", "venv", "--clear", str(folder)], check=True)
+    command = [python, "-m", "pip", "install", "--no-input", "--quiet", *packages]
+    try:
+        done = subprocess.run(
+            command, check=False, capture_output=True, text=True, env=environment(), timeout=INSTALL_S
+        )
+    except subprocess.TimeoutExpired:
+        raise Failed(f"{name} cannot be installed within {INSTALL_S:g} s") from None
+    if done.returncode != 0:
+        errors = (line for line in done.stderr.splitlines() if line.startswith("ERROR"))
+        raise Failed(f"{name} cannot be installed: {next(errors, 'pip failed')}")
+    stamp.write_text(wanted, encoding="utf-8")
+    return python
+
+
+def environment() -> dict[str, str]:
+    """The user's environment without packages of elsewhere."""
+    kept = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "PYTHONHOME"}}
+    return {**kept, **ONE_THREAD}
+
+
+class Driver:
+    """A process that measures one simulator, once for each line that it gets."""
+
+    def __init__(self, name: str, robots: int, *arguments: str) -> None:
+        self.name, self.robots = name, robots
+        if PEERS[name].packages:
+            command = [python_of(name), "-m", f"{DRIVERS}.peer_{name}", str(robots)]
+        else:
+            command = [sys.executable, "-m", f"{DRIVERS}.peer_zenpark", str(robots), *name.split(), *arguments]
+        self.errors = tempfile.TemporaryFile(  # noqa: SIM115 - closed by `close`
+            "w+", encoding="utf-8", errors="replace"
+        )
+        self.process = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env=environment(),
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+        )
+        self.about = self._line()
+
+    def measure(self) -> dict[str, Any]:
+        """Raises Failed if the process ends instead."""
+        with suppress(BrokenPipeError):
+            print(file=self.process.stdin, flush=True)
+        return self._line()
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout, self.errors):
+            with suppress(BrokenPipeError):
+                stream.close()
+
+    def _line(self) -> dict[str, Any]:
+        for line in self.process.stdout:
+            if line.startswith("{"):  # libraries print as well
+                return json.loads(line)
+        self.errors.seek(0)
+        said = self.errors.read().strip().splitlines() or ["no message"]
+        self.close()
+        raise Failed(f"{self.name}, {self.robots} robots: {said[-1]}")
+
+
+def in_turns(drivers: Sequence[Driver], rounds: int, troubles: list[str]) -> Iterator[Row]:
+    """Rows of processes that have been warmed up; of those that fail, the reason goes to `troubles` instead."""
+    speeds: dict[str, list[float]] = {driver.name: [] for driver in drivers}
+    running = list(drivers)
+    for _ in range(rounds):
+        for driver in running.copy():
+            try:
+                found = driver.measure()
+            except Failed as why:
+                troubles.append(str(why))
+                running.remove(driver)
+                continue
+            speeds[driver.name].append(found["agent_steps"] / found["cpu_s"])
+    for driver in running:
+        taken = speeds[driver.name]
+        ratios = {
+            other: statistics.median(one / two for one, two in zip(taken, speeds[other], strict=True))
+            for other in PEERS[driver.name].beside
+            if len(speeds.get(other, ())) == len(taken)
+        }
+        about = driver.about
+        yield Row(driver.robots, driver.name, about["version"], about["step_s"], statistics.median(taken), ratios)
+
+
+def measure(names: Sequence[str], sizes: Sequence[int], rounds: int, troubles: list[str]) -> Iterator[Row]:
+    """Rows of some simulators and of the settings of zenpark beside them, by number of robots."""
+    able = []
+    for name in names:
+        try:
+            python_of(name)
+            able.append(name)
+        except Failed as why:
+            troubles.append(str(why))
+    numbers = {name: {min(size, PEERS[name].most) for size in sizes} for name in able}
+    for robots in sorted(set().union(*numbers.values())):
+        others = [name for name in able if robots in numbers[name]]
+        beside = [
+            own for own in PEERS if robots <= PEERS[own].most and any(own in PEERS[name].beside for name in others)
+        ]
+        with ExitStack() as stack:
+            drivers = []
+            for name in [*beside, *others]:
+                try:
+                    duration = () if PEERS[name].packages else (f"{duration_s(name, robots):g}",)
+                    drivers.append(driver := Driver(name, robots, *duration))
+                    stack.callback(driver.close)
+                except Failed as why:
+                    troubles.append(str(why))
+            yield from in_turns(drivers, rounds, troubles)
+
+
+def network() -> Iterator[Row]:
+    """Robot processes on the ring in real time, each beside a bare Zenoh process that exchanges the same poses.
+
+    Medians of seven pairs of the same seconds; an agent-step is a pose that is sent.
+    """
+    robots = min(ROBOTS)
+    read = document.loads(peer_zenpark.experiment(robots, *WHEELS.split()[:2], FLIGHT_S))
+    bare, own = (figure for figure in process(read) if figure.name.startswith("CPU of a "))
+    speed = peer_zenpark.HZ / (bare.value / 100.0)
+    yield Row(robots, "robot process, real time", "", ring.STEP_S, speed / own.ratio, {})
+    yield Row(robots, "bare Zenoh process", "", ring.STEP_S, speed, {"robot process, real time": own.ratio})
+
+
+def title(name: str) -> str:
+    """Name of a simulator, or of a setting of zenpark, for people."""
+    return f"zenpark, {name}" if name in PEERS and name not in OTHERS else name
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown."""
+    lines = ["| robots | simulator | step [ms] | agent-steps per CPU second | ratio |", "|---|---|---|---|---|"]
+    for row in rows:
+        ratios = [f"{ratio:.2g} × {other}" for other, ratio in row.ratios.items() if other != row.name]
+        speed = f"{float(f'{row.speed:.2g}'):,.0f}"
+        cells = [
+            f"{row.robots:,}",
+            f"{title(row.name)} {row.version}".strip(),
+            f"{1e3 * row.step_s:g}",
+            speed,
+            ", ".join(ratios),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def limits(names: Sequence[str]) -> str:
+    """Markdown: bodies and limits of simulators; nothing without any."""
+    if not names:
+        return ""
+    lines = ["| simulator | bodies | what limits it |", "|---|---|---|"]
+    lines += [f"| {title(name)} | {PEERS[name].bodies} | {PEERS[name].limit} |" for name in names]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.peers", description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join([*OTHERS, ZENOH])}")
+    parser.add_argument("--all", action="store_true", help="the ones with large downloads as well")
+    parser.add_argument("--robots", type=int, nargs="+", default=ROBOTS)
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    wanted = parser.parse_args()
+    if unknown := {*wanted.names} - {*OTHERS, ZENOH}:
+        parser.error(f"unknown: {', '.join(sorted(unknown))}")
+    names = wanted.names or [name for name in [*OTHERS, ZENOH] if name == ZENOH or wanted.all or not PEERS[name].heavy]
+    print(report(names, wanted.robots, wanted.rounds))
+    return 0
+
+
+def report(names: Sequence[str], sizes: Sequence[int] = ROBOTS, rounds: int = ROUNDS) -> str:
+    """Both tables, and what could not be measured, in Markdown."""
+    troubles: list[str] = []
+    rows = list(measure([name for name in names if name != ZENOH], sizes, rounds, troubles))
+    found = {row.name for row in rows}
+    if ZENOH in names:
+        rows += network()
+    missing = "\n".join(f"- {trouble}" for trouble in troubles)
+    return "\n\n".join(filter(None, [table(rows), limits([name for name in PEERS if name in found]), missing]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

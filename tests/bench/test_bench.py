@@ -1,0 +1,90 @@
+"""The parts of the benchmarks that are no timings: the law, the dialogue with a simulator, the tables."""
+
+from __future__ import annotations
+
+import subprocess
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from tests.bench import __main__ as renewal
+from tests.bench import growth, peers
+from tests.bench.drivers import ring
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path))
+
+
+def test_law_closes_the_ring():
+    place, position = ring.places(7), ring.starts(7)
+    assert np.linalg.norm(place - np.roll(place, 1, axis=0), axis=1) == pytest.approx([ring.SPACING] * 7)
+    before = ring.link_error(position)
+    for _ in range(500):
+        position = position + ring.STEP_S * ring.velocities(position, place)
+    assert ring.link_error(position) < 0.01 * before
+
+
+def test_wheels_move_the_point_ahead():
+    velocity, yaw = np.array([[0.1, -0.2]]), np.array([0.7])
+    speed, rate = ring.wheels(velocity, yaw)
+    ahead = np.array([np.cos(0.7), np.sin(0.7)])
+    aside = np.array([-np.sin(0.7), np.cos(0.7)])
+    assert speed * ahead + 0.05 * rate * aside == pytest.approx(velocity[0])
+
+
+def test_zenpark_counts_its_agent_steps():
+    with closing(peers.Driver(peers.WHEELS, 3, "2", "loop")) as driver:
+        found = driver.measure()
+    assert found["agent_steps"] == round(3 * 50 * 0.5)
+    assert found["cpu_s"] > 0.0
+
+
+def test_compiled_flights_are_longer():
+    assert peers.duration_s(peers.WHEELS, 7) == 10.0
+    assert peers.duration_s(peers.COMPILED_WHEELS, 7) == 300.0
+    assert peers.duration_s(peers.COMPILED_WHEELS, 1000) == 10.0
+
+
+def test_failed_install_names_the_first_error(monkeypatch):
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
+    text = peers.report(["gym-pybullet-drones"], sizes=[3], rounds=1)
+    assert "gym-pybullet-drones cannot be installed: ERROR" in text
+
+
+def test_ended_process_gives_its_last_words(monkeypatch):
+    monkeypatch.setattr(peers, "DRIVERS", "tests.bench.missing")
+    with pytest.raises(peers.Failed, match=r"7 robots: .*tests\.bench\.missing"):
+        peers.Driver(peers.WHEELS, 7)
+
+
+def test_table_gives_ratios_to_zenpark():
+    own = peers.Row(7, peers.WHEELS, "", 0.02, 20_000.0, {})
+    other = peers.Row(7, "irsim", "2.12.0", 0.02, 8_123.0, {peers.WHEELS: 0.406})
+    lines = peers.table([own, other]).splitlines()
+    assert lines[2] == "| 7 | zenpark, khepera4 point-mass plain | 20 | 20,000 |  |"
+    assert lines[3] == "| 7 | irsim 2.12.0 | 20 | 8,100 | 0.41 × khepera4 point-mass plain |"
+
+
+def test_growth_has_a_line_for_each_number():
+    lines = growth.report(sizes=(3, 5), rounds=1, settings=[peers.WHEELS]).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| 3", "| 5"]
+
+
+def test_page_has_places_for_the_tables():
+    page = renewal.PAGE.read_text("utf-8")
+    names = ("circumstances", "peers", "growth")
+    again = renewal.renewed(page, {name: f"new {name}" for name in names})
+    assert all(f"<!-- {name} -->\n\nnew {name}\n\n<!-- end -->" in again for name in names)
+    with pytest.raises(ValueError, match="no place"):
+        renewal.renewed(page, {"other": ""})
+
+
+def test_simulators_are_run_by_drivers_of_their_own():
+    folder = renewal.PAGE.parents[2] / "tests" / "bench" / "drivers"
+    drivers = {file.stem.removeprefix("peer_") for file in folder.glob("peer_*.py")}
+    assert drivers == {*peers.OTHERS, "zenpark"} - {"gym-pybullet-drones"}
+    assert subprocess.run(["grep", "-rlE", r"^\s*(from|import) vmas", folder], check=False).returncode == 1
