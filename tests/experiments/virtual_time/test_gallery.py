@@ -173,6 +173,27 @@ def test_followers_without_any_leader_stop():
     assert [control.velocity[:2] for control in controls] == [(0.0, 0.0)] * 2
 
 
+@pytest.mark.parametrize(("case", "most"), [("periodic", 0.04), ("event", 0.05), ("event-loss", 0.08)])
+def test_a_flock_keeps_spacing_and_velocity_and_its_mean_obeys_the_rendezvous(case, most):
+    known = trace("flocking", case)
+    place = known.true_position[..., :2]
+    apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=3)[:, *np.triu_indices(7, 1)]
+    assert apart.min() > 0.5
+    near = apart[-1][apart[-1] < 0.84]
+    assert len(near) == 12  # all edges of a hexagon with its centre
+    assert near == pytest.approx(0.7, rel=0.15)
+    assert np.abs(known.memory["v"][-1] - [0.1, 0.0]).max() < 0.015
+    late = known.time > known.time[-1] - 1.0
+    speeds = (place[late][-1] - place[late][0]) / (known.time[late][-1] - known.time[late][0])
+    assert np.abs(speeds - [0.1, 0.0]).max() < 0.02
+    step, mean, speed = known.time[1] - known.time[0], place[0].mean(axis=0), np.zeros(2)
+    for moment, actual in zip(known.time, place.mean(axis=1), strict=True):
+        assert np.linalg.norm(mean - actual) < most
+        target = np.array([-1.0 + 0.1 * moment, 0.0])
+        speed = speed + step * (-0.15 * (mean - target) - 0.8 * (speed - [0.1, 0.0]))
+        mean = mean + step * speed
+
+
 def test_the_same_twice_and_another_seed_elsewhere():
     experiment = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
     first, again, other = (simulate(experiment, seed) for seed in (1, 1, 2))
