@@ -299,7 +299,7 @@ def test_without_a_command_nothing_is_kept(tmp_path):
 
 
 def test_what_acquired_means_is_named(broken):
-    for words in ("Acquired, mean [s]", "Acquired by all followers [s] periodic from the start"):
+    for words in ("Mean per robot", "Acquired [s]", "Acquired by all followers [s] periodic from the start"):
         assert words in broken.words
 
 
