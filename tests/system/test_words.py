@@ -34,4 +34,4 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
     assert trace.dropped.sum() > 0
     spoken = typed(file, "/KH01/spoken_pose")
     assert [each.name for each in spoken[-1].shared] == ["x", "q", "n"]
-    assert not typed(file, "/KH01/pose")
+    assert len(typed(file, "/KH01/pose")) < len(spoken) / 3  # those before its first step
