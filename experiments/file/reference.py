@@ -307,7 +307,7 @@ def _example(key: str, field: Mapping[str, Any], definitions: Mapping[str, Any],
     parts = _split(key)
     if found := [lines for document in _documents() for lines in _occurrences(document, parts, ())]:
         return min(found, key=len)
-    value = field.get("default")
+    value = field.get("default") or next(iter(field.get("examples", ())), None)
     made = _made(field, definitions) if value in (None, {}, [], math.inf) else value
     names = dict(_NAMES.values())
     return _lines(

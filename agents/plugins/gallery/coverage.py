@@ -28,7 +28,12 @@ class Coverage(Law, frozen=True):
 
     gain: Annotated[Positive, Meta(description="k [1/s]")] = 0.5
     area: Annotated[
-        list[Place], Meta(min_length=3, description="corners x, y [m] of a convex area, in their order")
+        list[Place],
+        Meta(
+            min_length=3,
+            description="corners x, y [m] of a convex area, in their order",
+            examples=[[[-2.0, -2.0], [2.0, -2.0], [0.0, 2.0]]],
+        ),
     ] = msgspec.field(default_factory=lambda: [(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)])
     peaks: Annotated[
         list[tuple[float, float, Positive, Positive]],

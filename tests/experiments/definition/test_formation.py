@@ -229,7 +229,7 @@ def test_a_calm_event_triggered_ring_does_not_turn():
 
 REFUSED = {
     "no three": ('"A - B" = { distance = 0.5, offset = [0.5, 0.0] }', "one of the three"),
-    "none": ('"A - B" = { gain = 1.0 }', "one of the three"),
+    "none": ('"A - B" = { gain = 1.0 }', "give a distance or an offset"),
     "no direction": ('"A - B" = { bearing = [0.0, 0.0] }', "no direction"),
     "ends first": ('"A - B" = { distance = 0.5, from_s = 3.0, until_s = 2.0 }', "must be later than `from_s`"),
     "after the end": ('"A - B" = { distance = 0.5, from_s = 99.0 }', "when the run of 40 s is over"),
