@@ -116,7 +116,9 @@ class Broadcast:
         except Undecodable:
             return
         if topic.recorded is not topic.message:  # less what the recorder added
-            entry = topic.message(**{name: getattr(entry, name) for name in topic.message.__struct_fields__ if hasattr(entry, name)})
+            entry = topic.message(
+                **{name: getattr(entry, name) for name in topic.message.__struct_fields__ if hasattr(entry, name)}
+            )
         encoding: messages.Encoding = self.experiment.network.encoding if topic.message in ENCODED else "json"
         key = topic.key(self.keys).replace("*", getattr(entry, "robot", ""))
         publisher = self._publishers.get(key)

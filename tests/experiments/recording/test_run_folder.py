@@ -103,7 +103,7 @@ def test_past_runs_with_their_figures_sizes_and_tags(tmp_path: Path) -> None:
     earlier, later = run_folder.past_runs([tmp_path])
     assert [Path(run.folder).name for run in (earlier, later)] == ["earlier", "later"]
     unknown = {1: None, 2: None}
-    both = {"f_hz": {1: 10.0, 2: 10.0}, "iae": {1: 1.5, 2: 1.5}, "rmse": unknown, "acquired_s": unknown}
+    both = {"f_hz": {1: 10.0, 2: 10.0}, "iae": {1: 1.5, 2: 1.5}, "rmse": unknown}
     assert earlier.cases == {"event": both}
     assert (earlier.seeds, earlier.recorded, earlier.megabytes > 0.001) == ([1, 2], True, True)
     assert [later.matches(words) for words in (["paper"], ["EVENT", "two"], ["pape"], ["paper", "other"])] == [

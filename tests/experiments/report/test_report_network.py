@@ -60,7 +60,7 @@ def test_verdict_and_tables_have_dropped_poses(run):
     spared = next(row.cells for row in table.rows if row.cells[0] == "TB01 > KH01")
     assert spared == ("TB01 > KH01", "200", "0", "0", "30.0", "30.0")
     assert proof_tables([measured])[0].head[-2:] == ("Lost", "Dropped")
-    dropped = ("Dropped by the modelled network", number(measured.dropped))
+    dropped = ("Dropped", number(measured.dropped))
     assert dropped in [row.cells for table in whole_tables([measured]) for row in table.rows]
 
 
