@@ -57,6 +57,7 @@ def test_a_run_forms_up_loses_nothing_and_reports(whole: Whole) -> None:
                 "bytes",
                 "iae",
                 "itae",
+                "updates",
                 "rmse",
                 "acquired_s",
                 "lost",
