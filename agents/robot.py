@@ -44,8 +44,8 @@ class Robot:
     __slots__ = (
         "_asked", "_blind", "_continuity", "_controller", "_decide_every", "_decided", "_detector", "_dt",
         "_external", "_filter", "_flies", "_follower", "_ordered", "_origin", "_perception", "_place", "_pose_every",
-        "_predicts", "_preflight", "_status", "_stepping", "assignment", "avoided", "begun", "causes", "changed",
-        "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
+        "_predicts", "_preflight", "_run_began", "_status", "_stepping", "assignment", "avoided", "begun", "causes",
+        "changed", "decision_due", "decisions", "error", "evasions", "goal", "goal_yaw", "goals", "guidance", "hazards",
         "health", "interventions", "keeping", "landing", "lands", "lifecycle", "neighbours", "now", "sent_position",
         "sent_velocity", "setpoint", "stops", "takes_off", "tick", "transmitter", "updates",
     )  # fmt: skip
@@ -70,6 +70,7 @@ class Robot:
     causes: int  # of hazards on this tick, a bit for each
     decision_due: bool  # whether the goal is decided on this tick; known from its first half on
     begun: bool  # whether the robot has begun to run
+    _run_began: float  # common start of a run under way that the robot joins [s]; infinity: it joins none
 
     def __init__(self, assignment: Assignment, health: ProcessHealth | None = None) -> None:
         """Take the `assignment`, and the `health` of the process, which sets it."""
@@ -102,6 +103,7 @@ class Robot:
         self.begun = self.decision_due = self._ordered = self._blind = False
         self.sent_position, self.sent_velocity, self._place = UNKNOWN, UNKNOWN, UNKNOWN
         self._decided = self._asked = -1
+        self._run_began = inf
         self._origin: Pose | None = None
 
     # ------------------------------------------------------------------ inputs
@@ -147,6 +149,15 @@ class Robot:
         self.goals.redirect(goal, t, 0.5 * self.assignment.kind.speed)
         return ""
 
+    def join(self, at: float, t: float, origin: Pose | None) -> None:
+        """Join a run that began at `at` [s]: the law steps from AIRBORNE on, so that the robot says what is current.
+
+        For the arguments see `start`.
+        """
+        self._run_began = at
+        if origin is not None:
+            self._begin_plan(origin, t - at)
+
     def start(self, at: float, t: float = -inf, origin: Pose | None = None) -> str:
         """Order to begin at `at` [s], or to go on after a hold; returns as `hold`.
 
@@ -160,10 +171,12 @@ class Robot:
             else:
                 self.resume()
             if origin is not None and waits:
-                x, y, z, yaw = origin
-                self._origin = origin
-                self.goals.begin_plan((x, y, z), yaw, max(0.0, t - at))
+                self._begin_plan(origin, t - at)
         return refusal
+
+    def _begin_plan(self, origin: Pose, elapsed_s: float) -> None:
+        x, y, z, yaw = self._origin = origin
+        self.goals.begin_plan((x, y, z), yaw, max(0.0, elapsed_s))
 
     @property
     def origin(self) -> Pose | None:
@@ -279,9 +292,13 @@ class Robot:
     def _step(self, t: float, stepping: Stepping) -> None:
         """Before its first question on a tick: a law that says something steps, so that it says what is new."""
         life, now = self.lifecycle, self.now
-        stepping.moves, stepping.scan, stepping.tick = not self._holds(), now.state.scan, self.tick
-        if stepping.speech is not None and life.phase == RUNNING and not now.invalid and self.guidance is None:
-            self.goals.step(t, now.position, now.velocity, now.yaw, life.start_at)
+        running, start, tick = life.phase == RUNNING, life.start_at, self.tick
+        joins = life.phase == AIRBORNE and self._run_began < t
+        if joins:
+            start, tick = self._run_began, round((t - self._run_began) * self.assignment.body_hz)
+        stepping.moves, stepping.scan, stepping.tick = running and not self._holds(), now.state.scan, tick
+        if stepping.speech is not None and (running or joins) and not now.invalid and self.guidance is None:
+            self.goals.step(t, now.position, now.velocity, now.yaw, start)
 
     def _renew_goal(self, stepping: Stepping) -> None:
         """A law gives a velocity: the goal moves on with it on every tick."""

@@ -296,11 +296,11 @@ class Order(Message, frozen=True):
     """
 
     order: OrderKind
-    at: float | None = None  # [s] UTC of a start
+    at: float | None = None  # [s] UTC of a start; of a take-off into a run under way, when that began
     name: str | None = None  # of the parameter to get or set
     value: float | None = None  # of the parameter to set
     goal: tuple[float, float] | None = None  # x, y [m] of go: where a leader goes, in a straight line
-    # of a start: `Status.origin` of the robot's former process; its plan goes on from there
+    # of both: `Status.origin` of the robot's former process; its plan goes on from there
     origin: Setpoint | None = None
 
 

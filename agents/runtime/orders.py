@@ -9,11 +9,13 @@ import msgspec
 
 from agents.network.messages import Order
 from agents.robot import Robot
+from agents.vectors import Setpoint
 
 SOON_S: Final = 3600.0  # a common start further ahead results from a wrong clock
 LAND: Final = "ordered to land"
 STOP: Final = "ordered to stop"
 OWN: Final = ("clamp", "tracking_gain")
+NEEDS_AT: Final = "a start needs `at`, a UTC time in seconds"
 PAUSED: Final = "ordered to hold"
 
 Answer = tuple[str, float | None]  # reason of a refusal (empty: none), and the value of a parameter
@@ -24,7 +26,7 @@ def carry_out(robot: Robot, order: Order, t: float, utc: float) -> Answer:
     refusal = ""  # also of "inspect": the loop adds the inspection to the reply, it has the body
     match order.order:
         case "takeoff":
-            refusal = robot.lifecycle.takeoff()
+            refusal = _take_off(robot, order, t, utc)
         case "start":
             refusal = _start(robot, order, t, utc)
         case "go":
@@ -63,17 +65,32 @@ def _send_to_goal(robot: Robot, goal: tuple[float, float] | None, t: float) -> s
     return robot.go(goal, t)
 
 
+def _take_off(robot: Robot, order: Order, t: float, utc: float) -> str:
+    if order.at is None:
+        return robot.lifecycle.takeoff()
+    refusal = _misdated(robot, order.at, order.origin, t, utc) or robot.lifecycle.takeoff()
+    if not refusal:
+        robot.join(order.at - utc, t, order.origin)
+    return refusal
+
+
 def _start(robot: Robot, order: Order, t: float, utc: float) -> str:
-    at, origin = order.at, order.origin
-    if at is None or not isfinite(at):
-        return "a start needs `at`, a UTC time in seconds"
+    if order.at is None:
+        return NEEDS_AT
+    refusal = _misdated(robot, order.at, order.origin, t, utc) or robot.start(order.at - utc, t, order.origin)
+    if not refusal:
+        _resume(robot)
+    return refusal
+
+
+def _misdated(robot: Robot, at: float, origin: Setpoint | None, t: float, utc: float) -> str:
+    """Why a common start `at` [s, UTC], or the origin of a plan, cannot be; empty: it can."""
+    if not isfinite(at):
+        return NEEDS_AT
     if not t - robot.assignment.duration < at - utc < t + SOON_S:
         return f"start at {at} is not within this experiment; are the clocks set?"
     if origin is not None and not all(map(isfinite, origin)):
         return "the `origin` of a start is x, y, z, yaw, all of them known"
-    if refusal := robot.start(at - utc, t, origin):
-        return refusal
-    _resume(robot)
     return ""
 
 

@@ -295,7 +295,9 @@ class HotChanges:
         try:
             yield from self._reach(names, "ready", self._experiment.start.deadline_s + READY_S)
             yield from self._room({name: self._last_place(name) for name in names}, ROOM_S)
-            yield from self._repeat_order(names, messages.Order("takeoff"))
+            for name in names:
+                takeoff = messages.Order("takeoff", at=self._start, origin=robots[name].origin)
+                yield from self._repeat_order([name], takeoff)
             yield from self._reach(names, "airborne", CLIMB_S)
             for name in names:
                 start = messages.Order("start", at=self._start, origin=robots[name].origin)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
 
 import pytest
 
@@ -10,6 +13,7 @@ from agents.body.limits import Safety
 from agents.decision.lifecycle import AIRBORNE, READY, RUNNING
 from agents.network import messages
 from agents.network.keys import Keys
+from agents.plugins.law import Control, Law, Said
 from agents.runtime.loop import Runtime, Setup
 from agents.runtime.orders import carry_out
 from experiments.definition.experiment import Formation, Leg, Robot
@@ -85,6 +89,52 @@ def test_plan_of_a_follower_keeps_its_origin():
     assert first.robot.origin[:2] == START
     second = Life((START[0] + WAY, START[1]), 30.0, first.robot.origin, listens=True)
     assert second.robot.origin[:2] == START
+
+
+class Clock(Law, frozen=True):
+    """Says the time, and wants to move."""
+
+    SAYS: ClassVar[Mapping[str, Said]] = {"time": Said()}
+
+    def begin(self, robot):
+        return {"time": (math.nan,)}
+
+    def step(self, view, memory):
+        return Control(
+            memory={"time": (view.time,)},
+            velocity=(0.1, 0.0, math.nan),
+            measures={"moves": float(view.moves), "step_s": view.step_s},
+        )
+
+
+def test_restarted_robot_steps_before_it_runs():
+    assignment = replace(Plan(pair()).assignment("B"), law=Clock(), start=None, starts=())
+    bench = Bench(assignment, (0.0, 0.0, 0.0))
+    stepping = bench.robot.stepping
+
+    def hear(bench):
+        bench.hear(0, (0.5, 0.0, 0.0))
+
+    bench.step(0.05, hear)
+    late, began = messages.Order("takeoff", at=UTC - 1e5), UTC + bench.t - 30.0
+    assert "not within this experiment" in carry_out(bench.robot, late, bench.t, UTC)[0]
+    assert carry_out(bench.robot, messages.Order("takeoff", at=began), bench.t, UTC)[0] == ""
+    bench.step(0.02, hear)
+    while bench.life.phase != AIRBORNE:
+        assert bench.robot.words == ()
+        bench.step(0.01, hear)
+    bench.step(1.0, hear)
+    since = UTC + bench.t - began
+    assert bench.life.phase == AIRBORNE
+    assert stepping.memory["time"][0] == pytest.approx(since, abs=0.11)
+    assert bench.robot.words == (("time", (pytest.approx(stepping.memory["time"][0]),)),)
+    assert stepping.measures == {"moves": 0.0, "step_s": pytest.approx(0.1)}
+    assert bench.robot.setpoint[:2] == (0.0, 0.0)
+    assert carry_out(bench.robot, messages.Order("start", at=began), bench.t, UTC)[0] == ""
+    bench.step(0.5, hear)
+    assert stepping.memory["time"][0] == pytest.approx(since + 0.5, abs=0.11)
+    assert stepping.measures == {"moves": 1.0, "step_s": pytest.approx(0.1)}
+    assert bench.robot.setpoint[0] > 0.0
 
 
 def test_start_with_unknown_origin_is_refused():

@@ -95,7 +95,7 @@ class View:
         self.given.append((name, order.order))
         if name in self._stage.hung:
             return messages.Reply(name, ok=False, phase="unknown", reason="no answer")
-        if order.order == "start":
+        if order.order in {"takeoff", "start"}:
             assert order.at == START
         self._stage.told(name, order.order)
         return messages.Reply(name, ok=True, phase=self.robots[name].phase)
