@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,11 +21,11 @@ from agents.plugins.avoidance import Avoidance
 from agents.plugins.law import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
-from agents.plugins.triggers import Trigger
+from agents.plugins.triggers import Periodic, Trigger
 from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, kinds, start_poses
 from experiments.definition.experiment import Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
-from experiments.definition.graph import Links
+from experiments.definition.graph import Links, adjacency
 from experiments.definition.links import OneWay, one_way_links
 from twins.arrays import Index
 
@@ -144,6 +144,38 @@ class Plan:
             for receiver in self.names
             if self.experiment.robots[receiver].avoids
         }
+
+    @cached_property
+    def hops(self) -> float:
+        """Largest number of links from any robot to any other, D; infinite where there is no way."""
+        hears, rows = adjacency(self.links, len(self.names)) > 0, len(self.names)
+        reached, hops = np.eye(rows, dtype=bool), 0
+        while not reached.all():
+            wider = reached | (hears @ reached)
+            if (wider == reached).all():
+                return math.inf
+            reached, hops = wider, hops + 1
+        return hops
+
+    def laplacian_eigenvalues(self, weight: Callable[[float, float], float]) -> list[complex]:
+        """Eigenvalues of the Laplacian of the links (N).
+
+        A link weighs `weight` of the numbers of neighbours of its receiver and of its sender.
+        """
+        matrix = adjacency(self.links, len(self.names))
+        degree = matrix.sum(axis=1)
+        for i, j in np.argwhere(matrix):
+            matrix[i, j] = weight(float(degree[i]), float(degree[j]))
+        values = np.linalg.eigvals(np.diag(matrix.sum(axis=1)) - matrix)
+        return [complex(each) for each in values]
+
+    @property
+    def talk_period_s(self) -> float:
+        """Shortest time between two steps of a law after both of which its robot may transmit [s]."""
+        trigger = self.trigger
+        period = trigger.period_s if isinstance(trigger, Periodic) else 0.0
+        decides = 1.0 / self.experiment.rates.coordination_hz
+        return max(decides, period, trigger.minimum_interval_s, trigger.evaluate_every_s)
 
     @cached_property
     def _links_to(self) -> dict[str, list[int]]:

@@ -4,8 +4,10 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from agents.formation.link import Link
+from agents.plugins.gallery.aggregative import Aggregative
 from agents.plugins.gallery.coverage import Coverage
 from agents.plugins.gallery.leader_observer import LeaderObserver
 from agents.plugins.law import NeighbourView, RobotFacts, View
@@ -50,6 +52,40 @@ def test_average_of_ramps_has_a_bounded_error():
 def test_events_save_messages():
     counts = [len(trace("average", case).sent) for case in CASES]
     assert counts[1] < counts[0] / 4
+
+
+@pytest.mark.parametrize(("case", "most"), [("periodic", 1e-3), ("event", 3e-3), ("event-loss", 0.01)])
+def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
+    known = trace("aggregative", case)
+    law, names = Aggregative(**{k: v for k, v in known.experiment.formation.law.items() if k != "kind"}), known.robots
+    targets, places = np.array([law.targets[name] for name in names]), np.array([*law.places.values()])
+    share = law.team * len(places) / len(names)
+    centre = (law.own * targets.mean(axis=0) + share * places.mean(axis=0)) / (law.own + share)
+    optimum = targets - share / law.own * (centre - places.mean(axis=0))
+    error = np.linalg.norm(known.true_position[..., :2] - optimum, axis=2).max(axis=1)
+    assert error[0] > 0.5
+    assert error[known.time > 36.0].max() < most
+    falls = (error < 0.5) & (error > 3.0 * most) & (known.time < 25.0)
+    rate = -np.polyfit(known.time[falls], np.log(error[falls]), 1)[0]
+    assert rate > 0.4  # 0.46: the slowest eigenvalue of points on this ring
+    assert np.abs(known.memory["s"][-1] - centre).max() < 2.0 * most
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_robots_fly_to_the_tasks_that_they_won(case):
+    known = trace("auction", case)
+    law, place = known.experiment.formation.law, known.true_position[..., :2]
+    tasks = np.array([*law["tasks"], *(each[:2] for each in law["later"])])
+    for begin, end, count in ((0.0, 14.9, 4), (15.1, known.time[-1], 5)):
+        first, last = np.searchsorted(known.time, [begin, end])
+        task = known.measures["task"][last].astype(int)
+        won = task[task >= 0]
+        assert sorted(won) == [*range(count)]  # each once
+        ways = np.linalg.norm(place[first, :, None] - tasks[:count], axis=2)
+        least = ways[linear_sum_assignment(ways)].sum()
+        assert ways[task >= 0, won].sum() <= least + 6 * law["epsilon"]
+        assert np.linalg.norm(place[last, task >= 0] - tasks[won], axis=1).max() < 0.03
+    assert np.linalg.norm(place[-1, task < 0] - place[0, task < 0], axis=1).max() < 0.05  # one is left, and stays
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,0 +1,114 @@
+"""The auction on networks of points: its bound, its losses, and tasks that appear."""
+
+from math import ceil, dist
+from random import Random
+
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from agents.plugins.gallery.auction import Auction
+from experiments.catalogue import index
+from experiments.check.check import check
+from experiments.file import document
+from tests.agents.plugins.talking import Talking
+
+EPSILON = 0.2
+
+
+def drawn(seed):
+    """Places of robots and tasks in 4 m × 4 m, links of a tree, and a few more."""
+    random = Random(seed)
+    robots, tasks = random.randint(2, 8), random.randint(1, 10)
+    places, wanted = (
+        [(random.uniform(-2.0, 2.0), random.uniform(-2.0, 2.0)) for _ in range(count)] for count in (robots, tasks)
+    )
+    pairs = {(random.randrange(child), child) for child in range(1, robots)}
+    for _ in range(robots // 3):
+        pairs.add(tuple(sorted(random.sample(range(robots), 2))))
+    return places, wanted, sorted(pairs)
+
+
+def settled(talking, most=6000):
+    """Rounds until all hold the same bids and have heard that nothing changes."""
+    calm = 0
+    while calm < 40:
+        before = [(each["level"], each["bidder"]) for each in talking.memory]
+        talking.round()
+        now = [(each["level"], each["bidder"]) for each in talking.memory]
+        calm = calm + 1 if before == now and len(set(now)) == 1 else 0
+        assert talking.rounds < most
+    return talking.rounds - 40
+
+
+def least(places, tasks):
+    """Least sum of ways [m]."""
+    ways = np.array([[dist(place, task) for task in tasks] for place in places])
+    return ways[linear_sum_assignment(ways)].sum()
+
+
+def won(talking):
+    return [int(each.measures["task"]) for each in talking.controls]
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_sum_of_ways_is_within_the_bound_of_the_least(loss):
+    gaps = []
+    for seed in range(100):
+        places, tasks, pairs = drawn(seed)
+        law = Auction(tasks=tasks, epsilon=EPSILON, calm_s=1e9)
+        talking = Talking(law, places, pairs, loss=loss, seed=seed)
+        settled(talking)
+        got = [each for each in won(talking) if each >= 0]
+        assert len(got) == len(set(got)) == min(len(places), len(tasks))
+        ways = sum(dist(place, tasks[k]) for place, k in zip(places, won(talking), strict=True) if k >= 0)
+        gaps.append((ways - least(places, tasks)) / (EPSILON * len(places)))
+    assert min(gaps) > -1e-9
+    assert 0.01 < max(gaps) <= 1.0  # some are not the least
+
+
+def test_all_bid_anew_when_a_task_appears():
+    places, tasks, pairs = drawn(3)
+    law = Auction(tasks=tasks[:-1], later=[(*tasks[-1], 20.0)], epsilon=EPSILON, calm_s=0.5)
+    talking = Talking(law, places, pairs)
+    while talking.rounds * talking.step_s < 19.95:
+        talking.round()
+    begin = [place[:2] for place in talking.places]
+    assert sorted(dist(place, tasks[k]) < 0.01 for place, k in zip(begin, won(talking), strict=True) if k >= 0)
+    settled(talking)
+    ways = sum(dist(place, tasks[k]) for place, k in zip(begin, won(talking), strict=True) if k >= 0)
+    assert ways <= least(begin, tasks) + EPSILON * len(places)
+
+
+def test_a_robot_that_begins_anew_takes_up_what_it_had_won():
+    places, tasks, pairs = drawn(5)
+    law = Auction(tasks=tasks, epsilon=EPSILON, calm_s=1e9)
+    talking = Talking(law, places, pairs)
+    settled(talking)
+    before = sorted(won(talking))
+    talking.memory[1] = talking.said[1] = law.begin(talking.facts[1])
+    settled(talking)
+    again = won(talking)
+    assert len({k for k in again if k >= 0}) == sum(k >= 0 for k in again)
+    assert len(again) == len(before)
+
+
+def findings(*changes):
+    found = check(document.read(index.find_file("auction"), changes), ["periodic"])
+    return [(each.severity, each.message, each.remedy) for each in found if each.code == "law"]
+
+
+@pytest.mark.slow
+def test_rounds_are_foretold():
+    ((severity, message, _),) = findings()
+    rounds = 3 * ceil(dist((1.5, -1.5), (-1.6, 1.2)) / 0.15)
+    assert severity == "note"
+    assert f"about {rounds} rounds" in message
+
+
+@pytest.mark.slow
+def test_bids_that_are_too_small_or_not_heard_are_found():
+    ((severity, _, remedy),) = findings("formation.law.epsilon=0.01")
+    assert severity == "warning"
+    enough = remedy.split()[3]
+    assert findings(f"formation.law.epsilon={enough}")[0][0] == "note"
