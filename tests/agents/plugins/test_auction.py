@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from agents.plugins.gallery.auction import Auction
 from experiments.catalogue import index
 from experiments.check.check import check
+from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.plugins.talking import Talking
 
@@ -107,8 +108,16 @@ def test_rounds_are_foretold():
 
 
 @pytest.mark.slow
-def test_bids_that_are_too_small_or_not_heard_are_found():
+def test_bids_that_are_too_small_are_found():
     ((severity, _, remedy),) = findings("formation.law.epsilon=0.01")
     assert severity == "warning"
     enough = remedy.split()[3]
     assert findings(f"formation.law.epsilon={enough}")[0][0] == "note"
+
+
+def test_bids_that_do_not_come_back_are_found():
+    text = index.find_file("auction").read_text("utf-8").replace(" - CF", " > CF")
+    plan = Plan(document.loads(text).cases()["periodic"])
+    ((severity, message, _),) = plan.law.analyse(plan)
+    assert severity == "error"
+    assert "do not reach" in message
