@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from math import ceil, dist, floor, inf, nan
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
@@ -13,6 +13,8 @@ from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Severity,
 from agents.vectors import NotNegative, Positive
 
 Place = tuple[float, float]
+
+MOST_TASKS: Final = 31  # of 64 numbers, two for each task
 
 
 class Auction(Law, frozen=True):
@@ -24,7 +26,8 @@ class Auction(Law, frozen=True):
     assignment problem", IEEE Conference on Decision and Control, 2008; on consensus of bids H.-L. Choi, L. Brunet,
     J. P. How, "Consensus-based decentralized auctions for robust task allocation", IEEE Transactions on Robotics
     25(4), 2009). Bids are states, which a lost message only delays. Prices count in ε: levels are said exactly. Robots
-    without a task stay. When a task appears all bid anew, from the places where they are then.
+    without a task stay. When a task appears all bid anew, from the places where they are then. A robot that is lost
+    keeps what it won.
     """
 
     ALONE: ClassVar[bool] = True
@@ -45,6 +48,11 @@ class Auction(Law, frozen=True):
     speed: Annotated[Positive, Meta(description="on the way to the task [m/s]")] = 0.2
     gain: Annotated[Positive, Meta(description="of the approach to the task [1/s]")] = 1.0
     calm_s: Annotated[NotNegative, Meta(description="time without a new bid before the robot moves [s]")] = 1.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if there are more tasks than can be said."""
+        if len(self.tasks) + len(self.later) > MOST_TASKS:
+            raise ValueError(f"at most {MOST_TASKS} tasks: of each a pose carries two numbers")
 
     def begin(self, robot: RobotFacts) -> Memory:
         """Price level and bidder of each task, number of tasks so far, way to each [m], time without a new bid [s]."""
