@@ -71,5 +71,6 @@ def equally_long(lengths: Iterable[float]) -> bool:
 def coverage(case: CaseMetrics) -> float:
     """Known share of the errors of the robots in the means; 1 without any."""
     out = {*case.leaders, *case.died}
-    known = [robot.coverage for robot in case.robots if robot.robot not in out and robot.iae is not None]
+    robots = [robot for robot in case.robots if robot.robot not in out and robot.iae is not None]
+    known = [robot.coverage for robot in robots if robot.coverage is not None]
     return sum(known) / len(known) if known else 1.0

@@ -32,7 +32,7 @@ from experiments.metrics.metric import (
     unusable_metrics,
     values_of,
 )
-from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, RobotMetrics
+from experiments.metrics.results import Approach, Belief, CaseMetrics, Collision, LawMeasure, RobotMetrics
 from experiments.metrics.shadow import agreement
 from experiments.metrics.signals import (
     LinkErrors,
@@ -46,7 +46,7 @@ from experiments.metrics.signals import (
     outside_arena,
 )
 from experiments.recording.trace import ROUNDING_S, Trace
-from twins.arrays import norm
+from twins.arrays import Array, norm
 
 TROUBLES: Final = ("late", "unread")  # kinds of events of the run itself, not of a robot
 PRESENT: Final = 0.8  # a robot whose position is known for less of the run was out of reach
@@ -125,7 +125,7 @@ def measure(trace: Trace) -> CaseMetrics:
         mean=case_values(known_metrics(), values, kept),
         acquired_s=tuple(together),
         rotation_rad_s=tuple(rotation),
-        j2=_benchmark_cost(trace, errors),
+        j2=_benchmark_cost(trace, errors) if shared.has_errors else None,
         belief=tuple(
             Belief(names[i], names[j], _number(rms[k]), _number(largest[k]))
             for k, (i, j) in enumerate(zip(errors.net.receiver, errors.net.sender, strict=True))
@@ -158,6 +158,7 @@ def measure(trace: Trace) -> CaseMetrics:
         network_bytes=sum(robot.bytes + robot.goal_bytes for robot in robots),
         deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
+        measures=_law_measures(shared, kept),
         metric_faults=(*unusable_metrics(), *faults),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
@@ -188,6 +189,9 @@ def _robots(
         delivered += trace.goals.received
     goals, goal_bytes = centralised.goals_to(trace)
     late, agreements = centralised.delays(trace), agreement(trace)
+    settled: list[float | None] = [None] * rows
+    if shared.has_errors:
+        settled = [duration if when is None else when for when in shared.settled]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     numbers = {  # (N,) each
         **{"recorded": shared.transmissions[1], "listeners": listeners, "heard": delivered},
@@ -214,9 +218,9 @@ def _robots(
             residual=shared.phases[0][i].residual,
             worst=shared.phases[0][i].worst,
             phases=tuple(phase[i] for phase in shared.phases[1:]),
-            settle_s=duration if (when := shared.settled[i]) is None else when,
+            settle_s=settled[i],
             missed_share=_share(trace.missed_deadlines[i], trace.ticks[i] + trace.missed_deadlines[i]),
-            coverage=float(coverage[i]),
+            coverage=float(coverage[i]) if shared.has_errors else None,
             known=float(shared.known[i]),
             collisions=len(own[i]),
             impulse=max((each.impulse for each in own[i] if each.impulse is not None), default=None),
@@ -228,10 +232,21 @@ def _robots(
             avoided_share=_share(trace.avoided[i], trace.ticks[i]),
             shadow=agreements[i],
             extra={name: values[name][i] for name in foreign},
+            measures=_law_measures(shared, [i]),
             **plain(i),
         )
         for i, name in enumerate(trace.robots)
     )
+
+
+def _law_measures(shared: Measurement, rows: Sequence[int]) -> dict[str, LawMeasure]:
+    """Each measure of the law, mean over these robots."""
+
+    def mean(values: Array) -> float | None:
+        return _number(mean_known(values[:, rows].reshape(-1)).item())
+
+    every = shared.trace.measures.items()
+    return {name: LawMeasure(mean(values), mean(values[-shared.window :])) for name, values in every}
 
 
 def _distance_to_goal(trace: Trace, net: Links, row: int) -> float | None:

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.plugins.laws import Gradient
 from experiments.metrics.clearance import Clearance
 from experiments.metrics.results import Phase
 from experiments.metrics.signals import (
@@ -40,6 +41,11 @@ class Measurement:
     def errors(self) -> LinkErrors:
         """Errors of the links [m]."""
         return LinkErrors.of_trace(self.trace)
+
+    @cached_property
+    def has_errors(self) -> bool:
+        """Whether links have errors: only gradient laws measure them."""
+        return isinstance(self.trace.plan.law, Gradient)
 
     @cached_property
     def robot_errors(self) -> Array:

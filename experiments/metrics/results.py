@@ -68,6 +68,13 @@ class Guidance(msgspec.Struct, frozen=True):
     missed: int  # decisions skipped, because they were too late
 
 
+class LawMeasure(msgspec.Struct, frozen=True):
+    """A measure of a law that remembers, in the unit of the law."""
+
+    mean: float | None  # over the run
+    end: float | None  # over the last second
+
+
 class RobotMetrics(msgspec.Struct, frozen=True):
     """Metrics of a robot in a case; unknown numbers are None."""
 
@@ -89,7 +96,8 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     residual: float | None  # [m] worst link, |error| averaged over the last second of the first phase
     worst: str  # robot at the other end of that link
     phases: tuple[Phase, ...]  # each later phase
-    settle_s: float  # [s] when e enters the 2 % band of its largest value for good; the duration if never
+    # [s] when e enters the 2 % band of its largest value for good; the duration if never, None for laws without errors
+    settle_s: float | None
     missed_share: float | None  # missed deadlines over the ticks that were due, made or missed
     updates: int  # goals computed anew
     gap_min_s: float | None  # [s] shortest time between two transmissions
@@ -98,7 +106,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     recorded: int  # poses in the recording
     listeners: int  # receivers, with the central controller
     heard: int  # poses of it received, by all receivers together
-    coverage: float  # known share of its link errors
+    coverage: float | None  # known share of its link errors; None for laws without errors
     known: float  # share of the run in which its own position is known
     collisions: int  # contacts with robots, obstacles and walls
     impulse: float | None  # [N s] of the hardest contact; None if unknown
@@ -118,6 +126,7 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     delay_max_s: float | None = None  # [s]
     foreign: int = 0  # poses in its name that did not come from its process, and were refused
     extra: dict[str, float | None] = {}  # metrics of other distributions, by name
+    measures: dict[str, LawMeasure] = {}  # of its law, by name
 
     def value(self, name: str) -> float | None:
         """The value of a metric; None if it is unknown, or was not measured."""
@@ -171,8 +180,8 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     # [rad/s] net rotation rate of the formation per phase, from acquisition on
     rotation_rad_s: tuple[float | None, ...]
     # cost of the authors' benchmark: Σ(0.02 n_m + 0.1 n_u + 0.3 t_s + 0.1 IAE + 0.01 ITAE) over the robots that receive
-    # poses, each until its settling time t_s, see `measure`
-    j2: float
+    # poses, each until its settling time t_s, see `measure`; None for laws without errors
+    j2: float | None
     belief: tuple[Belief, ...]  # per link
     belief_rms: float | None  # [m] over all links
     belief_max: float | None  # [m] over all links
@@ -209,4 +218,5 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     guidance: Guidance | None = None  # None if each robot decides for itself
     # why the figures are compared with none of another case, one clause each, see `metrics.comparable`
     spoiled: tuple[str, ...] = ()
+    measures: dict[str, LawMeasure] = {}  # of the law by name, means over the robots in the means
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each

@@ -22,6 +22,7 @@ from experiments.metrics.metric import PLAIN, known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.metrics.signals import formation_errors, phase_starts
 from experiments.recording.trace import Trace
+from twins.arrays import Array
 
 LONGEST: Final = 63  # letters of a name in MATLAB
 LARGEST: Final = 2**31  # bytes of a variable that MATLAB reads from a file of this version
@@ -96,20 +97,36 @@ def write_mat(traces: Mapping[str, Trace], metrics: Mapping[str, CaseMetrics], f
 
 
 def write_csv(traces: Mapping[str, Trace], file: Path) -> None:
-    """Writes a table with a line for each case, time and robot; empty where a value is unknown."""
+    """Writes a table with a line for each case, time and robot; empty where a value is unknown.
+
+    Behind the columns of all runs stand those of laws that remember, see `_of_law`.
+    """
+    of_law = dict.fromkeys(name for trace in traces.values() for name in _of_law(trace))
     try:
         with file.open("w", newline="", encoding="utf-8") as stream:
             table = csv.writer(stream)
-            table.writerow(["case", "time", "robot", *COLUMNS])
+            table.writerow(["case", "time", "robot", *COLUMNS, *of_law])
             for case, trace in traces.items():
                 parts = (trace.position, trace.yaw[..., None], trace.true_position, trace.goal)
-                values = np.concatenate([*parts, formation_errors(trace)[..., None]], axis=2)
+                told, unknown = _of_law(trace), np.full(trace.yaw.shape, np.nan)
+                more = [told.get(name, unknown)[..., None] for name in of_law]
+                values = np.concatenate([*parts, formation_errors(trace)[..., None], *more], axis=2)
                 cells = values.astype(object)
                 cells[~np.isfinite(values)] = None
                 for t, rows in zip(trace.time.tolist(), cells.tolist(), strict=True):
                     table.writerows([case, t, robot, *row] for robot, row in zip(trace.robots, rows, strict=True))
     except OSError as error:
         raise _unwritable(file, error) from None
+
+
+def _of_law(trace: Trace) -> dict[str, Array]:
+    """Columns of a law that remembers, each (T, N): `memory_NAME`, `memory_NAME[0]` and so on, `measure_NAME`."""
+    found = {}
+    for name, values in trace.memory.items():
+        size = values.shape[2]
+        for k in range(size):
+            found[f"memory_{name}[{k}]" if size > 1 else f"memory_{name}"] = values[..., k]
+    return found | {f"measure_{name}": values for name, values in trace.measures.items()}
 
 
 FRAMES_HZ: Final = 15.0  # of a film

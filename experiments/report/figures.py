@@ -20,8 +20,9 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
+from agents.plugins.laws import Gradient
 from experiments.metrics.measurement import WINDOW_S, bounds_of
-from experiments.metrics.metric import FORMULA, known_metrics
+from experiments.metrics.metric import ERRORS, FORMULA, known_metrics
 from experiments.metrics.results import CaseMetrics
 from experiments.metrics.shadow import differences, in_heading
 from experiments.metrics.signals import LinkErrors, leaders, moving_mean, transmission_gaps
@@ -60,6 +61,7 @@ BAND: Final = "#009E73"  # the tolerance
 LEAST_ERROR: Final = 1e-5  # [m] below this an error axis does not go
 WIDE: Final = 8.0  # rates farther apart are drawn on a logarithmic axis
 MOST_SEEDS: Final = 50  # of a case, for the range of its errors
+MOST_MEASURES: Final = 6  # of a law, each with a panel
 SOLID: Final = 0.95  # share of the time that marks cover where there is nothing to see between them
 
 __all__ = ["formation", "plan_view", "svg"]  # besides those of this module
@@ -74,7 +76,7 @@ def every(
     """All figures of a run by name; motions of the first seed, `errors` of all seeds.
 
     Figures without content are left out: all without a trace; ratios of a single case; pictures of space where no
-    position is known, or in perspective where all robots stay on the floor.
+    position is known, or in perspective where all robots stay on the floor; errors of laws that measure none.
 
     Args:
         cases, traces: The run; several seeds of a case have one name.
@@ -87,8 +89,11 @@ def every(
         figures["plan_view"] = plan_view(first, width)
         if any((trace.true_position[..., 2] > LOW).any() for trace in first):
             figures["formation"] = formation(first, width)
-    if first:
-        figures["errors"] = errors(known, cases, width, bands)
+    judged = [trace for trace in known if isinstance(trace.plan.law, Gradient)]
+    if judged:
+        figures["errors"] = errors(judged, cases, width, bands)
+    if any(trace.measures for trace in first):
+        figures["measures"] = measures(first, width)
     if len(by_case(cases)) > 1:
         figures["global_bars"] = global_bars(cases, width)
     if cases:
@@ -110,10 +115,11 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     grouped = by_case(cases)
     (reference, first), *others = grouped.items()
     figure = Drawing(figsize=(width, 1.9 if len(others) <= 4 else 2.3), layout="constrained")
-    bars = _bar_metrics()
-    panels = figure.subplots(1, 2, width_ratios=(1, len(bars) - 1))
+    bars = _bar_metrics(cases)
+    parts = [part for part in (bars[:1], bars[1:]) if part]
+    panels = figure.subplots(1, len(parts), width_ratios=[len(part) for part in parts], squeeze=False)[0]
     share = min(0.8 / max(1, len(others)), 0.5)
-    for axes, indices in zip(panels, (bars[:1], bars[1:]), strict=True):
+    for axes, indices in zip(panels, parts, strict=True):
         tops = [0.0]
         for k, (name, runs) in enumerate(others):
             found = [spread(ratios(runs, first, index)) for index, _, _ in indices]
@@ -141,16 +147,17 @@ def global_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
         axes.grid(axis="y")
     panels[0].set_ylabel(f"relative to {plain(reference)}")
-    legend_above(figure, panels[1].get_legend_handles_labels(), columns=3)
+    legend_above(figure, panels[-1].get_legend_handles_labels(), columns=3)
     return figure
 
 
-def _bar_metrics() -> list[tuple[str, str, str]]:
-    """Metrics that are drawn as bars: name, label and unit as matplotlib writes them."""
+def _bar_metrics(cases: Sequence[CaseMetrics]) -> list[tuple[str, str, str]]:
+    """Metrics that are drawn as bars: name, label and unit as matplotlib writes them; no errors of laws without any."""
+    judged = any(case.j2 is not None for case in cases)
     return [
         (name, f"${metric.label}$" if len(metric.label) == 1 else plain(metric.label), metric.unit.translate(FORMULA))
         for name, metric in known_metrics().items()
-        if metric.figure
+        if metric.figure and (judged or name not in ERRORS)
     ]
 
 
@@ -160,7 +167,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     grouped = by_case(cases)
     names = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots))
     out = {name for case in cases for name in (*case.leaders, *case.died)}
-    bars = [each for each in _bar_metrics() if known_metrics()[each[0]].per == "robot"]
+    bars = [each for each in _bar_metrics(cases) if known_metrics()[each[0]].per == "robot"]
     figure = Drawing(figsize=(width, min(1.075 * len(bars), TALLEST)), layout="constrained")
     panels = figure.subplots(len(bars), 1, sharex=True, squeeze=False)[:, 0]
     share = 0.8 / max(1, len(grouped))
@@ -244,6 +251,35 @@ def errors(
     axes.grid()
     time_axis(axes, traces)
     axes.set_ylabel("error of the worst link [m]")
+    legend_above(figure, (list(handles.values()), list(handles)), columns=6)
+    return figure
+
+
+@styled
+def measures(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
+    """Measures of laws that remember, over time: a panel each, the median of the robots thick, single ones thin."""
+    names = [*dict.fromkeys(name for trace in traces for name in trace.measures)][:MOST_MEASURES]
+    height = panel_height(len(names), 1.3)
+    figure = Drawing(figsize=(width, height * len(names) + 0.7), layout="constrained")
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    handles: dict[str, Artist] = {}
+    for axes, name in zip(panels, names, strict=True):
+        for k, trace in enumerate(traces):
+            if name not in trace.measures:
+                continue
+            line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
+            few = thinned(trace, len(names) * len(traces))
+            values = trace.measures[name][few]
+            axes.plot(trace.time[few], values, color=line["color"], linewidth=0.4, alpha=0.45)
+            known = np.isfinite(values).any(axis=1)
+            axes.plot(trace.time[few][known], np.nanmedian(values[known], axis=1), **line, linewidth=1.3, zorder=3)
+            handles[plain(trace.case)] = Line2D([], [], **line, linewidth=1.3)
+        mark_phases(axes, traces[0])
+        axes.grid()
+        axes.set_ylabel(plain(name))
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+    time_axis(panels[-1], traces)
+    figure.align_ylabels(list(panels))
     legend_above(figure, (list(handles.values()), list(handles)), columns=6)
     return figure
 

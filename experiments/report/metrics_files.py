@@ -10,11 +10,11 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 
-from experiments.metrics.results import CaseMetrics, RobotMetrics, ShadowMetrics
+from experiments.metrics.results import CaseMetrics, LawMeasure, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 from twins.arrays import Array
 
-_NESTED: Final = ("phases", "near", "near_arena", "shadow", "extra")
+_NESTED: Final = ("phases", "near", "near_arena", "shadow", "extra", "measures")
 
 
 def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[str, Any]:
@@ -37,6 +37,7 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
                 "near_m": None if case.near is None else case.near.gap,
                 **({"duration_s": case.duration_s, "interrupted": True} if case.interrupted else {}),
                 **({"spoiled": list(case.spoiled)} if case.spoiled else {}),
+                **({"measures": msgspec.to_builtins(case.measures)} if case.measures else {}),
                 **({"metric_faults": list(case.metric_faults)} if case.metric_faults else {}),
             }
             for case in cases
@@ -57,7 +58,7 @@ def write_csv(path: Path, cases: Sequence[CaseMetrics]) -> None:
         for case in cases:
             table.writerows(_robot_rows(case))
             known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
-            table.writerow({**known, "robot": "mean", **case.mean})
+            table.writerow({**known, "robot": "mean", **case.mean, **_flat_measures(case.measures)})
 
 
 def rows(cases: Sequence[CaseMetrics]) -> Iterator[dict[str, object]]:
@@ -74,7 +75,8 @@ def _columns(cases: Sequence[CaseMetrics]) -> list[str]:
     shadows = list(_flat_shadow(None)) if any(robot.shadow for case in cases for robot in case.robots) else []
     phases = [f"phase{k}_{what}" for k in range(2, later + 1) for what in ("acquired_s", "residual", "worst")]
     added = dict.fromkeys(name for case in cases for name in case.mean if name not in _PLAIN)
-    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added]
+    of_law = dict.fromkeys(name for case in cases for name in _flat_measures(case.measures))
+    return ["seed", "case", "spoiled", "in_mean", *_PLAIN, *phases, *near, *shadows, *added, *of_law]
 
 
 _PLAIN: Final = [field for field in RobotMetrics.__struct_fields__ if field not in _NESTED]
@@ -90,9 +92,18 @@ def _robot_rows(case: CaseMetrics) -> Iterator[dict[str, object]]:
             if near is not None:
                 row |= {f"{what}_gap": near.gap, f"{what}_to": near.between[1], f"{what}_at_s": near.at_s}
         row |= _flat_shadow(robot.shadow) if robot.shadow else {}
-        row |= robot.extra
+        row |= robot.extra | _flat_measures(robot.measures)
         known = {"seed": case.seed, "case": case.case, "spoiled": int(bool(case.spoiled))}
         yield {**known, "in_mean": int(robot.robot not in out), **row}
+
+
+def _flat_measures(measures: Mapping[str, LawMeasure]) -> dict[str, float | None]:
+    """Measures of a law as columns, `measure_NAME_mean` and `measure_NAME_end`."""
+    return {
+        f"measure_{name}_{what}": getattr(value, what)
+        for name, value in measures.items()
+        for what in LawMeasure.__struct_fields__
+    }
 
 
 def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:

@@ -295,6 +295,7 @@ def _pictures(
         "formation": f"Trajectories in space, {of_cases}; start hollow, end full, with its links.{standing}{seed}",
         "robot_bars": _robot_caption(cases),
         "errors": f"Error of the worst link of the formation, mean over the last second; {curves}{legs}.{recorded}",
+        "measures": f"Measures of the law over time: median of the robots, single robots thin{legs}.{seed}",
         "events": f"Transmissions of each robot{legs}.{seed}",
         "intervals": f"Share of the times between transmissions up to a length; single robots thin.{seed}",
         "plan_view": f"From above: start hollow, end full, with its links.{standing}{seed}",

@@ -168,6 +168,11 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
             ("of a collision", lambda case: _known(max, (each.impulse for each in case.collisions)), 1000.0)
         ],
         "Cost (a number without unit)": [("J2", _value("j2"), 1.0)],
+        "Measures of the law": [
+            (f"{name}, {words}", partial(_of_law, name=name, what=what), 1.0)
+            for name in dict.fromkeys(name for case in cases for name in case.measures)
+            for what, words in (("mean", "mean"), ("end", "at the end"))
+        ],
     }
     tables = [
         replace(_table_by_case(unit, cases, lines), note=EXTREMES if several and unit in EXTREME_UNITS else "")
@@ -179,9 +184,15 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
         if name not in summary_metrics()
     ]
     tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
-    formed = any(case.belief for case in cases)  # a formation that was never acquired is a result
+    # a formation that was never acquired is a result; without errors of links there is none
+    formed = any(case.belief and case.j2 is not None for case in cases)
     shown = [table if formed and table is tables[0] else _occurred(table) for table in tables]
     return tuple(table for table in shown if table.rows)
+
+
+def _of_law(case: CaseMetrics, name: str, what: str) -> float | None:
+    """A number of a measure of the law; None where the law of the case has no such measure."""
+    return getattr(case.measures.get(name), what, None)
 
 
 def _total(runs: Sequence[CaseMetrics], name: str) -> float | None:
@@ -305,7 +316,7 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     columns += [(f"{_phase(runs, k).strip()} [s]", partial(_acquired_again, k=k)) for k in later]
     worst = "Worst link at the end" + (", mean" if len(runs) > 1 else "")
     columns.append((f"{worst} [cm]", lambda robots: number(_known(_mean, (r.by_the_end[0] for r in robots)), 100.0)))
-    if any(robot.coverage < 1.0 for run in runs for robot in run.robots):
+    if any(robot.coverage is not None and robot.coverage < 1.0 for run in runs for robot in run.robots):
         columns.append(("Known [%]", _cell(_mean, "coverage", 100.0)))
     kept = [robot for run in runs for robot in run.robots if robot.robot not in left_out]
     every = {robot.robot: robot.kind for robot in kept}

@@ -21,6 +21,7 @@ NAMED = 3  # so many collisions, or twins, are named; the tables have them all
 def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """The verdict over all cases, the first one being the reference; nothing is praised if one of them was spoiled."""
     formation = any(case.belief for case in cases)
+    judged = [case for case in cases if case.belief and case.j2 is not None]  # others have laws without errors
     found = [
         *failures(cases),
         *spoiled(cases),
@@ -34,7 +35,8 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *_gaps(cases),
         *_of_each_case(cases, _died),
         *_of_each_case(cases, _guided),
-        *([*_acquired(cases), _worst_link(cases), *_against_the_first(cases)] if formation else []),
+        *([*_acquired(judged), _worst_link(judged)] if judged else []),
+        *(_against_the_first(cases) if formation else []),
         *contacts(cases),
         *_avoided(cases),
         *_unfinished(cases),
@@ -291,7 +293,8 @@ def _against_the_first(cases: Sequence[CaseMetrics]) -> list[Finding]:
             text = f"Its errors relative to {reference}: {_list(parts)}{some}."
             mark: Mark = "good" if worse <= 1.0 and not some else "plain" if worse < 1.25 else "fair"
             found.append(Finding(mark, text))
-        if "IAE" not in dict(known) and rate.mean is not None:
+        judged = all(run.j2 is not None for run in (*runs, *first))
+        if judged and "IAE" not in dict(known) and rate.mean is not None:
             text = f"Less is known of one of {name} and {reference}: integrals of errors are not compared."
             found.append(Finding("fair", text))
     return found
