@@ -18,6 +18,7 @@ from twins.engines.engine import Engine, EngineFactory, Motion, Stage, Touch
 from twins.engines.point_mass import PointMassEngine, model, require_models
 from twins.models import noise
 from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
+from twins.models.onboard_flight import OnboardFlight
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
     from twins.scene import World
@@ -72,6 +73,8 @@ class Twin:
         self._jitters, self._measures = self._jitter.present, self._measurement.present
         self._drifts, self._delays = self._drift.present, self._latency.present
         self._drives, self._endurance = not kind.flies, kind.endurance_s
+        if disturbance.wind is not None and isinstance(motion, OnboardFlight):
+            motion.blow(disturbance.wind)
         self._command, self._before = NO_SETPOINT, motion.position
         self._t = self._used = 0.0
         self._measured_at, self._measured, self._velocity = -inf, ZERO, ZERO

@@ -32,6 +32,9 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     correlation_s: Annotated[float, Meta(description="correlation time [s]", gt=0, lt=1000)] = 0.5
 
 
+Push = Annotated[float, Meta(ge=-5, le=5)]  # [m/s²]
+
+
 class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Disturbances of a simulated body; a field left out adds none."""
 
@@ -46,10 +49,14 @@ class Disturbance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     odometry_drift: Annotated[
         float | None, Meta(description="random walk of the measured position with the way [m per square root of m]")
     ] = None
+    wind: Annotated[
+        tuple[Push, Push] | None,
+        Meta(description="push of a steady wind on a flying robot, as an acceleration x, y [m/s²]"),
+    ] = None
 
     def without_noise(self) -> Disturbance:
-        """Disturbance without its random parts: the latency."""
-        return Disturbance(latency_s=self.latency_s)
+        """Disturbance without its random parts: latency and wind."""
+        return Disturbance(latency_s=self.latency_s, wind=self.wind)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ _SYNONYMS: Final = {  # of words that users look for: words that keys and their 
     "frequency": ("hz", "rate"),
     "gps": ("positioning", "capture"),
     "graph": ("links", "topology"),
+    "gust": ("drift", "jitter", "wind"),
     "latency": ("delay", "late"),
     "localisation": ("positioning", "position"),
     "loss": ("drop", "lost"),
@@ -54,7 +55,6 @@ _SYNONYMS: Final = {  # of words that users look for: words that keys and their 
     "saturation": ("clamp", "limit", "speed"),
     "velocity": ("speed",),
     "wall": ("arena", "obstacle"),
-    "wind": ("drift", "jitter"),
 }
 _LIMITS: Final = {
     "minimum": "≥ {}",

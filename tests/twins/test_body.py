@@ -138,6 +138,17 @@ def test_hover_jitter_fades_on_the_way_down():
     assert (state.true_position, state.flying) == (ZERO, False)
 
 
+@pytest.mark.parametrize("engine", ["point-mass", "pymunk"])
+def test_wind_pushes_what_flies_by_the_error_of_its_loop(engine):
+    world = World(Scene.empty(), engine, ((),) * 2, 1.0, (False,) * 2)
+    twin = TwinBody(request((CRAZYFLIE, KHEPERA4), STARTS[:2], disturbance=Disturbance(wind=(0.8, -0.3))), world)
+    twin.takeoff([0], [0.5])
+    for tick in range(1200):
+        flying, standing = twin.read(tick * DT)
+    assert flying.true_position == pytest.approx((0.1 + 0.08, 0.2 - 0.03, 0.5), abs=1e-3)
+    assert standing.true_position == (*STARTS[1], 0.0)
+
+
 def test_ground_robots_measure_no_height():
     twin = body(KHEPERA4, Disturbance(position_sigma=0.002, yaw_sigma=0.01))
     errors = []

@@ -77,6 +77,7 @@ class _Drone(FaultyLink[tuple[bytes, tuple[str, int]]]):
         super().__init__(faults, np.random.default_rng([seed, zlib.crc32(name.encode()), zlib.crc32(b"loss")]))
         self.wire, self._dt = wire, 1.0 / body.rate_hz
         self.model = Quadrotor(body.kinds[row], body.start[row], body.yaw[row])
+        self.model.blow(disturbance.wind or (0.0, 0.0))
         self._jitter = HoverJitter(disturbance, name, seed, self._dt)
         self._latency = Latency(disturbance, self._dt)
         self.start_yaw = body.yaw[row]

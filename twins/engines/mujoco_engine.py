@@ -8,6 +8,7 @@ the engine `pymunk`.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Final
@@ -118,6 +119,10 @@ class Drone(OnboardFlight):
         if self._drones.start_motors(self):
             super().takeoff(height)
 
+    def blow(self, wind: Planar) -> None:
+        super().blow(wind)
+        self._drones.blow(self)
+
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
         super().place(position, yaw, flying=flying)
         self._drones.place(self)
@@ -181,6 +186,12 @@ class Drones:
         drone = Drone(self, len(self._drones), kind, start, yaw)
         self._drones.append(drone)
         return drone
+
+    def blow(self, drone: Drone) -> None:
+        """Push a drone by its wind, as a slant of gravity in a model of its own."""
+        model = copy.copy(self._models[drone.row])
+        model.opt.gravity[:2] = drone.wind
+        self._models[drone.row] = model
 
     def start_motors(self, drone: Drone) -> bool:
         """Prepare a take-off; returns whether the drone stands upright."""

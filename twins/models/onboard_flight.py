@@ -19,7 +19,7 @@ class OnboardFlight:
     __slots__ = (
         "_by_velocity", "_climb_s", "_climbing", "_elapsed", "_from", "_landing", "_target", "_to",
         "_velocity_setpoint", "_yaw_rate", "_yaw_setpoint", "attitude", "flying", "held", "position", "velocity",
-        "wobble", "yaw",
+        "wind", "wobble", "yaw",
     )  # fmt: skip
 
     position: Vector  # the truth, hover jitter included [m]
@@ -29,6 +29,7 @@ class OnboardFlight:
     flying: bool  # motors on
     attitude: Attitude  # NaN where it is always upright
     wobble: tuple[float, float]  # hover jitter of the next step [m]
+    wind: tuple[float, float]  # acceleration that it adds while the motors are on [m/s²]
     _by_velocity: bool  # setpoints are velocity and yaw rate
     _target: Vector  # setpoint of the position [m],
     _yaw_setpoint: float  # and of the yaw [rad]
@@ -44,7 +45,7 @@ class OnboardFlight:
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
         """At rest at `start` [m] with `yaw` [rad], motors off."""
         self._by_velocity = kind.takes == "velocity"
-        self.attitude, self.wobble = NO_ATTITUDE, (0.0, 0.0)
+        self.attitude, self.wobble, self.wind = NO_ATTITUDE, (0.0, 0.0), (0.0, 0.0)
         self._from = self._to = start[2]
         self._elapsed, self._climb_s = 0.0, 1.0
         self.place(start, yaw, flying=False)
@@ -59,6 +60,10 @@ class OnboardFlight:
             self._velocity_setpoint, self._yaw_rate = (x, setpoint[1], setpoint[2]), setpoint[3]
         else:
             self._target, self._yaw_setpoint = (x, setpoint[1], setpoint[2]), setpoint[3]
+
+    def blow(self, wind: tuple[float, float]) -> None:
+        """Set the acceleration by a steady wind [m/s²], before the first step."""
+        self.wind = wind
 
     def takeoff(self, height: float) -> None:
         """Start the motors and climb to `height` [m] at the present place."""

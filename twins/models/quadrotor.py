@@ -14,7 +14,9 @@ GRAVITY: Final = 9.81  # [m/s²]
 class Quadrotor(OnboardFlight):
     """One quadrotor."""
 
-    __slots__ = ("_change", "_dt", "_gain", "_response", "_speed", "_step_gain", "_tilt", "_turn", "_turn_rate")
+    __slots__ = (
+        "_change", "_dt", "_gain", "_push", "_response", "_speed", "_step_gain", "_tilt", "_turn", "_turn_rate"
+    )  # fmt: skip
 
     _response: Flight
     _gain: Vector  # k_p [1/s]
@@ -24,6 +26,7 @@ class Quadrotor(OnboardFlight):
     _dt: float  # step for which the next two hold [s], 0 before the first
     _step_gain: Vector  # k_v dt
     _tilt: Vector  # share of the acceleration that is reached in a step
+    _push: tuple[float, float]  # change of velocity in a step by the wind [m/s]
     _change: Vector  # of velocity in a step, with the lag of tilting [m/s]
 
     def __init__(self, kind: Kind, start: Vector, yaw: float) -> None:
@@ -32,7 +35,7 @@ class Quadrotor(OnboardFlight):
         self._response = flight
         self._gain, self._speed = flight.position, flight.speed
         self._turn, self._turn_rate = kind.turn_response, kind.turn_rate
-        self._dt, self._step_gain, self._tilt = 0.0, ZERO, ZERO
+        self._dt, self._step_gain, self._tilt, self._push = 0.0, ZERO, ZERO, (0.0, 0.0)
         super().__init__(kind, start, yaw)
 
     def place(self, position: Vector, yaw: float, *, flying: bool) -> None:
@@ -44,7 +47,10 @@ class Quadrotor(OnboardFlight):
         self.velocity = velocity
 
     def move(self, dt: float) -> None:
-        """One step of `dt` [s]: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting."""
+        """One step of `dt` [s]: v_cmd = clip(k_p (target − p), ± limit), a = k_v (v_cmd − v), delayed by tilting.
+
+        Wind is added to a: k_v and k_p together leave an error of its acceleration / (k_p k_v) [m].
+        """
         if dt != self._dt:
             self._set_step(dt)
         if self._climbing:
@@ -57,6 +63,7 @@ class Quadrotor(OnboardFlight):
         limit_x, limit_y, limit_z = self._speed
         gain_x, gain_y, gain_z = self._step_gain
         tilt_x, tilt_y, tilt_z = self._tilt
+        push_x, push_y = self._push
         vx, vy, vz = self.velocity
         ax, ay, az = self._change
         if self._by_velocity and not self._climbing:
@@ -73,7 +80,7 @@ class Quadrotor(OnboardFlight):
         ay = (1.0 - tilt_y) * ay + tilt_y * (gain_y * (wy - vy))
         az = (1.0 - tilt_z) * az + tilt_z * (gain_z * (wz - vz))
         self._change = (ax, ay, az)
-        vx, vy, vz = vx + ax, vy + ay, vz + az
+        vx, vy, vz = vx + ax + push_x, vy + ay + push_y, vz + az
         x, y, z = x + dt * vx, y + dt * vy, z + dt * vz
         self.yaw += dt * clamp(turn, -self._turn_rate, self._turn_rate)
         if self._landing and self._touches_down(z):
@@ -85,9 +92,10 @@ class Quadrotor(OnboardFlight):
         self.position = (x + wobble_x, y + wobble_y, z)
 
     def _set_step(self, dt: float) -> None:
-        gain, tilt = self._response.velocity, self._response.tilt
+        gain, tilt, wind = self._response.velocity, self._response.tilt, self.wind
         self._dt, self._step_gain = dt, (dt * gain[0], dt * gain[1], dt * gain[2])
         self._tilt = (min(dt * tilt[0], 1.0), min(dt * tilt[1], 1.0), min(dt * tilt[2], 1.0))
+        self._push = (dt * wind[0], dt * wind[1])
 
     def _fall(self, dt: float, x: float, y: float, z: float) -> None:
         """Motors off: fall from x, y, z [m], or stand."""

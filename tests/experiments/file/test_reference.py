@@ -126,7 +126,7 @@ def test_a_metric_is_explained(metric):
         ("latency", "channel.delay_s"),
         ("camera", "positioning"),
         ("crash", "safety.separation"),
-        ("wind", "disturbance.KIND.hover_jitter"),
+        ("gust", "disturbance.KIND.hover_jitter"),
     ],
 )
 def test_a_word_that_is_no_key_finds_the_keys_about_it(word, key):

@@ -342,6 +342,15 @@ def test_hover_jitter_is_flown():
     assert 0.5 < TRACKED_SHARE < 1.0
 
 
+def test_drone_leans_against_the_wind():
+    body = twin((CRAZYFLIE, CRAZYFLIE), {"R0": Disturbance(wind=(0.8, 0.0)), "R1": Disturbance()})
+    body.takeoff(range(2), [0.5] * 2)
+    for tick in range(1000):
+        windy, calm = body.read(tick * DT)
+    assert 2.0 * np.arcsin(windy.attitude[2]) == pytest.approx(-np.arctan(0.8 / 9.81), rel=0.05)
+    assert abs(calm.attitude[2]) < 1e-3
+
+
 def test_ground_robots_drive_as_point_masses():
     body, plain = twin((KHEPERA4, CRAZYFLIE)), TwinBody(request((KHEPERA4,)))
     for tick in range(100):

@@ -102,6 +102,8 @@ class Quadrotors:
     def __init__(self, request: BodyRequest, dt: float) -> None:
         robots = zip(request.kinds, request.start, request.yaw, strict=True)
         self._models, self._dt = [Quadrotor(*robot) for robot in robots], dt
+        for model, disturbance in zip(self._models, request.disturbance, strict=True):
+            model.blow(disturbance.wind or (0.0, 0.0))
         self.position, self.velocity = np.array(request.start, dtype=float), np.zeros((len(self._models), 3))
         self.yaw, self.flying = np.array(request.yaw, dtype=float), np.zeros(len(self._models), dtype=bool)
 

@@ -390,7 +390,7 @@ def test_truth_and_lock_on_the_console():
 
 def test_nature_is_that_of_the_other_twin():
     """Wobble and noise come out of the same models, with the same seeds, as in the robot's own process."""
-    nature = Disturbance(hover_jitter=Jitter(0.05), position_sigma=0.01, latency_s=0.1)
+    nature = Disturbance(hover_jitter=Jitter(0.05), position_sigma=0.01, latency_s=0.1, wind=(0.5, 0.0))
     asked = request("crazyflie", ["x"], disturbance=nature)
     flock, plain = Flock(asked, Faults()), TwinBody(asked)
     plain.takeoff([0], [0.5])
