@@ -102,6 +102,12 @@ class VirtualCentre:
             if guidance.receive(sample.position, sample.yaw, sample.stamp):
                 self._followed.append((row, t, sample))
 
+    def retire(self, row: int, t: float) -> None:
+        """A robot is lost to the central controller at `t` [s]; see `VirtualNetwork.retire`."""
+        if (link := self._link_of.get(row)) is not None:
+            self._poses.forget(link)
+            self.centre.mark_lost(row, t)
+
     def decide(self, t: float) -> None:
         """On a tick on which goals are decided: those of the robots that are guided."""
         lives = [robot.lifecycle for robot in self._robots]
@@ -179,6 +185,7 @@ class VirtualNetwork:
         guided = any(robot.guidance is not None for robot in robots)
         self.centre = VirtualCentre(experiment, plan, robots, seed) if guided else None
         self.seq = [0] * len(robots)  # number of the last pose of each robot
+        self.retired: set[int] = set()  # robots that are silent
         self._sizes = _Sizes(experiment, names)
         self._sent, self._received = _Samples(), _Samples()
         self._words: list[Words] = []  # said with the poses, where they say something
@@ -203,6 +210,16 @@ class VirtualNetwork:
             channel.send(link, sample, seq, t, start=start, size=size)
         if self.centre is not None:
             self.centre.transmit(sample, start, size)
+
+    def retire(self, row: int, t: float) -> None:
+        """A robot lands at `t` [s] in mid-run: it is silent, and lost to the others, none of which follows it down."""
+        self.retired.add(row)
+        for link in self._links[row]:
+            robot, k = self.receivers[link]
+            self._channel.forget(link)
+            robot.neighbours.mark_lost(k, t)
+        if self.centre is not None:
+            self.centre.retire(row, t)
 
     def deliver(self, t: float) -> None:
         """Delivers poses and goals that have arrived by `t` [s]."""

@@ -137,6 +137,7 @@ class Flight:
         self._conductor = VirtualConductor(self.robots)
         rates = experiment.rates
         self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
+        self._duration = experiment.duration_s - 0.5 * self.dt  # [s] robots that land later are not lost
         self._tick = 0
         self.stretches: Stretches | None = None  # compiled ones, where they pay
         self._samples: list[dict[str, Any]] = []
@@ -162,7 +163,7 @@ class Flight:
         self.stretches = stretches = stretches_of(self) if watch is None else None
         while not conductor.over:
             reason = AT_END
-            if stretches is not None:
+            if stretches is not None and not self.network.retired:
                 self._tick, reason = stretches.fly(self._tick, conductor.next_order(self._tick, dt))
             t = self._tick * dt
             self.step(t, reason)
@@ -179,10 +180,10 @@ class Flight:
 
     def step(self, t: float, reason: int = AT_END) -> None:
         """One tick at `t` [s], or the rest of one that a compiled stretch has begun, for this `reason`."""
-        robots, body = self.robots, self._body
+        robots, body, network, begin = self.robots, self._body, self.network, self._conductor.start_at
         if reason == AT_END:
             self._states = body.read(t)
-            self.network.deliver(t)
+            network.deliver(t)
             for robot, state in zip(robots, self._states, strict=True):
                 robot.take(t, state)
         if reason != AT_HAZARDS:
@@ -197,6 +198,8 @@ class Flight:
                 body.land((row,))
             if robot.stops:
                 body.stop((row,))
+            if robot.descending and row not in network.retired and t < begin + self._duration:
+                network.retire(row, t)
         body.command([robot.setpoint for robot in robots])
         if touches := self.twin.touches():
             self._touches += touches
@@ -207,7 +210,7 @@ class Flight:
         for row, robot in enumerate(robots):
             if not robot.is_steady(t):
                 robot.live(t)
-            if robot.question(t):
+            if robot.question(t) and row not in network.retired:
                 network.transmit(row, robot, t, robot.now.state.yaw, start)
                 sent = True
         if sent and network.instant:

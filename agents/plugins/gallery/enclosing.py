@@ -46,7 +46,7 @@ class Enclosing(Law, frozen=True):
             return Control(memory={"target": (x, y), "speed": view.target_velocity[:2], "links": (0.0,)})
         memory = self.estimate(view, memory)
         (a, b), (speed_x, speed_y) = memory["target"], memory["speed"]
-        if not is_known((a, b)):
+        if memory["links"][0] >= view.robot.count:
             return Control(memory=memory, measures={"radius": nan, "gap": nan})
         radius, angle = hypot(x - a, y - b), atan2(y - b, x - a)
         others = [each.position for each in view.neighbours if each.said["links"][0] != 0.0]
@@ -62,7 +62,7 @@ class Enclosing(Law, frozen=True):
         (a, b), (speed_x, speed_y), most = memory["target"], memory["speed"], float(view.robot.count)
         heard = [each for each in view.known(*self.SAYS) if each.said["links"][0] + 1.0 < most]
         if not heard:
-            return self.begin(view.robot)
+            return {"target": (a, b), "speed": (0.0, 0.0), "links": (most,)}
         links = 1.0 + min(each.said["links"][0] for each in heard)
         if links == 1.0:
             heard = [each for each in heard if each.said["links"][0] == 0.0]

@@ -18,6 +18,7 @@ from agents.plugins.gallery.leader_observer import LeaderObserver
 from agents.plugins.law import NeighbourView, RobotFacts, View
 from agents.vectors import ZERO
 from experiments.catalogue import index
+from experiments.definition.standby import without_standby
 from experiments.file import document
 from experiments.recording import playback
 from experiments.virtual_time.log import Logbook
@@ -229,26 +230,62 @@ def test_followers_that_do_not_know_the_velocity_lag_by_speed_over_gain():
     assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
 
 
+EDGE = np.linspace(-1.78, 1.78, 90)
+SPOTS = np.stack(np.meshgrid(EDGE, EDGE), axis=-1).reshape(-1, 2)
+WEIGHT = (1.0 + 8.0 * np.exp(-((SPOTS - 0.8) ** 2).sum(axis=1) / (2.0 * 0.5**2))) * (EDGE[1] - EDGE[0]) ** 2
+
+
+def squares(places):
+    return ((SPOTS[:, None] - places) ** 2).sum(axis=2)
+
+
+def costs(ways):
+    """H of places (T, N, 2)."""
+    return np.array([squares(places).min(axis=1) @ WEIGHT for places in ways])
+
+
+def off_centroid(places):
+    """Farthest of any robot from the centroid of its cell, on an axis [m]."""
+    owner, worst = squares(places).argmin(axis=1), 0.0
+    for robot, place in enumerate(places):
+        weight = WEIGHT * (owner == robot)
+        worst = max(worst, np.abs(weight @ SPOTS / weight.sum() - place).max())
+    return worst
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
     known = trace("coverage", case)
-    edge = np.linspace(-1.79, 1.79, 180)
-    spots = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
-    weight = 1.0 + 8.0 * np.exp(-((spots - 0.8) ** 2).sum(axis=1) / (2.0 * 0.5**2))
-    weight *= (edge[1] - edge[0]) ** 2
-
-    def squares(places):
-        return ((spots[:, None] - places) ** 2).sum(axis=2)
-
     ways = known.true_position[::25, :, :2]
-    costs = np.array([squares(places).min(axis=1) @ weight for places in ways])
-    assert np.diff(costs).max() < 0.005
-    assert costs[-1] < 0.15 * costs[0]
-    assert known.measures["cost"][-1].sum() == pytest.approx(costs[-1], rel=0.02)
-    owner = squares(ways[-1]).argmin(axis=1)
-    for robot, place in enumerate(ways[-1]):
-        cell = owner == robot
-        assert weight[cell] @ spots[cell] / weight[cell].sum() == pytest.approx(place, abs=0.03)
+    found = costs(ways)
+    assert np.diff(found).max() < 0.005
+    assert found[-1] < 0.15 * found[0]
+    assert known.measures["cost"][-1].sum() == pytest.approx(found[-1], rel=0.02)
+    assert off_centroid(ways[-1]) < 0.03
+
+
+@cache
+def five_alone():
+    """H that the robots reach without CF06."""
+    given = document.read(index.find_file("coverage"), ["robots.CF06.standby=true", "duration_s=16"])
+    return costs(simulate(without_standby(given.cases()["periodic"]), 1).true_position[-1:, :, :2])[0]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_coverage_makes_up_for_a_robot_that_lands_in_mid_flight(case):
+    """The battery of CF06, a Crazyflie among Tellos, is low first."""
+    others = tuple(f'robots.CF0{number}.kind="tello"' for number in range(1, 6))
+    known = trace("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16")
+    ((lost, name),) = {(event.stamp, event.source) for event in known.events if event.text.startswith("land: its batt")}
+    assert name == "CF06"
+    assert 7.0 < lost < 9.0
+    five = known.true_position[:, :5, :2]
+    assert costs(five[known.time < lost][-1:])[0] > 2.0 * five_alone()
+    after = costs(five[known.time > lost + 1.5][::25])  # it is lost to the others after 1 s
+    assert np.diff(after).max() < 0.005
+    assert after[-1] < 1.15 * five_alone()
+    assert off_centroid(five[-1]) < 0.06
+    assert known.measures["mass"][-1, :5].sum() == pytest.approx(WEIGHT.sum(), rel=0.005)
 
 
 def test_cells_share_the_area_and_make_up_for_a_lost_robot():
@@ -261,10 +298,6 @@ def test_cells_share_the_area_and_make_up_for_a_lost_robot():
             view.position = (*places[own], 0.0)
             total += law.step(view, {}).measures["mass"]
         assert total == pytest.approx(16.0)
-
-
-def test_a_robot_lost_in_mid_flight_is_made_up_for_by_the_others():
-    pass
 
 
 def test_an_area_that_is_not_convex_is_refused():

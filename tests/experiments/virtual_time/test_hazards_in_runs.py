@@ -52,7 +52,9 @@ def test_a_drone_lands_when_its_battery_is_low_and_says_so():
     during = np.flatnonzero((log.time > 10.0) & (log.time < 12.0))
     assert (log.phase[during, 0] == DONE).all()
     assert (log.phase[during, 1] < DONE).all()
-    assert [text for _, text in events(log, experiment)] == ["land: its battery is low: 98% (limit 98%)"]
+    found = events(log, experiment)
+    assert found[0] == ("F", "land: its battery is low: 98% (limit 98%)")
+    assert found[1:3] == [("G", "warn: a neighbour is lost: F"), ("G", "hold: all its neighbours are lost: F")]
     reasons = [status.reason for status in Logbook(log, experiment, "case")._statuses()]
     assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
 
