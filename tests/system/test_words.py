@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from experiments.recording import playback
-from tests.system.lab import Flight, typed
+from tests.system.lab import Flight, Watcher, typed
 
 pytestmark = pytest.mark.system
+
+RUN_S = 24.0
 
 
 @pytest.mark.mechanism("words")
@@ -35,3 +37,28 @@ def test_robots_agree_on_an_average_in_real_time(tmp_path: Path) -> None:
     spoken = typed(file, "/KH01/spoken_pose")
     assert [each.name for each in spoken[-1].shared] == ["x", "q", "n"]
     assert len(typed(file, "/KH01/pose")) < len(spoken) / 3  # those before its first step
+
+
+@pytest.mark.mechanism("words: restart")
+def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path: Path) -> None:
+    """Its first words are a step old, not those of its beginning; the others keep to their average meanwhile."""
+    flight = Flight(
+        tmp_path / "run", "average", "--case", "periodic", "--set", 'on_loss="restart"', "--set", f"duration_s={RUN_S}"
+    )
+    flight.until_said("phase conductor: formation")
+    watcher = Watcher(flight.endpoint())
+    agreed = RUN_S / 2.0  # they have agreed by then
+    watcher.until(
+        lambda: watcher.state["KH03"].stamp > watcher.status["KH03"].started + agreed > agreed,
+        "half of the run is over",
+    )
+    flight.children()["KH03"].kill()
+    code, _ = flight.finish(120.0)
+    watcher.close()
+    assert code in (0, 1), flight.said()  # a robot was lost
+    file = tmp_path / "run" / "periodic.mcap"
+    trace = playback.read(file).trace
+    x, late = trace.memory["x"][..., 0], trace.time > agreed
+    others = np.delete(x[late], 2, axis=1)
+    assert np.nanmax(np.abs(others - 3.0)) < 0.6, np.nanmax(np.abs(others - 3.0))
+    assert np.abs(x[-5] - 3.0).max() < 0.06, x[-5]
