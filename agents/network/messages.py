@@ -73,6 +73,16 @@ class Memory(Message, frozen=True, omit_defaults=True):
     memory: list[Variable] = []
     measures: list[Variable] = []  # of one number each
 
+    @property
+    def variables(self) -> dict[str, list[float]]:
+        """The memory by name."""
+        return {each.name: each.value for each in self.memory}
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The measures by name."""
+        return {each.name: each.value[0] for each in self.measures if each.value}
+
 
 class PoseReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A neighbour's pose as a robot received it."""

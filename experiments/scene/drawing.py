@@ -25,6 +25,7 @@ LABEL_ROUNDS: Final = (2, 3)  # names of few robots, and of more, move at each s
 GOAL_ROUNDS: Final = 3
 TURNS: Final = 3  # digits of quaternions: a tenth of a degree, so that what stands is not drawn anew for its noise
 COARSE: Final = 5  # of more robots than that, trails have each fifth point
+PLACE_M: Final = 0.03  # half-size of the mark of a place that a robot says
 SHADOWS: Final = 24  # shadows of more robots cost a browser without a graphics card too much
 
 
@@ -50,6 +51,7 @@ class Shown:
     names: bool = True
     trails: bool = True
     goals: bool = True
+    places: bool = True
     links: bool = True
     ranges: bool = False
     margins: bool = False
@@ -97,6 +99,10 @@ class SceneDrawing:
         self._trails = self._ranges = self._margins = None
         ring = models.annulus(1.5, 2.1)
         self._rings = self._batch("rings", ring, rows, scales=stage.radius, cast=False)
+        self._places: Any = None
+        if count := len(stage.place_variables):
+            colours = np.repeat(stage.colours, count, axis=0)
+            self._places = self._batch("places", models.diamond(PLACE_M), rows * count, colours, cast=False)
         self._labels: dict[int, Any] = {}
         self._texts: dict[int, str] = {}
 
@@ -216,6 +222,10 @@ class SceneDrawing:
             _update(handle, "wxyz", appearance.quaternions(pose[2]).round(4))
         if trails:
             self._draw_trails(moment)
+        if self._places is not None:
+            _show(self._places, shown=self.shown.places and moment.places is not None)
+            if moment.places is not None:
+                _update(self._places, "batched_positions", appearance.shown(moment.places.reshape(-1, 3)))
         self._draw_margins(moment)
         self._draw_ranges(moment, scans or {})
         if still or self._round % LABEL_ROUNDS[not self._few] == 1:

@@ -70,6 +70,15 @@ def box(x: float, y: float, low: float, high: float) -> Mesh:
     return prism(0.5 * np.array([[-x, -y], [x, -y], [x, y], [-x, y]]), low, high)
 
 
+def diamond(radius: float) -> Mesh:
+    """Octahedron about the origin, `radius` [m] from its middle to its corners."""
+    corners = radius * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float)
+    k = np.arange(4)
+    after = (k + 1) % 4
+    top, bottom = np.stack([k, after, np.full(4, 4)], 1), np.stack([after, k, np.full(4, 5)], 1)
+    return Mesh(corners, np.concatenate([top, bottom]).astype(np.uint32))
+
+
 def annulus(inner: float, outer: float, sides: int = 32) -> Mesh:
     """Flat ring that is seen from above and from below."""
     ring = np.column_stack([np.concatenate([circle(inner, sides), circle(outer, sides)]), np.zeros(2 * sides)])

@@ -179,6 +179,27 @@ class Stage:
         )  # fmt: skip
 
     @cached_property
+    def place_variables(self) -> Mapping[str, int]:
+        """Variables that robots say with a place among their numbers, and where it begins."""
+        plan = self.plan
+        law = None if plan is None else _if_installed(lambda: plan.law)
+        said = {} if law is None else law.SAYS
+        return {name: each.place for name, each in said.items() if each.place is not None}
+
+    def said_places(self, memories: Sequence[Mapping[str, Sequence[float]]], position: Array) -> Array:
+        """Places (N, P, 3) [m] in the memories of the robots, NaN where unknown.
+
+        A place without z is shown at the height of the robot at `position` (N, 3) [m] that says it.
+        """
+        places = np.full((len(self.names), len(self.place_variables), 3), np.nan)
+        for row, memory in enumerate(memories):
+            for k, (name, begin) in enumerate(self.place_variables.items()):
+                numbers = memory.get(name, ())[begin:]
+                if len(numbers) >= 2:
+                    places[row, k] = *numbers[:2], numbers[2] if len(numbers) == 3 else position[row, 2]
+        return places
+
+    @cached_property
     def colours(self) -> Colours:
         """Colour of each robot (N, 3)."""
         return np.array([ROBOTS[row % len(ROBOTS)] for row in range(len(self.names))], dtype=np.uint8).reshape(-1, 3)
@@ -239,6 +260,8 @@ class Moment:
     shadow: Array | None = None  # (N, 3) [m] of the twins beside the robots
     shadow_yaw: Array | None = None  # (N,) [rad]
     time: float | None = None  # [s] since the common start; None before it
+    places: Array | None = None  # (N, P, 3) [m] that the robots say, see `Stage.said_places`
+    measures: Sequence[Mapping[str, float]] = ()  # of the law, by robot; none known if empty
 
 
 class LinkTracker:

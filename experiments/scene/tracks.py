@@ -9,14 +9,14 @@ from functools import cached_property, lru_cache
 from itertools import accumulate, islice, pairwise
 from math import nan
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.decision.lifecycle import Phase
-from agents.network.messages import Event, HostClock, State, Status, WorldState
+from agents.network.messages import Event, HostClock, Memory, State, Status, WorldState
 from experiments.definition.experiment import Experiment
 from experiments.recording.clocks import Correction
 from experiments.recording.playback import AboutRun, topic_of
@@ -26,6 +26,7 @@ from experiments.recording.topics import SentPose
 from experiments.recording.trace import ROUNDING_S
 from twins.arrays import Array, Index
 
+M = TypeVar("M", Status, Memory)
 LOST_S: Final = 1.0  # without a sample for so long a robot is silent
 WORDS: Final = {phase.word: int(phase) for phase in Phase}
 NOWHERE: Final = (nan, nan, nan)
@@ -52,6 +53,7 @@ class Track:
     shadow_yaw: Array  # (K,) [rad]
     sent: Array  # (P,) [s] of each pose to the neighbours
     statuses: tuple[Status, ...]  # stamps since the common start
+    memories: tuple[Memory, ...] = ()  # of a law that remembers, likewise
 
     def at(self, t: float) -> int:
         """Number of the last sample at or before `t` [s]; −1 before the first."""
@@ -96,7 +98,7 @@ def read(path: Path) -> Tracks:
     records = Records(path)
     samples: dict[str, list[Array]] = {}
     sent: dict[str, list[Array]] = {}
-    rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock)}
+    rare: dict[type, list[Any]] = {kind: [] for kind in (Event, Status, WorldState, HostClock, Memory)}
     for data, starts in _batches(records):
         heads = _gathered(data, starts, HEAD)[:, 0]
         for channel in np.unique(heads["channel"]).tolist():
@@ -126,6 +128,10 @@ def read(path: Path) -> Tracks:
     def since(robot: str, stamps: Array) -> Array:
         return right.stamps(robot, stamps) - start
 
+    def told(name: str, messages: Sequence[M]) -> tuple[M, ...]:
+        own = sorted((each for each in messages if each.robot == name), key=lambda each: each.stamp)
+        return tuple(msgspec.structs.replace(each, stamp=float(since(name, np.array(each.stamp)))) for each in own)
+
     def track(name: str) -> Track:
         table = np.concatenate([np.zeros((0, COLUMNS[-1])), *samples.get(name, ())])
         time = since(name, table[:, 0])
@@ -133,13 +139,11 @@ def read(path: Path) -> Tracks:
         order = order[np.isfinite(time[order])]
         _, phase, position, yaw, goal, attitude, shadow, shadow_yaw, _ = np.split(table[order], COLUMNS, axis=1)
         poses = since(name, np.unique(np.concatenate([np.zeros(0), *sent.get(name, ())])))
-        own = sorted((status for status in statuses if status.robot == name), key=lambda status: status.stamp)
         return Track(
             time[order], phase[:, 0].astype(np.intp), position, yaw[:, 0], goal, attitude, shadow, shadow_yaw[:, 0],
             sent=poses[np.isfinite(poses)],
-            statuses=tuple(
-                msgspec.structs.replace(each, stamp=float(since(name, np.array(each.stamp)))) for each in own
-            ),
+            statuses=told(name, statuses),
+            memories=told(name, rare[Memory]),
         )  # fmt: skip
 
     tracks = tuple(map(track, robots))

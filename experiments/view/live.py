@@ -110,8 +110,8 @@ class Page:
         self._boxes: dict[str, Any] = {}
         with server.gui.add_folder("Show", order=50.0, expand_by_default=False):
             for name, text in (
-                ("names", "names"), ("trails", "trails"), ("goals", "goals"), ("links", "links"),
-                ("ranges", "range readings"), ("margins", "avoidance margins"),
+                ("names", "names"), ("trails", "trails"), ("goals", "goals"), ("places", "said places"),
+                ("links", "links"), ("ranges", "range readings"), ("margins", "avoidance margins"),
             ):  # fmt: skip
                 box = server.gui.add_checkbox(text, getattr(self.shown, name))
                 box.on_update(partial(self._set, name))
@@ -223,7 +223,8 @@ class LiveView:
         for k, name in enumerate(stage.names):
             report, condition = observer.robots[name], Condition(int(moment.condition[k]))
             delay = max(report.delay.values(), default=None)
-            rows.append(robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay))
+            row = robot_row(name, condition, report.status, known(errors[k]), report.rate, delay=delay)
+            rows.append(row.measured(moment.measures, k))
         elapsed = observer.elapsed
         start = None if elapsed is None else time.time() - elapsed
         phase = observer.phase

@@ -26,7 +26,7 @@ from experiments.view.heartbeat import DataAge
 UNKNOWN_S: Final = 2.0  # without an experiment for so long, robots are drawn of which only the names are known
 RATE_S: Final = 1.0
 Handler = zenoh.handlers.Handler[zenoh.Sample]
-R = TypeVar("R", messages.State, messages.Ranges)
+R = TypeVar("R", messages.State, messages.Memory, messages.Ranges)
 DEPTH: Final = 8192  # samples between two rounds
 EVENTS: Final = 200  # kept
 
@@ -37,6 +37,7 @@ class RobotReport:
 
     state: messages.State | None = None
     status: messages.Status | None = None
+    memory: messages.Memory = field(default_factory=lambda: messages.Memory("", 0, 0.0))
     heard_at: float = -inf  # [s, monotonic] arrival of that status
     alive: bool = False
     known: bool = False  # it was alive, or reported, at some time
@@ -61,6 +62,7 @@ class Observer:
         self._session, self._keys, self._clock = session, keys, Clock()
         self._experiments = pubsub.pose_subscriber(session, keys.experiment, 4)
         self._states = pubsub.subscriber(session, keys.state("*"), DEPTH)
+        self._memories = pubsub.subscriber(session, keys.memory("*"), DEPTH)
         self._poses = pubsub.subscriber(session, keys.pose("*"), DEPTH)
         self._statuses = pubsub.Inbox(
             pubsub.pose_subscriber(session, keys.status("*"), 1024), messages.Status, keys=keys
@@ -151,6 +153,8 @@ class Observer:
         states = list(self._newest(self._states, messages.State))
         if states:
             self.age.add(max(state.stamp for state in states), self._clock.utc(), time.monotonic())
+        for memory in self._newest(self._memories, messages.Memory):
+            self._report(memory.robot).memory = memory
         for state in states:
             report = self._report(state.robot)
             report.state, report.known = state, True
@@ -223,4 +227,6 @@ class Observer:
             shadow=known_rows((s.shadow_position if s else None for s in states), 3),
             shadow_yaw=known_rows(s.shadow_yaw if s else None for s in states)[:, 0],
             time=elapsed,
+            places=stage.said_places([report.memory.variables for report in reports], position),
+            measures=[report.memory.numbers for report in reports],
         )

@@ -104,6 +104,7 @@ class PacedView:
             for robot in robots
         ]
         self._trail.add(instant.now, position)
+        laws = [robot.stepping for robot in robots if robot.stepping is not None]
         return Moment(
             position=position,
             yaw=np.where(np.isfinite(true_yaw), true_yaw, yaw),
@@ -118,6 +119,8 @@ class PacedView:
             shadow=None if np.isnan(shadow).all() else shadow,
             shadow_yaw=None if np.isnan(shadow).all() else _column(states, "shadow_yaw"),
             time=elapsed,
+            places=self._stage.said_places([law.memory for law in laws], position) if laws else None,
+            measures=[law.measures for law in laws],
         )
 
     def _draw(self, instant: Instant, now: float) -> None:
@@ -138,7 +141,7 @@ class PacedView:
             Row(
                 name, Condition(int(moment.condition[k])), known(errors[k]), float(len(self._sent[k])),
                 known(instant.states[k].battery), note=instant.robots[k].hazards.worst(),
-            )
+            ).measured(moment.measures, k)
             for k, name in enumerate(self._stage.names)
         ]  # fmt: skip
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,6 +34,7 @@ HISTORY_S: Final = 30.0
 PLOT_S: Final = 0.25
 CURVES: Final = 12  # of more robots, the largest, the median and the smallest value are plotted
 TABLE: Final = 20  # rows; of more robots, those that need attention first, then the worst
+MEASURES: Final = 3  # of a law, in the table
 EVENTS: Final = 12
 LINKS: Final = 30  # rows
 FEW_MISSED: Final = 0.01  # share of ticks; more are shown in red
@@ -56,6 +57,11 @@ class Row:
     missed_share: float = 0.0  # of all ticks
     delay: float | None = None  # [s] largest of its links
     note: str = ""
+    measures: Mapping[str, float] = field(default_factory=dict)  # of its law
+
+    def measured(self, measures: Sequence[Mapping[str, float]], row: int) -> Row:
+        """The same with the measures of its law, of those of all robots."""
+        return replace(self, measures=measures[row]) if measures else self
 
 
 def robot_row(
@@ -221,6 +227,10 @@ def _cells(row: Row) -> tuple[str, ...]:
     )
 
 
+def _measures(row: Row, names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"{row.measures[name]:.3g}" if name in row.measures else "" for name in names)
+
+
 def _coloured(text: str, colour: Colour | None) -> str:
     return text if colour is None else f"<span style='color:{css(colour)}'>{text}</span>"
 
@@ -243,14 +253,16 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         shown.sort(key=lambda row: (-row.condition, -(row.error or 0.0)))
         left = f"<div style='opacity:0.6'>and {len(rows) - TABLE} more; the worst are shown</div>"
         shown = shown[:TABLE]
-    filled = [_cells(row) for row in shown]
-    columns = [k for k in range(len(HEADS)) if not filled or any(cells[k] for cells in filled)]
+    measures = [*dict.fromkeys(name for row in shown for name in row.measures)][:MEASURES]
+    every = (*HEADS, *map(escape, measures))
+    filled = [(*_cells(row), *_measures(row, measures)) for row in shown]
+    columns = [k for k in range(len(every)) if not filled or any(cells[k] for cells in filled)]
     leading = {stage.names[row] for row in range(len(stage.names))} - {
         stage.names[row] for row in stage.links.receiver.tolist()
     }
     filled = [(NONE, *cells[1:]) if row.name in leading and not cells[0] else cells
               for row, cells in zip(shown, filled, strict=True)]  # fmt: skip
-    heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{HEADS[k]}</th>" for k in columns)
+    heads = "".join(f"<th style='text-align:right;font-weight:500;opacity:0.6'>{every[k]}</th>" for k in columns)
     lines = []
     for row, cells in zip(shown, filled, strict=True):
         word, colour = CONDITIONS[row.condition]
@@ -259,7 +271,8 @@ def table(rows: Sequence[Row], stage: Stage) -> str:
         note = ""
         if row.note:
             noted = FAIR if row.condition == Condition.ACTIVE else colour  # a warning is never green
-            note = f"<tr><td colspan='6' style='color:{css(noted)};padding-left:1.2em'>{escape(row.note)}</td></tr>"
+            style = f"style='color:{css(noted)};padding-left:1.2em'"
+            note = f"<tr><td colspan='{len(every) + 1}' {style}>{escape(row.note)}</td></tr>"
         lines.append(
             f"<tr><td style='white-space:nowrap'>{dot} {escape(row.name)}{badge}</td>"
             + "".join(f"<td style='text-align:right;white-space:nowrap'>{cells[k]}</td>" for k in columns)
@@ -320,6 +333,7 @@ def legend() -> str:
     return (
         "<div style='padding:0 1em;font-size:0.75em'>"
         f"<div>links by error: {', '.join(said)}; wide when the sender transmits; dashed when broken</div>"
-        f"<div>bodies: {', '.join(bodies)}; translucent: goals and shadow twins</div>"
+        f"<div>bodies: {', '.join(bodies)}; translucent: goals and shadow twins; "
+        "&#9670; a place that a robot says</div>"
         f"<div>rings: {', '.join(states)}</div></div>"
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from agents.decision.lifecycle import DONE, IDLE, LANDING, READY
-from agents.network.messages import EMERGENCY, Status, WorldState
+from agents.network.messages import EMERGENCY, Memory, Status, WorldState
 from experiments.definition.formation import errors_over_time
 from experiments.recording.trace import ROUNDING_S
 from experiments.scene.drawing import SceneDrawing
@@ -25,7 +25,8 @@ from twins.arrays import Array
 if TYPE_CHECKING:
     import viser
 
-M = TypeVar("M", Status, WorldState)
+M = TypeVar("M", Status, WorldState, Memory)
+NOTHING: Final = Memory("", 0, 0.0)
 SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "5", "10", "20")
 STEP_S: Final = 0.02  # of a single step: a sample at 50 Hz
 APART: Final = 0.15  # between words on the slider, in its lengths
@@ -51,6 +52,7 @@ class Film:
         position = trail[:, 0]
         conditions = np.array([_condition(track, k, t) for track, k in zip(tracks, at, strict=True)], dtype=np.intp)
         goal = _taken(tracks, at, "goal", 3)
+        memories = [_last_status(track.memories, t) or NOTHING for track in tracks]
         goal[np.isin(conditions, (Condition.WAITING, Condition.DONE))] = nan
         return Moment(
             position=position,
@@ -66,6 +68,8 @@ class Film:
             shadow=_taken(tracks, at, "shadow", 3),
             shadow_yaw=_taken(tracks, at, "shadow_yaw", 1)[:, 0],
             time=t,
+            places=self.stage.said_places([each.variables for each in memories], position),
+            measures=[each.numbers for each in memories],
         )
 
     def rows(self, t: float) -> list[Row]:
@@ -77,7 +81,8 @@ class Film:
         for k, (name, track) in enumerate(zip(self.tracks.robots, self.tracks.tracks, strict=True)):
             condition, status = Condition(int(moment.condition[k])), _last_status(track.statuses, t)
             rate = float(np.subtract(*np.searchsorted(track.sent, (t, t - 1.0), side="right")))
-            rows.append(robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks))
+            row = robot_row(name, condition, status, known(errors[k]), rate, ticks=ticks)
+            rows.append(row.measured(moment.measures, k))
         return rows
 
     def history(self) -> History:

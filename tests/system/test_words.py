@@ -60,5 +60,5 @@ def test_a_restarted_robot_joins_without_drawing_the_others(tmp_path: Path) -> N
     trace = playback.read(file).trace
     x, late = trace.memory["x"][..., 0], trace.time > agreed
     others = np.delete(x[late], 2, axis=1)
-    assert np.nanmax(np.abs(others - 3.0)) < 0.6, np.nanmax(np.abs(others - 3.0))
+    assert np.nanmax(np.abs(others - 3.0)) < 0.45, np.nanmax(np.abs(others - 3.0))
     assert np.abs(x[-5] - 3.0).max() < 0.06, x[-5]
