@@ -105,6 +105,8 @@ class Stepping:
         law = self._law
         try:
             memory = {name: tuple(map(float, values)) for name, values in law.begin(self.facts).items()}
+        except PluginError:  # such as a library that is not installed: with its remedy
+            raise
         except FAILURES as error:
             raise failure("law", law, error) from error
         if missing := [name for name in law.SAYS if name not in memory]:

@@ -135,6 +135,7 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     SAYS: ClassVar[Mapping[str, Said]] = {}  # variables of the memory that go out with the pose
     ALONE: ClassVar[bool] = False  # moves a robot without neighbours, which else stays in place
     PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
+    LIBRARY: ClassVar[str] = ""  # distribution that it needs beside zenpark: its version decides on results, too
 
     def begin(self, robot: RobotFacts) -> Memory:
         """Variables at the start, each with as many numbers as it ever has."""

@@ -94,17 +94,18 @@ def digest(experiment: Experiment) -> str:
 
 def code_of(experiment: Experiment) -> str:
     """Digest of all that decides on results: our code, that of its plug-ins and of metrics, and the versions of numpy
-    and of the library of the engine, which has its name.
+    and of the libraries of the engine, which has its name, and of the law.
 
     Of a plug-in the module counts in which it stands; another module that it imports does not.
     """
     files = plugin_files(experiment)
     engine = registry.split(experiment.world.engine)[0]
-    engines = [engine, *engine_versions(engine)]
+    library = registry.build(registry.LAWS, experiment.formation.law).LIBRARY
+    libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(_file_digest(file) for file in files if file.parent.parent != ROOT)
     others += [f"{name} {_file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
     return hashlib.sha256(
-        ":".join((digest_of_code(packages=PACKAGES), np.__version__, *engines, *others)).encode()
+        ":".join((digest_of_code(packages=PACKAGES), np.__version__, *libraries, *others)).encode()
     ).hexdigest()[:20]
 
 

@@ -110,3 +110,12 @@ def test_the_version_of_the_engines_library_counts(park, monkeypatch):
     monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "pymunk" else real(name))
     assert code_of(park) == before[0]
     assert code_of(pymunk) != before[1]
+
+
+def test_the_version_of_the_laws_library_counts(park, monkeypatch):
+    formation = msgspec.structs.replace(park.formation, law="mpc")
+    planned = msgspec.structs.replace(park, formation=formation)
+    before = code_of(park), code_of(planned)
+    monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "daqp" else [])
+    assert code_of(park) == before[0]
+    assert code_of(planned) != before[1]

@@ -1,0 +1,189 @@
+"""Distributed model predictive control: robots swap places without contact, and reach them or tell that they wait."""
+
+import sys
+from dataclasses import replace
+from math import cos, dist, nan, pi, sin
+from random import Random
+
+import numpy as np
+import pytest
+
+from agents.body.kinds import KINDS
+from agents.decision.stepping import Stepping
+from agents.plugins.gallery.mpc import Mpc, horizon
+from agents.plugins.law import NeighbourView
+from agents.plugins.registry import PluginError
+from agents.vectors import ZERO
+from experiments.catalogue import index
+from experiments.definition.plan import Plan
+from experiments.file import document
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+from tests.agents.bench import Bench
+from tests.agents.few import triangle
+
+pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark install daqp")
+
+NAMES = [f"CF{number:02}" for number in range(1, 9)]
+CONTACT = 0.13  # m, between the axes of two Crazyflies
+APART = 0.55  # m, between random places
+CASES = [pytest.param(number, marks=[] if number < 3 else pytest.mark.nightly) for number in range(20)]
+
+
+def opposite(number):
+    """Places on a circle, turned; each robot goes to the opposite one."""
+    turn = Random(number).uniform(0.0, pi)
+    places = [(1.4 * cos(turn + k * pi / 4), 1.4 * sin(turn + k * pi / 4)) for k in range(8)]
+    return places, places[4:] + places[:4]
+
+
+def random(number):
+    """Random places, and an order in which no robot keeps its own."""
+    draw, places = Random(number), []
+    while len(places) < 8:
+        place = draw.uniform(-1.5, 1.5), draw.uniform(-1.5, 1.5)
+        if all(dist(place, other) > APART for other in places):
+            places.append(place)
+    goals = places
+    while any(goal == place for goal, place in zip(goals, places, strict=True)):
+        goals = draw.sample(places, 8)
+    return places, goals
+
+
+def flown(starts, goals, *changes, case="periodic"):
+    """Trace of robots that fly from places to goals."""
+    words = [f"robots.{name}.start=[{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, starts, strict=True)]
+    table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
+    given = document.read(index.find_file("mpc"), [*words, f"formation.law.goal={{ {table} }}", *changes])
+    experiment = given.cases()[case]
+    return Logbook(simulate(experiment, experiment.seed), experiment, case).trace()
+
+
+def nearest(trace):
+    """Least distance between any two robots [m]."""
+    place = trace.true_position[..., :2]
+    first, second = np.triu_indices(place.shape[1], 1)
+    return np.linalg.norm(place[:, first] - place[:, second], axis=2).min()
+
+
+@pytest.mark.parametrize("number", CASES)
+@pytest.mark.parametrize("swap", [opposite, random])
+def test_eight_robots_swap_places_without_contact(swap, number):
+    starts, goals = swap(number)
+    trace = flown(starts, goals)
+    assert nearest(trace) > CONTACT
+    left = np.linalg.norm(trace.true_position[-1, :, :2] - goals, axis=1)
+    assert left.max() < 0.05
+
+
+@pytest.mark.parametrize("case", ["event", "event-loss"])
+def test_swap_by_events_and_with_losses(case):
+    starts, goals = opposite(0)
+    trace = flown(starts, goals, case=case)
+    assert nearest(trace) > CONTACT
+    assert trace.true_position[-1, :, :2] == pytest.approx(np.array(goals), abs=0.05)
+    assert len(trace.sent) < 0.7 * len(flown(starts, goals).sent)
+
+
+ALONE = """
+title = "One robot"
+duration_s = 12.0
+[robots.KH01]
+kind = "KIND"
+start = [-1.0, -0.5]
+HOVER
+[formation]
+law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
+[cases.periodic]
+"""
+
+
+@pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
+def test_one_robot_reaches_its_goal_within_its_limits(kind):
+    text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")
+    experiment = document.loads(text).cases()["periodic"]
+    trace = Logbook(simulate(experiment, 1), experiment, "periodic").trace()
+    assert trace.true_position[-1, 0, :2] == pytest.approx([1.0, 0.6], abs=0.02)
+    state = trace.memory["state"][:, 0]
+    known = state[np.isfinite(state).all(axis=1)]
+    assert np.abs(known[:, 2:4]).max() == pytest.approx(min(0.5, KINDS[kind].speed), abs=1e-3)
+    assert np.abs(known[:, 4:]).max() < 1.0 + 1e-6
+
+
+def come(bench):
+    """B stands, and says that it comes; C stands elsewhere."""
+    path = tuple(number for k in range(16) for number in (0.4 - 0.04 * k, 0.0))
+    for link, place, words in ((0, (0.4, 0.0, 0.0), {"path": path}), (1, (0.0, -1.5, 0.0), {})):
+        bench.neighbours.receive(link, place, ZERO, bench.t, bench.t, 0.0, words)
+
+
+@pytest.fixture
+def meeting():
+    """A on its way to a goal beyond B."""
+    law = Mpc(goal={"A": (1.4, 0.0)}, speed=0.2)
+    bench = Bench(replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=()), (-0.4, 0.0, 0.0))
+    return bench.running(come).step(0.5, come)
+
+
+def plan_of(bench):
+    """Conflicts, and y of the path [m]."""
+    stepping = bench.robot.stepping
+    return stepping.measures["conflicts"], np.array(stepping.memory["path"])[1::2]
+
+
+def test_a_robot_plans_around_what_another_says(meeting):
+    conflicts, y = plan_of(meeting)
+    assert conflicts == 1.0
+    assert y.min() < -0.2  # to its right: the other does so as well
+
+
+def test_a_lost_robot_is_no_longer_avoided_by_what_it_said(meeting):
+    meeting.step(0.8)
+    assert plan_of(meeting)[0] == 1.0  # what was said is old, and still counts
+    meeting.neighbours.mark_lost(0, meeting.t)
+    meeting.step(1.3)
+    conflicts, y = plan_of(meeting)
+    assert conflicts == 0.0
+    assert y.min() > -0.1
+
+
+def test_constraints_hold_where_they_can():
+    """Of a plan beside one other: n·p ≥ b at its step, and limits."""
+    ahead = horizon(15, 0.2, 0.1)
+    (found,) = ahead.conflicts(ahead.positions((0.0, 0.0), (0.3, 0.0), ahead.rest), [standing((0.6, 0.0))], 0.35, 0.0)
+    step, normal, bound = found
+    assert (step, normal, bound) == (4, (-1.0, 0.0), pytest.approx(-0.25))
+    a, slack = ahead.plan((0.0, 0.0), (0.3, 0.0), (2.0, 0.5), [found], (0.5, 1.0, 100.0))
+    places = ahead.positions((0.0, 0.0), (0.3, 0.0), a)
+    assert slack < 1e-6
+    assert places[step, 0] <= 0.25 + 1e-6
+    assert np.abs(a).max() <= 1.0 + 1e-6
+    assert np.abs(0.3 * np.array([1.0, 0.0]) + 0.2 * np.cumsum(a, axis=0)).max() <= 0.5 + 1e-6
+
+
+def standing(place):
+    return NeighbourView(1, "B", (*place, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, {"path": (nan,) * 32}, None)
+
+
+def test_a_path_is_read_at_the_time_of_its_reader():
+    path = tuple(number for k in range(16) for number in (0.1 * k, 1.0))
+    later = horizon(15, 0.2, 0.1).later(path, 0.3)
+    assert later[:3, 0] == pytest.approx([0.25, 0.35, 0.45])
+    assert later[-1] == pytest.approx([1.5, 1.0])  # it stays at the end
+    assert horizon(15, 0.2, 0.1).later(path, 1e6)[0] == pytest.approx([1.5, 1.0])
+
+
+def test_a_missing_library_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "daqp", None)
+    horizon.cache_clear()
+    with pytest.raises(PluginError, match=r"^the law mpc needs .*: \./zenpark install daqp"):
+        Stepping(replace(Plan(triangle()).assignment("A"), law=Mpc()))
+
+
+def test_check_warns_of_goals_that_cannot_be_had_together():
+    plan = Plan(triangle())
+    assert list(Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 1.0)}).analyse(plan)) == []
+    (near,) = Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 0.3)}).analyse(plan)
+    assert near[0] == "warning"
+    (stranger,) = Mpc(goal={"A": (0.0, 0.0), "X": (0.0, 1.0)}).analyse(plan)
+    assert stranger[0] == "error"
