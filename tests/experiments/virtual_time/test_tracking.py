@@ -1,0 +1,70 @@
+"""Tracking of a target, against a central Kalman filter with the same readings."""
+
+import numpy as np
+import pytest
+from scipy.special import gammaincinv
+
+from experiments.catalogue import index
+from experiments.file import document
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+
+
+def track_centrally(known, steps, seeing):
+    """Estimates (K, 4) of one Kalman filter that has all readings of a run at once."""
+    law, step = known.experiment.formation.law, 0.1
+    onward, per_axis = np.eye(4) + step * np.eye(4, k=2), [[step**3 / 3.0, step**2 / 2.0], [step**2 / 2.0, step]]
+    growth = law["agility"] * np.kron(per_axis, np.eye(2))
+    x, covariance = np.array([*law["guess"], 0.0, 0.0]), np.diag(np.repeat(law["doubt"], 2)) ** 2
+    states = []
+    for moment in steps:
+        x, covariance = onward @ x, onward @ covariance @ onward.T + growth
+        information = np.linalg.inv(covariance)
+        vector, (east, north) = information @ x, (x[:2] - known.true_position[moment, seeing, :2]).T
+        far = np.hypot(east, north)
+        expected, slopes = far, np.stack([east, north]) / far
+        if law["sees"] == "direction":
+            expected, slopes = np.arctan2(north, east), np.stack([-north, east]) / far**2
+        change = known.measures["reading"][moment, seeing] - expected
+        if law["sees"] == "direction":
+            change = (change + np.pi) % (2.0 * np.pi) - np.pi
+        for each, slope in zip(change[~np.isnan(change)], slopes.T[~np.isnan(change)], strict=True):
+            information = information + np.outer([*slope, 0, 0], [*slope, 0, 0]) / law["sigma"] ** 2
+            vector = vector + np.array([*slope, 0, 0]) * (each + slope @ x[:2]) / law["sigma"] ** 2
+        covariance = np.linalg.inv(information)
+        x = covariance @ vector
+        states.append(x)
+    return np.array(states)
+
+
+def track(case, seed, *changes):
+    """Mean squared errors of a place [m²], of the robots and of a central filter, and normalised ones of the robots."""
+    experiment = document.read(index.find_file("tracking"), changes).cases()[case]
+    known = Logbook(simulate(experiment, seed), experiment, case).trace()
+    seeing, steps = slice(1, None), np.arange(5, len(known.time), 5)
+    place = known.true_position[:, 0, :2]
+    truth = np.hstack([place, np.gradient(place, known.time, axis=0)])[steps]
+    states = track_centrally(known, steps, seeing)
+    late = known.time[steps] > 5.0
+    apart = (known.memory["x"][steps][:, seeing] - truth[:, None])[late]
+    information = known.memory["all"][steps][:, seeing].reshape(len(steps), -1, 4, 4)[late]
+    normalised = np.einsum("tni,tnij,tnj->tn", apart, information / experiment.formation.law["sigma"] ** 2, apart)
+    squares = (apart[..., :2] ** 2).sum(axis=2).mean(), ((states - truth)[late, :2] ** 2).sum(axis=1).mean()
+    return *squares, normalised.mean(axis=1)[::20]  # every two seconds, since errors last that long
+
+
+@pytest.mark.parametrize(("case", "most"), [("periodic", 1.1), ("event", 1.15), ("event-loss", 1.15)])
+def test_tracking_is_as_accurate_as_a_central_filter_and_consistent(case, most):
+    runs = [track(case, seed) for seed in (1, 2, 3)]
+    own, central = (sum(run[k] for run in runs) / len(runs) for k in (0, 1))
+    assert central < own < most**2 * central
+    assert own < 0.05**2
+    normalised = np.concatenate([run[2] for run in runs])
+    low, high = 2.0 * gammaincinv(2.0 * len(normalised), [0.005, 0.995]) / len(normalised)  # of χ² with 4 each
+    assert low < normalised.mean() < high
+
+
+def test_tracking_by_directions():
+    own, central, _ = track("periodic", 1, "formation.law.sees=direction", "formation.law.sigma=0.08")
+    assert own < 1.1**2 * central
+    assert own < 0.06**2
