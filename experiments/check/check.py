@@ -151,6 +151,7 @@ def _figures(analysis: Analysis) -> Figures:
     links, prediction, limits = analysis.links, analysis.prediction, analysis.limits
     end, fastest, follower = prediction.position[-1], analysis.fastest, analysis.follower
     last = float(prediction.time[-1])
+    payload, words, load = theory.load(analysis)
     return Figures(
         robots=len(analysis.names),
         arena=experiment.arena.size,
@@ -184,5 +185,8 @@ def _figures(analysis: Analysis) -> Figures:
         end={name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(analysis.names, end, strict=True)},
         end_inside=bool(((end >= np.array(limits.low) - FORGIVEN) & (end <= np.array(limits.high) + FORGIVEN)).all()),
         messages_hz=prediction.messages_hz,
+        pose_bytes=payload,
+        words_bytes=words,
+        pose_kbit_s=load,
         predicted_s=last,
     )

@@ -73,6 +73,9 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     end: dict[str, tuple[float, float, float]]  # where each robot is expected to end [m]
     end_inside: bool  # whether all of them are inside the arena then
     messages_hz: float  # poses that all robots send in a second, estimated
+    pose_bytes: int  # payload of one pose, its numbers at their longest
+    words_bytes: int  # of these what the law says
+    pose_kbit_s: float  # payload of one robot at the largest rate of its trigger [kbit/s]
     predicted_s: float  # how much of the run was predicted
 
 

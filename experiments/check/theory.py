@@ -9,7 +9,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
+from agents.network import messages
 from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
@@ -24,6 +26,9 @@ FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another s
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
+# of a pose: running number, stamp [s], position [m], velocity [m/s] and yaw [rad]
+LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) * 3, -1.234567)
+LONG_NUMBER: Final = -1.234567e-05  # of what is said
 MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
 
@@ -295,6 +300,21 @@ def law(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("warning", "lost-words", message, remedy, ("trigger",))
     for severity, message, remedy in plan.law.analyse(plan):
         yield Finding(severity, "law", message, remedy, path)
+
+
+def load(analysis: Analysis) -> tuple[int, int, float]:
+    """Payload of a pose with its numbers at their longest, and of what is said [bytes]; its largest rate [kbit/s]."""
+    plan, experiment = analysis.plan, analysis.experiment
+    name = max(analysis.names, key=len)
+    said = Stepping(plan.assignment(name)).says if plan.law.SAYS else {}
+    bare, whole = (
+        len(messages.encode(messages.pose(name, *LONG_POSE, words), experiment.network.encoding))
+        for words in ((), [(variable, (LONG_NUMBER,) * size) for variable, size in said.items()])
+    )
+    rate = experiment.rates.pose_hz
+    if plan.trigger.TIMED:
+        rate = min(rate, analysis.prediction.messages_hz / len(analysis.names))
+    return whole, whole - bare, 8e-3 * whole * rate
 
 
 def strength(analysis: Analysis) -> str:

@@ -284,6 +284,9 @@ def _formatted(of: Figures) -> dict[str, str]:
         "worst link at the end": number(of.end_error_mm, ".1f", " mm"),
         "all end inside the arena": "yes" if of.end_inside else "no",
         "poses sent by all, estimated": number(of.messages_hz, ".1f", " per second"),
+        "payload of one pose, at most": f"{of.pose_bytes} bytes"
+        + (f", {of.words_bytes} of them said by the law" if of.words_bytes else ""),
+        "payload of one robot, at most": number(of.pose_kbit_s, ".0f", " kbit/s"),
     }
 
 

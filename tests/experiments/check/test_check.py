@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.decision.position_control import REACHED
+from agents.network import messages
 from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.vectors import UNKNOWN, ZERO, norm
@@ -385,3 +386,15 @@ def test_every_battery_that_ends_before_the_run_is_named():
     assert "CF01, CF02, CF03 land after about 373 s" in drones
     assert not said(300.0)
     assert not said(12000.0, battery_low=0.0)
+
+
+def test_payload_of_what_a_law_says():
+    bare, said = (figures(document.read(name).cases()["event"]) for name in ("triangle", "average"))
+    assert bare.words_bytes == 0
+    assert 140 < bare.pose_bytes < 200
+    assert bare.pose_kbit_s == pytest.approx(0.008 * bare.pose_bytes * 50.0)
+    assert said.words_bytes == len(',"shared":[]') + sum(
+        len(messages.encode(messages.Variable(name, [-1.234567e-05]), "json")) for name in "xqn"
+    ) + len(",,")  # fmt: skip
+    periodic = figures(document.read("average").cases()["periodic"])
+    assert periodic.pose_kbit_s == pytest.approx(0.008 * said.pose_bytes * 10.0)
