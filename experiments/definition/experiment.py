@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -387,6 +387,45 @@ class Hybrid(Part, frozen=True):
     robots: Annotated[list[Name], Meta(min_length=1, description="those that the centre guides")]
 
 
+# metrics of zenpark that a criterion can name; those of other distributions come beside them
+JUDGED: Final = (
+    *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
+    *("missed_deadlines", "residual", "settle_s", "collisions"),
+)
+MEAN: Final = "mean"  # over robots
+WORST: Final = "worst"  # of them
+
+
+class Criterion(Part, frozen=True):
+    """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
+
+    metric: Annotated[str | None, Meta(description="a metric; or give `measure`")] = None
+    measure: Annotated[
+        str | None, Meta(description="a number that the law measures, averaged over the last second of the run")
+    ] = None
+    of: Annotated[
+        str,
+        Meta(description="mean over robots, worst (largest for `at_most`, smallest for `at_least`), or a robot's name"),
+    ] = MEAN
+    case: Annotated[str | None, Meta(description="of which case; left out: of each")] = None
+    at_most: Annotated[float | None, Meta(description="upper limit, in the unit of the metric")] = None
+    at_least: Annotated[float | None, Meta(description="lower limit, in the unit of the metric")] = None
+    relative_to: Annotated[
+        str | None, Meta(description="a case: limits are multiples of the value there, seed by seed")
+    ] = None
+    why: Annotated[str, Meta(description="printed where it is not met")] = ""
+
+    def __post_init__(self) -> None:
+        if (self.metric is None) == (self.measure is None):
+            raise ValueError('a criterion judges one number; give metric = "iae", or measure = "..." of the law')
+        if self.at_most is None and self.at_least is None:
+            raise ValueError("a criterion needs a limit; add at_most = 0.5, or at_least")
+        if self.at_most is not None and self.at_least is not None and self.at_least > self.at_most:
+            raise ValueError("`at_least` is above `at_most`; exchange them")
+        if self.relative_to is not None and self.relative_to == self.case:
+            raise ValueError("`relative_to` names the case that is judged; name another one")
+
+
 class Experiment(Part, frozen=True):
     """Experiment, or a case of it after `document.cases`."""
 
@@ -433,6 +472,9 @@ class Experiment(Part, frozen=True):
     hosts: Annotated[dict[Name, Host], Meta(description="other machines, and which robots run there")] = {}
     safety: Annotated[Safety, Meta(description="limits at which robots hold, land or stop")] = Safety()
     start: Annotated[Start, Meta(description="start of a run: its deadline and the scatter of the robots")] = Start()
+    criteria: Annotated[
+        list[Criterion], Meta(description="limits that a run must keep to pass; `run` says which it does not")
+    ] = []
     cases: Annotated[
         dict[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], dict[str, Any]],
         Meta(description="each may override any field; the first is the reference of every ratio"),

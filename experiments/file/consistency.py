@@ -16,7 +16,18 @@ from agents.plugins.laws import Gradient
 from agents.plugins.registry import did_you_mean
 from agents.plugins.triggers import Trigger
 from experiments.definition.bodies import WORLD, driven_kind, own_bodies
-from experiments.definition.experiment import Arena, Change, Experiment, Hybrid, Link, Robot, Target
+from experiments.definition.experiment import (
+    JUDGED,
+    MEAN,
+    WORST,
+    Arena,
+    Change,
+    Experiment,
+    Hybrid,
+    Link,
+    Robot,
+    Target,
+)
 from experiments.definition.links import FORM, held_height, link_pairs
 from experiments.file import consistency_network
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
@@ -59,7 +70,7 @@ def standby_faults(experiment: Experiment) -> Iterator[Fault]:
 
 _ROLES: Final = ("recorder", "world", "centre", "vicon")  # processes of a case beside those of its robots
 # words of keys, of [disturbance], of events and of tables of results
-_RESERVED: Final = ("all", "estop", "run", "conductor", "mean", *_ROLES)  # and the kinds of robots
+_RESERVED: Final = ("all", "estop", "run", "conductor", MEAN, WORST, *_ROLES)  # and the kinds of robots
 ROUNDED: Final = 1e-3  # [m] heights written with three decimals
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
@@ -87,6 +98,26 @@ def faults(experiment: Experiment) -> Iterator[Fault]:
         if name not in known:
             message = f"'{name}' is neither a robot nor a kind of robots"
             yield Fault(("disturbance", name), message, did_you_mean(name, known), on_key=True)
+
+
+def judged_metrics() -> list[str]:
+    """Metrics that a criterion can name."""
+    return [*JUDGED, *registry.names(registry.METRICS)]
+
+
+def criteria_faults(experiment: Experiment, cases: Iterable[str]) -> Iterator[Fault]:
+    """Faults of the criteria of a file with these cases."""
+    cases = list(cases)
+    for number, each in enumerate(experiment.criteria):
+        path = ("criteria", number)
+        if each.metric is not None and each.metric not in (known := judged_metrics()):
+            yield Fault((*path, "metric"), f"no {each.metric!r} among the metrics", did_you_mean(each.metric, known))
+        if each.of not in (known := [MEAN, WORST, *experiment.robots]):
+            yield Fault((*path, "of"), f"no robot is called '{each.of}'", did_you_mean(each.of, known))
+        for key in ("case", "relative_to"):
+            name = getattr(each, key)
+            if name is not None and name not in cases:
+                yield Fault((*path, key), f"no case '{name}' in this experiment", did_you_mean(name, cases))
 
 
 def _case_names(names: Iterable[str]) -> Iterator[Fault]:

@@ -29,6 +29,7 @@ __all__ = ["Document", "DocumentError", "Problem"]
 _Table = dict[str, Any]
 UNNAMED: Final = "default"  # the case of an experiment without cases
 TEXT: Final = "text"  # what an experiment is called that stands in no file
+_OF_THE_FILE: Final = ("cases", "criteria")  # keys that no case has
 _ABOVE: Final = (("arena",), ("arena", "file"))  # changes after which the arena may begin with another file
 
 
@@ -112,14 +113,17 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
         source.refuse(structure.number_faults(content))
         documents, tables = _resolved(file, source, content)
         nested = [
-            Fault(("cases", name, "cases"), "a case cannot hold cases", "leave them out", on_key=True)
+            Fault(("cases", name, key), f"a case cannot hold {key}", "they stand at the top of the file", on_key=True)
             for name, table in tables.items()
-            if "cases" in table
+            for key in _OF_THE_FILE
+            if key in table
         ]
         shapes = {name: [*fill_from_shape(each), *structure.faults(each)] for name, each in documents.items()}
         source.refuse([*nested, *_each_once(shapes, tables)])
         experiments = {name: msgspec.convert(each, Experiment) for name, each in documents.items()}
         source.refuse(_each_once({name: list(consistency.faults(each)) for name, each in experiments.items()}, tables))
+        if tables or not is_json:  # a case that was written as JSON names cases that are not in it
+            source.refuse(consistency.criteria_faults(experiments[None], tables or [UNNAMED]))
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     experiment = experiments[None]
@@ -273,13 +277,13 @@ def _beginning(table: object, path: Keys) -> Keys:
 
 
 def case_document(experiment: Experiment, case: str = UNNAMED) -> bytes:
-    """A case as one line of JSON for a robot without a file; without the hosts of the other robots.
+    """A case as one line of JSON for a robot without a file; without criteria and the hosts of the other robots.
 
     Its name comes with it: `Document.cases` of what is received has this case alone.
     """
     arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
     cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
-    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}, cases=cases))
+    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}, criteria=[], cases=cases))
 
 
 def chosen_case(read: Document, name: str | None) -> Experiment:

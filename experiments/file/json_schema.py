@@ -17,6 +17,7 @@ import msgspec
 from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.definition.experiment import Experiment
+from experiments.file.consistency import judged_metrics
 from experiments.file.overrides import ALONE, SHAPE
 from experiments.file.problems import Path
 from experiments.file.structure import LARGEST, group_of
@@ -59,8 +60,11 @@ def described() -> dict[str, Any]:
         field["description"] = definitions["Channel"]["properties"][name]["description"]
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE, ALONE]})
     definitions["Robot"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
+    judged = definitions["Criterion"]["properties"]["metric"]
+    judged["enum"] = judged_metrics()
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
-    del partial["Experiment" + _CASE]["properties"]["cases"]
+    for key in ("cases", "criteria"):
+        del partial["Experiment" + _CASE]["properties"][key]
     definitions["Experiment"]["properties"]["cases"]["additionalProperties"] = {
         "$ref": f"#/definitions/Experiment{_CASE}"
     }

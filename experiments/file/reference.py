@@ -31,7 +31,7 @@ _NAMES: Final = {  # tables whose keys are names, with the example of such a nam
     "links": ("LINK", '"TB01 > KH01"'),
     "anchors": ("ROBOT", "TB01"),
 }
-_LISTS: Final = ("timeline", "changes", "outages")  # keys that are lists of tables
+_LISTS: Final = ("timeline", "changes", "outages", "criteria")  # keys that are lists of tables
 _SYNONYMS: Final = {  # of words that users look for: words that keys and their texts have
     "camera": ("positioning", "capture"),
     "charge": ("battery",),

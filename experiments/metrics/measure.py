@@ -160,6 +160,7 @@ def measure(trace: Trace) -> CaseMetrics:
         guidance=centralised.guidance(trace),
         measures=_law_measures(shared, kept),
         metric_faults=(*unusable_metrics(), *faults),
+        criteria=tuple(trace.experiment.criteria),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
+from experiments.definition.experiment import Criterion
+
 
 class Phase(msgspec.Struct, frozen=True):
     """Robot in a later phase: from a leg of the timeline to the next, or to the end."""
@@ -220,3 +222,4 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     spoiled: tuple[str, ...] = ()
     measures: dict[str, LawMeasure] = {}  # of the law by name, means over the robots in the means
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each
+    criteria: tuple[Criterion, ...] = ()  # of the experiment

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 import numpy as np
 
+from experiments.metrics import criteria
 from experiments.metrics.results import CaseMetrics, LawMeasure, RobotMetrics, ShadowMetrics
 from experiments.metrics.statistics import ratios
 from twins.arrays import Array
@@ -42,6 +43,7 @@ def document(run_folder: str, seed: int, cases: Sequence[CaseMetrics]) -> dict[s
             }
             for case in cases
         },
+        **criteria.document(criteria.judge(cases)),
     }
 
 

@@ -161,7 +161,7 @@ def write(
 def labelled(runs: Sequence[tuple[str, Sequence[CaseMetrics]]]) -> list[CaseMetrics]:
     """Metrics of all cases of several runs, by names that tell the runs apart."""
     return [
-        msgspec.structs.replace(case, case=_label(name, case, cases))
+        msgspec.structs.replace(case, case=_label(name, case, cases), criteria=())
         for name, (_, cases) in zip(_distinct([name for name, _ in runs]), runs, strict=True)
         for case in cases
     ]

@@ -6,6 +6,8 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from agents.plugins.registry import did_you_mean
+from experiments.metrics import criteria
 from experiments.metrics.comparable import LOST, MISSED, SLOW, lost_share, spoils
 from experiments.metrics.metric import ERRORS, OURS
 from experiments.metrics.results import CaseMetrics, Collision
@@ -26,6 +28,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *failures(cases),
         *spoiled(cases),
         *interruptions(cases),
+        *judged(cases),
         *_troubles(cases),
         *metric_faults(cases),
         *_lost_poses(cases),
@@ -47,6 +50,39 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     if any(case.spoiled or case.failures for case in cases):
         return [Finding("plain", each.text) if each.mark == "good" else each for each in found]
     return found
+
+
+def judged(cases: Sequence[CaseMetrics]) -> list[Finding]:
+    """Whether the runs pass the criteria of their experiment, and why not; empty without criteria."""
+    found = criteria.judge(cases)
+    if not found:
+        return []
+    bad, unknown = [each for each in found if each.passed is False], [each for each in found if each.passed is None]
+    count = f"{len(found) - len(bad) - len(unknown)} of {len(found)} criteria are met"
+    seeds = max(len(each.values) for each in found)
+    count += f" by all {seeds} seeds" * (seeds > 1)
+    words = "Not passed" if bad else "Not judged as a whole" if unknown else "Passed"
+    mark: Mark = "bad" if bad else "fair" if unknown else "good"
+    return [
+        Finding(mark, f"{words}: {count}."),
+        *(Finding("bad", _missed(each)) for each in bad),
+        *(Finding("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unknown),
+    ]
+
+
+def _missed(judgement: criteria.Judgement) -> str:
+    """The criterion that is not met, by how many seeds, and why it is asked."""
+    seeds, failed = len(judgement.values), judgement.failed
+    values = [judgement.values[seed] for seed in failed]
+    asked = judgement.criterion
+    off = [value if asked.at_most is None else -value for value in values if value is not None]
+    worst = None if len(off) < len(values) else min(off) if asked.at_most is None else -min(off)
+    which = f" for {len(failed)} of {seeds} seeds, the farthest" * (seeds > 1)
+    is_what = "is unknown" if worst is None else f"is {number(worst)}"
+    if asked.measure and asked.measure not in judgement.measures:
+        is_what += f" (no measure of the law; {did_you_mean(asked.measure, judgement.measures) or 'it has none'})"
+    why = f" {asked.why.strip().rstrip('.')}." if asked.why.strip() else ""
+    return f"{judgement.what} {is_what}{which}, not {judgement.limit}.{why}"
 
 
 def _of_each_case(

@@ -84,11 +84,11 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
 
 
 def digest(experiment: Experiment) -> str:
-    """The same for experiments that run in the same way: title, source, cases and the file's own seed are left out.
+    """The same for experiments that run in the same way: title, source, cases, criteria and the seed are left out.
 
     Robots and links count in the order of the file, by which starts are drawn and sums are formed.
     """
-    bare = msgspec.structs.replace(experiment, title="", source="", cases={}, seed=0)
+    bare = msgspec.structs.replace(experiment, title="", source="", cases={}, criteria=[], seed=0)
     return hashlib.sha256(msgspec.json.encode(bare)).hexdigest()[:20]
 
 

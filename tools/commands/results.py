@@ -398,10 +398,14 @@ def write_figures_of_merit(runs: Sequence[Run], folder: Path) -> None:
 
 def summary(runs: Sequence[Run]) -> dict[str, Any]:
     """The figures of a run for scripts: those of its first seed, and `across` its seeds if there are several."""
+    from experiments.metrics import criteria
     from experiments.metrics.statistics import across_seeds
 
     found = runs[0].summary()
-    return found | ({"across": across_seeds([each.summary() for each in runs])} if len(runs) > 1 else {})
+    if len(runs) > 1:
+        found |= {"across": across_seeds([each.summary() for each in runs])}
+        found |= criteria.document(criteria.judge([case for each in runs for case in each.metrics.values()]))
+    return found
 
 
 def write_report(runs: Sequence[Run], folder: Path, width: float = 3.5, *, pdf: bool = False) -> Path:

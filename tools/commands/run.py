@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 app: Final = typer.Typer()
 
 STOPPED: Final = 1  # exit code of a run that an emergency stop has ended,
-FAILED: Final = 1  # and of one in which a robot did not do its part
+FAILED: Final = 1  # and of one in which a robot did not do its part, or that does not keep a criterion
 SPOILED: Final = 3  # of a run whose figures cannot be compared
 FEW: Final = 6  # hazards of runs in virtual time that are printed
 
@@ -135,6 +135,7 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
     """
     from experiments.check.kept import KeptVerdict
     from experiments.file.document import load
+    from experiments.metrics.criteria import has_passed, judge
     from experiments.recording.cleaning import using
     from experiments.recording.run_folder import SOURCE, check_folder, new_folder, remove_unused
     from experiments.report import verdict
@@ -172,10 +173,11 @@ def _run(origin: RunOrigin, options: RunOptions, show: _Shown, *, former: Path |
         if stopped:
             warn([stopped])
         if not code:
-            failures = verdict.failures([case for each in runs for case in each.metrics.values()])
+            cases = [case for each in runs for case in each.metrics.values()]
+            failures = verdict.failures(cases)
             warn([finding.text for finding in failures])
-            code = FAILED if failures or stopped else 0
-            if not code and any(case.spoiled for each in runs for case in each.metrics.values()):
+            code = FAILED if failures or stopped or has_passed(judge(cases)) is False else 0
+            if not code and any(case.spoiled for case in cases):
                 code = SPOILED
         return code if former is None else max(code, _print_differences(folder, former, quiet=show.as_json))
     finally:
@@ -402,6 +404,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
         yield verdict.left_out(cases)
     yield from (finding.text for finding in verdict.contacts(cases) if finding.mark == "bad")
     yield from (finding.text for finding in verdict.metric_faults(cases))
+    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.judged(cases))
     if len(runs) > 1:
         yield f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)"
     yield from (f"note: {note}" for note in runs[0].notes)

@@ -1,0 +1,133 @@
+"""Criteria of a file: what passes, what does not and why, over cases and seeds, in files and on the command line."""
+
+import json
+import sys
+
+import msgspec
+import pytest
+
+from experiments.definition.experiment import JUDGED, Criterion
+from experiments.file.document import loads, write_json
+from experiments.metrics.criteria import document, has_passed, judge
+from experiments.metrics.metric import OURS
+from experiments.metrics.results import RobotMetrics
+from experiments.report.verdict import judged
+from experiments.run import reopen, simulate, simulate_seeds
+from tools.main import main
+
+FILE = """
+title = "Two robots"
+duration_s = 4.0
+disturbance.all.position_sigma = 0.001
+[robots.A]
+kind = "khepera4"
+start = [0.0, 0.0]
+[robots.B]
+kind = "khepera4"
+start = [0.8, 0.0]
+[formation.links]
+"A - B" = 0.6
+[cases.periodic]
+trigger = { kind = "periodic", period_s = 0.1 }
+[cases.event]
+trigger = { kind = "send-on-delta", threshold = 0.02 }
+"""
+HALF = '[[criteria]]\nmetric = "f_hz"\ncase = "event"\nrelative_to = "periodic"\nat_most = 0.5\nwhy = "events save"\n'
+TIGHT = '[[criteria]]\nmetric = "rmse"\nof = "worst"\nat_most = 0.001\nwhy = "nobody is that good"\n'
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return list(simulate(loads(FILE + HALF + TIGHT)).metrics.values())
+
+
+def with_criteria(cases, *criteria):
+    return [msgspec.structs.replace(case, criteria=criteria) for case in cases]
+
+
+def answer(cases, **criterion):
+    return [each.passed for each in judge(with_criteria(cases, Criterion(**criterion)))]
+
+
+def test_names_that_are_judged_are_measured():
+    assert set(OURS) <= set(JUDGED) <= set(RobotMetrics.__struct_fields__)
+
+
+def test_each_criterion_is_judged_in_its_cases(cases):
+    assert [(each.case, each.passed) for each in judge(cases)] == [
+        ("event", True),
+        ("periodic", False),
+        ("event", False),
+    ]
+    first, *others = judged(cases)
+    assert (first.mark, first.text) == ("bad", "Not passed: 1 of 3 criteria are met.")
+    assert all("nobody is that good" in each.text for each in others)
+
+
+@pytest.mark.parametrize(
+    ("criterion", "passed"),
+    [
+        ({"metric": "f_hz", "at_least": 9.0, "at_most": 11.0}, True),
+        ({"metric": "f_hz", "at_most": 9.0}, False),
+        ({"metric": "f_hz", "of": "B", "at_least": 9.0}, True),
+        ({"metric": "f_hz", "of": "worst", "at_least": 9.0}, True),
+        ({"metric": "collisions", "of": "worst", "at_most": 0.0}, True),
+        ({"metric": "residual", "at_most": 1.0}, True),
+        ({"measure": "spread", "at_most": 1.0}, False),
+    ],
+)
+def test_numbers_that_can_be_judged(cases, criterion, passed):
+    assert answer(cases, case="periodic", **criterion) == [passed]
+
+
+def test_what_was_not_run_is_not_judged(cases):
+    event = cases[1:]
+    assert answer(event, metric="f_hz", case="periodic", at_most=1.0) == [None]
+    assert answer(event, metric="f_hz", case="event", relative_to="periodic", at_most=1.0) == [None]
+    assert has_passed(judge(event)) is False
+    assert has_passed(judge(with_criteria(event, cases[0].criteria[0]))) is None
+
+
+def test_an_interrupted_run_passes_nothing(cases):
+    short = [msgspec.structs.replace(case, interrupted=True) for case in cases]
+    assert answer(short, metric="f_hz", at_least=0.0) == [False, False]
+
+
+def test_every_seed_must_pass():
+    runs = simulate_seeds(loads(FILE), [1, 2, 3], cases=["event"])
+    found = [case for run in runs for case in run.metrics.values()]
+    values = sorted(case.mean["rmse"] for case in found)
+    (only,) = judge(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
+    assert len(only.values) == 3
+    assert len(only.failed) == 1
+    (_, why) = judged(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
+    assert "for 1 of 3 seeds" in why.text
+
+
+def test_scripts_get_values_by_seed(cases):
+    found = document(judge(cases))
+    assert found["passed"] is False
+    assert found["criteria"][0]["metric"] == "f_hz"
+    assert found["criteria"][0]["values"]["1"] < 0.5
+    assert document([]) == {}
+
+
+def test_a_case_keeps_criteria_when_it_is_written():
+    case = loads(FILE + HALF).cases()["event"]
+    assert loads(FILE + HALF).cases()["periodic"].criteria == case.criteria
+    assert b'"relative_to"' in write_json(case)
+
+
+@pytest.mark.parametrize(("limits", "code"), [(HALF, 0), (HALF + TIGHT, 1)])
+def test_a_run_ends_by_its_criteria(limits, code, tmp_path, monkeypatch, capsys):
+    file, out = tmp_path / "task.toml", tmp_path / "run"
+    file.write_text(FILE + limits, "utf-8")
+    monkeypatch.setattr(sys, "argv", ["zenpark", "run", str(file), "--virtual", "--json", "--out", str(out)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == code
+    passed = code == 0
+    assert json.loads(capsys.readouterr().out)["passed"] is passed
+    words = "Passed: 1 of 1 criteria are met." if passed else "nobody is that good"
+    assert words in (out / "report.html").read_text("utf-8")
+    assert reopen(out).summary()["passed"] is passed
