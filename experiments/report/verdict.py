@@ -28,7 +28,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
         *failures(cases),
         *spoiled(cases),
         *interruptions(cases),
-        *judged(cases),
+        *criteria_met(cases),
         *_troubles(cases),
         *metric_faults(cases),
         *_lost_poses(cases),
@@ -52,7 +52,7 @@ def findings(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return found
 
 
-def judged(cases: Sequence[CaseMetrics]) -> list[Finding]:
+def criteria_met(cases: Sequence[CaseMetrics]) -> list[Finding]:
     """Whether the runs pass the criteria of their experiment, and why not; empty without criteria."""
     found = criteria.judge(cases)
     if not found:

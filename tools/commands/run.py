@@ -404,7 +404,7 @@ def _lines(runs: Sequence[Run], found: dict[str, Any], page: Path | None) -> Ite
         yield verdict.left_out(cases)
     yield from (finding.text for finding in verdict.contacts(cases) if finding.mark == "bad")
     yield from (finding.text for finding in verdict.metric_faults(cases))
-    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.judged(cases))
+    yield from (f"{page_of.MARKS[each.mark]} {each.text}" for each in verdict.criteria_met(cases))
     if len(runs) > 1:
         yield f"± is the half-width of the 95 % confidence interval of the mean over {len(runs)} seeds (Student's t)"
     yield from (f"note: {note}" for note in runs[0].notes)

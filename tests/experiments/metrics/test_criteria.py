@@ -11,7 +11,7 @@ from experiments.file.document import loads, write_json
 from experiments.metrics.criteria import document, has_passed, judge
 from experiments.metrics.metric import OURS
 from experiments.metrics.results import RobotMetrics
-from experiments.report.verdict import judged
+from experiments.report.verdict import criteria_met
 from experiments.run import reopen, simulate, simulate_seeds
 from tools.main import main
 
@@ -59,7 +59,7 @@ def test_each_criterion_is_judged_in_its_cases(cases):
         ("periodic", False),
         ("event", False),
     ]
-    first, *others = judged(cases)
+    first, *others = criteria_met(cases)
     assert (first.mark, first.text) == ("bad", "Not passed: 1 of 3 criteria are met.")
     assert all("nobody is that good" in each.text for each in others)
 
@@ -100,7 +100,7 @@ def test_every_seed_must_pass():
     (only,) = judge(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
     assert len(only.values) == 3
     assert len(only.failed) == 1
-    (_, why) = judged(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
+    (_, why) = criteria_met(with_criteria(found, Criterion(metric="rmse", at_most=values[1])))
     assert "for 1 of 3 seeds" in why.text
 
 
