@@ -19,17 +19,26 @@ if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
 
-NOTEBOOKS: Final = ("experiments.run",)
+NOTEBOOKS: Final = (
+    "experiments.file.document",
+    "experiments.run",
+    "experiments.sweep.sweep",
+    "experiments.recording.trace",
+)
 FORMULA: Final = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 PLUGINS: Final = (
     "agents.vectors",
     "agents.formation.link",
+    "agents.plugins.law",
     "agents.plugins.laws",
     "agents.plugins.triggers",
     "agents.plugins.predictors",
     "agents.plugins.planners",
     "agents.plugins.avoidance",
+    "agents.body.kinds",
     "agents.body.interface",
+    "experiments.metrics.metric",
+    "experiments.metrics.measurement",
     "twins.engines.engine",
 )
 
@@ -230,8 +239,9 @@ def _comment(node: ast.stmt, lines: Sequence[str]) -> str:
 
 
 def api() -> Iterator[str]:
-    """Modules that notebooks and plug-ins may import."""
+    """Modules of the names that notebooks and plug-ins import."""
     yield "# Python API\n"
+    yield "Notebooks and plug-ins import these names from `zenpark`: [Python](../python.md) has an example of each.\n"
     yield "## Notebooks\n"
     yield from (f"::: {module}\n" for module in NOTEBOOKS)
     yield "## Plug-ins\n"

@@ -45,6 +45,7 @@ experiments.real_time.hosts
 experiments.report experiments.real_time.conductor
 experiments.run
 experiments.sweep experiments.view
+experiments.api
 tools.terminal
 tools.live_table tools.consent
 tools.progress tools.completion

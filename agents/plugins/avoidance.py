@@ -128,7 +128,7 @@ class OwnState:
         self.by_position = self.by_twist = self.flies = False
 
 
-def measure(own: OwnState, thing: Thing) -> None:
+def measure_gap(own: OwnState, thing: Thing) -> None:
     """Set `away` and `gap` of a thing.
 
     Two axes in one place, which only wrong measurements can give, are separated along x. A velocity fades with its time
@@ -206,7 +206,7 @@ class Potential(Avoidance, frozen=True):
         force_x = force_y = 0.0
         for k in range(near.count):
             thing = near.things[k]
-            measure(own, thing)
+            measure_gap(own, thing)
             push = self.push(thing.gap)
             force_x, force_y = force_x + push * thing.away_x, force_y + push * thing.away_y
         strength = sqrt(force_x * force_x + force_y * force_y)

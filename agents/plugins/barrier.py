@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
-from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState, Plane, Thing, measure
+from agents.plugins.avoidance import HURRY, Avoidance, Nearby, OwnState, Plane, Thing, measure_gap
 from agents.vectors import NotNegative, Positive, Setpoint, Vector, clamp
 
 SLACK: Final = 1e-9  # [m/s] violations smaller than this are arithmetic
@@ -119,7 +119,7 @@ class Barrier(Avoidance, frozen=True):
         """
         for k in range(near.count):
             thing, plane = near.things[k], near.planes[k]
-            measure(own, thing)
+            measure_gap(own, thing)
             plane.x, plane.y = -thing.away_x, -thing.away_y
             bound = self.bound(thing, share if thing.is_robot else 1.0)
             plane.b = bound if bound < HURRY * own.speed else inf

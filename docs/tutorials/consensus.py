@@ -13,18 +13,24 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.kinds.tello import TELLO
-from experiments.check.check import check, figures
-from experiments.check.ideal_run import bearable_factors, closed_shares
-from experiments.check.realisation import algebraic_connectivity
-from experiments.definition.graph import components, laplacian, links
-from experiments.file.document import Document, loads
-from experiments.recording.trace import Trace
-from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
-from experiments.run import folder, show, simulate
-from twins.arrays import Array
+from zenpark import (
+    KINDS,
+    Array,
+    Document,
+    Trace,
+    check,
+    figures,
+    folder,
+    graph,
+    ideal_run,
+    loads,
+    show,
+    simulate,
+    style,
+)  # fmt: skip
 
 OUT = folder("docs/tutorials/out")
+TELLO = KINDS["tello"]
 N = 6
 
 # %% [markdown]
@@ -44,7 +50,7 @@ GRAPHS: dict[str, Pairs] = {
 
 def laplacian_of(pairs: Pairs) -> Array:
     """L = D − A of the graph in which both ends of every pair receive from each other."""
-    return laplacian(links([*pairs, *((j, i) for i, j in pairs)]), N)
+    return graph.laplacian(graph.links([*pairs, *((j, i) for i, j in pairs)]), N)
 
 
 print(laplacian_of(GRAPHS["path"]))
@@ -68,7 +74,6 @@ for name, pairs in GRAPHS.items():
     assert np.all(L.sum(axis=1) == 0.0)
     assert abs(eigenvalues[0]) < 1e-12
     assert abs(eigenvalues[1] - KNOWN[name]) < 1e-12
-    assert abs(algebraic_connectivity(links(pairs), N) - KNOWN[name]) < 1e-12
     print(f"{name:>9}: {len(pairs):2d} edges, eigenvalues {np.round(eigenvalues, 3) + 0.0}")
 
 # %% [markdown]
@@ -77,15 +82,15 @@ for name, pairs in GRAPHS.items():
 # %%
 two_triangles: Pairs = [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)]
 eigenvalues = np.linalg.eigvalsh(laplacian_of(two_triangles))
-assert components(links(two_triangles), N) == 2
+assert graph.components(graph.links(two_triangles), N) == 2
 assert (np.abs(eigenvalues) < 1e-12).sum() == 2
 
 
 # %%
-@styled
+@style.styled
 def spectra() -> Figure:
     """Each graph on a circle, and its eigenvalues below."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 2.7), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 2.7), layout="constrained")
     panels = figure.subplots(2, len(GRAPHS), height_ratios=(2.0, 1.0))
     angle = 2.0 * np.pi * np.arange(N) / N
     x, y = np.cos(angle), np.sin(angle)
@@ -93,12 +98,12 @@ def spectra() -> Figure:
         above, below = panels[:, k]
         for i, j in pairs:
             above.plot(x[[i, j]], y[[i, j]], color="#9a9a9a", zorder=1)
-        above.scatter(x, y, s=60, color=CASES[k], zorder=2)
+        above.scatter(x, y, s=60, color=style.CASES[k], zorder=2)
         above.set(title=name, aspect="equal", xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))
         above.axis("off")
         values = np.linalg.eigvalsh(laplacian_of(pairs))
-        below.plot(values, np.zeros(N), "o", color=CASES[k], alpha=0.6, clip_on=False)
-        below.plot(values[1], 0.0, "o", markersize=10, fillstyle="none", color=MAGENTA)
+        below.plot(values, np.zeros(N), "o", color=style.CASES[k], alpha=0.6, clip_on=False)
+        below.plot(values[1], 0.0, "o", markersize=10, fillstyle="none", color=style.MAGENTA)
         below.set(xlim=(-0.4, 6.4), ylim=(-1.0, 1.0), yticks=[], xlabel=r"$\lambda$; circled: $\lambda_2$")
         below.spines["left"].set_visible(False)
     return figure
@@ -164,15 +169,15 @@ assert codes == {"lands-on", "not-acquired", "not-random"}  # nothing here is ra
 runs = {name: simulate(document).traces["default"] for name, document in experiments.items()}
 
 
-@styled
+@style.styled
 def motions() -> Figure:
     """x of all robots, for each graph."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 1.7), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 1.7), layout="constrained")
     for k, (axes, (name, trace)) in enumerate(
         zip(figure.subplots(1, len(runs), sharex=True, sharey=True), runs.items(), strict=True)
     ):
-        axes.plot(trace.time, trace.true_position[..., 0], color=CASES[k], linewidth=0.7)
-        axes.axhline(np.mean(START, axis=0)[0], color=MAGENTA, linestyle="--", linewidth=0.8)
+        axes.plot(trace.time, trace.true_position[..., 0], color=style.CASES[k], linewidth=0.7)
+        axes.axhline(np.mean(START, axis=0)[0], color=style.MAGENTA, linestyle="--", linewidth=0.8)
         axes.set(title=name, xlabel="$t$ [s]", xlim=(0.0, DURATION_S))
         if k == 0:
             axes.set_ylabel("$x$ [m]")
@@ -243,7 +248,7 @@ assert np.all(np.abs(off) < 0.125)
 # %%
 HZ = 10.0  # decisions in a second
 BODY_HZ = 100.0  # steps of the position controller
-h = float(closed_shares([TELLO], HZ)[0])
+h = float(ideal_run.closed_shares([TELLO], HZ)[0])
 
 
 def sampled_rate(taken: float) -> float:
@@ -263,7 +268,9 @@ def lagging_rate(taken: float) -> float:
 
 
 for name, document in experiments.items():
-    slowest_s = figures(document.cases()["default"]).slowest_mode_s
+    found = figures(document.cases()["default"])
+    slowest_s = found.slowest_mode_s
+    assert abs(found.algebraic_connectivity - KNOWN[name]) < 1e-12
     assert slowest_s is not None
     assert abs(slowest_s * sampled_rate(GAIN * KNOWN[name]) - 1.0) < 1e-3
     print(f"{name:>9}: check says that the slowest mode takes {slowest_s:.1f} s")
@@ -282,22 +289,22 @@ assert np.all(np.abs(measured / lagging - 1.0) < 0.005)
 
 
 # %%
-@styled
+@style.styled
 def rates() -> Figure:
     """Measured rates over the eigenvalue, and how far the predictions are off."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 2.2), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 2.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     line = np.linspace(0.0, 6.2, 100)
-    left.plot(line, TELLO.response * GAIN * line, color=MAGENTA, label=r"$c\,k\,\lambda$", zorder=1)
+    left.plot(line, TELLO.response * GAIN * line, color=style.MAGENTA, label=r"$c\,k\,\lambda$", zorder=1)
     for k, name in enumerate(GRAPHS):
         mine = slice(k * (N - 1), (k + 1) * (N - 1))
-        left.plot(eigenvalue[mine], measured[mine], "o^sD"[k], color=CASES[k], fillstyle="none", label=name)
+        left.plot(eigenvalue[mine], measured[mine], "o^sD"[k], color=style.CASES[k], fillstyle="none", label=name)
     left.set(xlabel=r"eigenvalue $\lambda$", ylabel="measured rate [1/s]", xlim=(0.0, 6.3), ylim=(0.0, None))
     left.legend()
     for name, predicted, marker, colour in (
-        ("by hand", by_hand, "o", CASES[0]),
-        ("sampled", sampled, "s", CASES[1]),
-        ("sampled, with lag", lagging, "^", CASES[2]),
+        ("by hand", by_hand, "o", style.CASES[0]),
+        ("sampled", sampled, "s", style.CASES[1]),
+        ("sampled, with lag", lagging, "^", style.CASES[2]),
     ):
         right.plot(eigenvalue, 100.0 * (measured / predicted - 1.0), marker, color=colour, fillstyle="none", label=name)
     right.axhline(0.0, color="#9a9a9a", linewidth=0.6)
@@ -319,7 +326,7 @@ show(rates(), OUT / "consensus-rates")
 
 # %%
 largest = float(spectrum["ring"][0][-1])
-h = 2.0 / float(bearable_factors([TELLO], HZ)[0])
+h = 2.0 / float(ideal_run.bearable_factors([TELLO], HZ)[0])
 print(f"the limit of the ring: k = 2/(h λ_max) = {2.0 / (h * largest):.2f} per decision")
 LOOP = (0.4, 0.8, 1.1, 1.5, 1.8, 2.1, 2.5)  # h k λ_max
 left_over, said, steps = [], [], {}
@@ -351,18 +358,18 @@ assert left_over[:5] == sorted(left_over[:5])
 
 
 # %%
-@styled
+@style.styled
 def step_sizes() -> Figure:
     """The approach below and beyond the limit, and what is left."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 2.0), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 2.0), layout="constrained")
     panels = figure.subplots(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.3))
-    for axes, loop, colour in zip(panels, (0.4, 1.8, 2.5), CASES, strict=False):
+    for axes, loop, colour in zip(panels, (0.4, 1.8, 2.5), style.CASES, strict=False):
         axes.plot(steps[loop].time, steps[loop].true_position[..., 0], color=colour, linewidth=0.6)
         axes.set(title=rf"$h k \lambda_{{max}} = {loop}$", xlabel="$t$ [s]", xlim=(0.0, 10.0), ylim=(-1.2, 1.2))
     panels[0].set_ylabel("$x$ [m]")
-    panels[3].semilogy(LOOP, left_over, "o-", color=CASES[3])
+    panels[3].semilogy(LOOP, left_over, "o-", color=style.CASES[3])
     for at in (1.2, 2.0):
-        panels[3].axvline(at, color=MAGENTA, linestyle="--", linewidth=0.8)
+        panels[3].axvline(at, color=style.MAGENTA, linestyle="--", linewidth=0.8)
     panels[3].set(xlabel=r"$h k \lambda_{max}$", ylabel="left after 15 s [m]")
     return figure
 

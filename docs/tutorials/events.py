@@ -12,13 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.file.document import load
-from experiments.metrics.signals import belief_errors
-from experiments.recording.trace import Trace
-from experiments.run import folder, show, simulate
-from experiments.sweep.pareto import front
-from experiments.sweep.sweep import sweep
-from twins.arrays import Array, norm
+from zenpark import Array, Trace, folder, load, pareto, show, signals, simulate, sweep
 
 OUT = folder("docs/tutorials/out")
 
@@ -54,7 +48,7 @@ def by_hand(trace: Trace) -> tuple[float, float]:
     """Messages in a second and IAE [m s], mean over the followers."""
     net, duration = trace.plan.links, float(trace.time[-1] - trace.time[0])
     position = trace.true_position
-    off = np.abs(net.distance - norm(position[:, net.receiver] - position[:, net.sender]))  # (T, E)
+    off = np.abs(net.distance - np.linalg.norm(position[:, net.receiver] - position[:, net.sender], axis=2))  # (T, E)
     rates, errors = [], []
     for row in range(len(trace.robots)):
         if row in net.receiver:  # the leader is not: it receives nothing
@@ -148,7 +142,7 @@ show(pictures["intervals"], OUT / "events-intervals")
 
 # %%
 net = event.plan.links
-believed = belief_errors(event, net)  # (T, E) [m]
+believed = signals.belief_errors(event, net)  # (T, E) [m]
 ground = np.array([not name.startswith("CF") for name in event.robots])[net.sender]
 worst_ground = float(np.nanmax(believed[:, ground]))
 print(f"worst belief of a ground robot {1e3 * worst_ground:.1f} mm, of a drone {1e3 * np.nanmax(believed):.1f} mm")
@@ -225,7 +219,7 @@ assert both.sum() >= 2
 assert np.all((gain > 1.6) & (gain < 2.2))
 assert abs(curve("periodic")[1][-1] - error[-1]) < 0.005  # a quarter of the messages: no difference
 
-best = front(found.rows)
+best = pareto.front(found.rows)
 print("nothing is better in both than:", *(row.label for row in best), sep="\n  ")
 assert "event" not in {row.case for row in best}  # and of the periods only one, that of the fewest messages
 slow = min(row.ratio["messages"].mean or 0.0 for row in best if row.case == "predictive")

@@ -13,23 +13,32 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from agents.kinds.crazyflie import CRAZYFLIE
-from experiments.check.check import check, figures
-from experiments.check.ideal_run import closed_shares
-from experiments.definition.rigidity import rigid_motions, rigidity, rigidity_matrix
-from experiments.file.document import Document, load, loads
-from experiments.report.style import CASES, MAGENTA, WIDTH, Drawing, styled
-from experiments.run import folder, show, simulate
-from twins.arrays import Array, Mask, norm
+from zenpark import (
+    KINDS,
+    Array,
+    Document,
+    check,
+    figures,
+    folder,
+    ideal_run,
+    load,
+    loads,
+    rigidity,
+    show,
+    simulate,
+    style,
+)  # fmt: skip
 
 OUT = folder("docs/tutorials/out")
+Mask = NDArray[np.bool_]
 Pairs = list[tuple[int, int]]
 
 
 def rank(position: Array, pairs: Pairs, free: Mask | None = None) -> tuple[int, int]:
     """Rank of the rigidity matrix, and the rank that a rigid framework has."""
-    found = rigidity(position, np.array(pairs), free)
+    found = rigidity.rigidity(position, np.array(pairs), free)
     return found.rank, found.needed
 
 
@@ -58,11 +67,11 @@ sides: Pairs = [(0, 1), (1, 2), (2, 3), (3, 0)]
 braced: Pairs = [*sides, (0, 2)]
 
 held = in_the_plane(square)
-R = rigidity_matrix(square, np.array(sides), held)
+R = rigidity.rigidity_matrix(square, np.array(sides), held)
 assert R.shape == (4, 8)
 assert rank(square, sides, held) == (4, 5)
 assert rank(square, braced, held) == (5, 5)
-assert rigid_motions(square, held) == 3
+assert rigidity.rigid_motions(square, held) == 3
 
 # %% [markdown]
 # Four equations for eight unknowns: four independent motions change no side. Three of them move the square as a
@@ -89,25 +98,25 @@ print("the flex, x and y of each corner:\n", np.round(flex, 3) + 0.0)
 assert np.linalg.matrix_rank(rest, tol=1e-9) == 1
 assert np.allclose(flex[0], -flex[2])  # opposite corners go opposite ways
 assert np.allclose(flex[1], -flex[3])
-across = rigidity_matrix(square, np.array([(0, 2)]), held) @ flex.ravel()
+across = rigidity.rigidity_matrix(square, np.array([(0, 2)]), held) @ flex.ravel()
 assert abs(across[0]) > 0.5  # a diagonal forbids it
 
 
 # %%
-@styled
+@style.styled
 def frameworks() -> Figure:
     """The square with its flex, and the braced one."""
-    figure = Drawing(figsize=(WIDTH, 1.8), layout="constrained")
+    figure = style.Drawing(figsize=(style.WIDTH, 1.8), layout="constrained")
     for axes, pairs, title in zip(figure.subplots(1, 2), (sides, braced), ("rank 4 of 5", "rank 5 of 5"), strict=True):
         for i, j in pairs:
-            axes.plot(square[[i, j], 0], square[[i, j], 1], color=CASES[0] if (i, j) in sides else MAGENTA)
+            axes.plot(square[[i, j], 0], square[[i, j], 1], color=style.CASES[0] if (i, j) in sides else style.MAGENTA)
         axes.plot(square[:, 0], square[:, 1], "o", color="#000000", markersize=5)
         axes.set(
             title=title, aspect="equal", xlim=(-0.35, 1.15), ylim=(-0.35, 1.15), xlabel="$x$ [m]", ylabel="$y$ [m]"
         )
         if pairs is sides:
             axes.quiver(
-                *square[:, :2].T, *flex.T, color=CASES[1], angles="xy", scale_units="xy", scale=2.0, width=0.012
+                *square[:, :2].T, *flex.T, color=style.CASES[1], angles="xy", scale_units="xy", scale=2.0, width=0.012
             )
     return figure
 
@@ -154,8 +163,8 @@ for lengths, what in ((SIDES, "sides"), (BRACED, "braced")):
     for name, starts in STARTS.items():
         place = ends_at(formation(starts, [0.8] * 4, lengths))
         ends[what, name] = place
-        side = [float(norm(place[[i]] - place[[j]])[0]) for i, j in sides]
-        diagonal = float(norm(place[[0]] - place[[2]])[0])
+        side = [float(np.linalg.norm(place[i] - place[j])) for i, j in sides]
+        diagonal = float(np.linalg.norm(place[0] - place[2]))
         print(f"{what:>6}, {name:>6} start: sides {np.round(side, 3)} m, A to C {diagonal:.3f} m")
         assert np.allclose(side, SIDE, atol=1e-3)  # every distance that was asked for is met
         right_one = abs(diagonal - BRACED["AC"]) < 1e-3
@@ -176,14 +185,14 @@ assert "in space 5 of 6, not needed while heights are held" in said["rigid"]
 
 
 # %%
-@styled
+@style.styled
 def squares() -> Figure:
     """How the four runs end, seen from above."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 1.9), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 1.9), layout="constrained")
     for axes, (what, name) in zip(figure.subplots(1, 4), ends, strict=True):
         place = ends[what, name] - ends[what, name].mean(axis=0)
         for i, j in sides if what == "sides" else braced:
-            axes.plot(place[[i, j], 0], place[[i, j], 1], color=CASES[0] if (i, j) in sides else MAGENTA)
+            axes.plot(place[[i, j], 0], place[[i, j], 1], color=style.CASES[0] if (i, j) in sides else style.MAGENTA)
         for corner, (x, y) in zip(CORNERS, place[:, :2], strict=True):
             axes.annotate(corner, (x, y), ha="center", va="center", bbox={"boxstyle": "circle", "fc": "w", "lw": 0.6})
         axes.set(title=f"{what}, {name} start", aspect="equal", xlim=(-0.9, 0.9), ylim=(-0.9, 0.9))
@@ -203,7 +212,7 @@ show(squares(), OUT / "rigidity-squares")
 # %%
 both: Pairs = [*braced, (1, 3)]
 lifted = square + np.array([[0.0], [0.0], [0.0], [1.0]]) * [0.0, 0.0, 0.3]
-assert rigid_motions(square, np.ones((4, 3), dtype=bool)) == 6
+assert rigidity.rigid_motions(square, np.ones((4, 3), dtype=bool)) == 6
 assert rank(square, braced) == (5, 6)
 assert rank(square, both) == (5, 6)
 assert rank(lifted, both) == (6, 6)
@@ -272,7 +281,7 @@ def compromise(rise: float) -> tuple[float, float]:
 flown = []
 for rise in RISES:
     place = ends_at(tent(rise))
-    base, leg, other = (float(norm(place[[i]] - place[[j]])[0]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    base, leg, other = (float(np.linalg.norm(place[i] - place[j])) for i, j in ((0, 1), (0, 2), (1, 2)))
     flown.append((BASE - base, leg - LEG))
     predicted = compromise(rise)
     short, long = 1e3 * np.array([flown[-1], predicted]).T
@@ -300,13 +309,13 @@ leaning = line.copy()
 leaning[2, 1] = 0.1
 assert rank(leaning, triangle, in_the_plane(line)) == (3, 3)
 assert rank(line, triangle, in_the_plane(line)) == (2, 2)
-assert rigid_motions(line, in_the_plane(line)) == 4
+assert rigidity.rigid_motions(line, in_the_plane(line)) == 4
 
 
 def measured_s(rise: float) -> float:
     """Time constant with which the tent closes after a push of its top by 1 cm [s]."""
     trace = simulate(tent(rise, push=0.01, duration_s=120.0)).traces["default"]
-    error = np.abs(norm(trace.true_position[:, 2] - trace.true_position[:, 0]) - LEG)
+    error = np.abs(np.linalg.norm(trace.true_position[:, 2] - trace.true_position[:, 0], axis=1) - LEG)
     use = (trace.time > 3.0) & (error > 1e-7)
     return float(-1.0 / np.polyfit(trace.time[use], np.log(error[use]), 1)[0])
 
@@ -325,7 +334,7 @@ for rise in SLACK:
 
 assert eigenvalue == sorted(eigenvalue, reverse=True)
 HZ = 10.0  # decisions in a second
-h = float(closed_shares([CRAZYFLIE], HZ)[0])
+h = float(ideal_run.closed_shares([KINDS["crazyflie"]], HZ)[0])
 assert np.allclose(slowest[2:], 1.0 / (HZ * h * GAIN * np.array(eigenvalue[2:])), rtol=0.05)
 faster = 1.0 - np.array(constant) / np.array(slowest)
 assert np.all(faster > 0.0)
@@ -366,26 +375,26 @@ assert patience[0.8] > 3.0 * patience[0.75]
 
 
 # %%
-@styled
+@style.styled
 def heights() -> Figure:
     """Errors beyond the limit, slackness below it, and the reference experiment."""
-    figure = Drawing(figsize=(2.0 * WIDTH, 2.1), layout="constrained")
+    figure = style.Drawing(figsize=(2.0 * style.WIDTH, 2.1), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     line = np.linspace(0.5, 0.96, 300)
     hand = 1e3 * np.array([compromise(float(rise)) for rise in line])
     for k, (label, marker) in enumerate((("base, too short", "o"), ("legs, too long", "s"))):
-        left.plot(line, hand[:, k], color=CASES[k], label=label)
-        left.plot(RISES, 1e3 * np.array(flown)[:, k], marker, color=CASES[k], fillstyle="none")
+        left.plot(line, hand[:, k], color=style.CASES[k], label=label)
+        left.plot(RISES, 1e3 * np.array(flown)[:, k], marker, color=style.CASES[k], fillstyle="none")
     left.set(xlabel="height of the tent [m]", ylabel="error [mm]")
     left.legend()
-    middle.semilogy(SLACK, slowest, color=CASES[2], label="check")
-    middle.semilogy(SLACK, constant, "o", color=CASES[2], fillstyle="none", label="measured")
+    middle.semilogy(SLACK, slowest, color=style.CASES[2], label="check")
+    middle.semilogy(SLACK, constant, "o", color=style.CASES[2], fillstyle="none", label="measured")
     middle.set(xlabel="height of the tent [m]", ylabel="slowest mode [s]")
     middle.legend()
-    right.plot(HOVERS, list(firmness.values()), "o-", color=CASES[3])
+    right.plot(HOVERS, list(firmness.values()), "o-", color=style.CASES[3])
     right.set(xlabel="hover height, reference [m]", ylabel="smallest eigenvalue [m²]", ylim=(0.0, None))
     for axes in (left, middle, right):
-        axes.axvline(LIMIT, color=MAGENTA, linestyle="--", linewidth=0.8)
+        axes.axvline(LIMIT, color=style.MAGENTA, linestyle="--", linewidth=0.8)
     return figure
 
 

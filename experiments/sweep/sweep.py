@@ -2,7 +2,7 @@
 
 In a notebook:
 
-    from experiments.sweep.sweep import sweep
+    from zenpark import sweep
     found = sweep("robotic-park", ["trigger.threshold=0.002:0.05:log12", "seeds=50"])
     print(found)
     found.rows[3].ratio["iae"].mean

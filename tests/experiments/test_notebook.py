@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from types import SimpleNamespace
 
@@ -73,7 +74,7 @@ def test_a_frame_has_numbers_where_some_are_unknown(run, monkeypatch, library):
 
 
 CELLS = (
-    "from experiments.file.document import load\nfrom experiments.run import reopen, simulate\n"
+    "from zenpark import load, reopen, simulate\n"
     'run = simulate(load("triangle", "duration_s=2.0"), folder="kept")\nrun',
     'run.figures()["errors"]',
     "run.figures()",
@@ -85,7 +86,7 @@ CELLS = (
 @pytest.mark.timeout(200)
 def test_jupyter_shows_a_run_its_figures_and_the_run_read_back(tmp_path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
-    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CHECKOUT), str(CHECKOUT / "face")]))
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
     nbclient.NotebookClient(book, timeout=150, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [cell.outputs[-1].data for cell in book.cells]

@@ -3,6 +3,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from itertools import pairwise
 from pathlib import Path
 
@@ -45,6 +46,19 @@ def test_locks_hold_every_requirement():
     wanted = {re.match(r"[a-z0-9-]+", line)[0] for line in project["project"]["dependencies"]}
     assert wanted <= core.keys()
     assert {re.match(r"[a-z0-9-]+", line)[0] for line in project["dependency-groups"]["dev"]} <= dev.keys()
+
+
+@pytest.mark.slow
+def test_a_wheel_has_the_names_for_plugins(tmp_path):
+    """In the root stands the launcher `zenpark`, so the package of that name comes from a folder of its own."""
+    uv = next((ROOT / ".uv").glob("*/bin/uv"), None) or shutil.which("uv")
+    if uv is None:
+        pytest.skip("needs uv, which ./zenpark gets")
+    subprocess.run([uv, "build", "--quiet", "--wheel", "--out-dir", tmp_path, ROOT], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    inside = zipfile.ZipFile(wheel).namelist()
+    assert {name.partition(".data/purelib/")[2] for name in inside} >= {"zenpark/__init__.py", "zenpark/py.typed"}
+    assert {"experiments/api.py", "agents/py.typed", "twins/py.typed", "experiments/py.typed"} <= {*inside}
 
 
 def test_each_lock_has_all_of_the_one_before(bootstrap):

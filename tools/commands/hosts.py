@@ -33,7 +33,7 @@ SECURED: Final = (*HEADING[:-1], "certificates", HEADING[-1])  # in a lab
 VAGUE_S: Final = 0.02  # a clock with a larger uncertainty lets robots start apart
 REACH_S: Final = 15.0
 INSTALL_S: Final = 900.0
-FILES: Final = ("zenpark", "pyproject.toml", "README.md", "LICENSE")
+FILES: Final = ("zenpark", "face", "pyproject.toml", "README.md", "LICENSE")
 
 # $0 is the folder, the rest is what to put there; a checkout or a folder of something else is not ours to change
 PUT_ZENPARK: Final = """set -eu

@@ -14,7 +14,7 @@ from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
 from agents.kinds.turtlebot3 import TURTLEBOT3
-from agents.plugins.avoidance import Nearby, Plane, measure
+from agents.plugins.avoidance import Nearby, Plane, measure_gap
 from agents.plugins.barrier import Barrier, closest
 from tests.agents.things import NOTHING, near, own
 
@@ -184,7 +184,7 @@ def test_least_violation_of_facing_half_planes():
 
 def bound(here, things):
     (thing,) = things.things
-    measure(here, thing)
+    measure_gap(here, thing)
     return BARRIER.bound(thing, 1.0)
 
 
@@ -248,7 +248,7 @@ def test_things_in_all_directions_are_obeyed(seed):
         u = BARRIER.restrain(tuple(rng.uniform(-1, 1, 4).tolist()), here, things)
         assert planar(u) <= TELLO.speed * (1 + 1e-12)
         for thing in things.things:
-            measure(here, thing)
+            measure_gap(here, thing)
             assert -(thing.away_x * u[0] + thing.away_y * u[1]) <= BARRIER.bound(thing, 1.0) + 1e-6
 
 

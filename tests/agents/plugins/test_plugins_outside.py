@@ -105,6 +105,27 @@ def test_every_run_of_the_guide_ends_well(installed, line, tmp_path):
     assert (tmp_path / "run" / "metrics.csv").exists()
 
 
+def test_robots_with_plugins_of_the_guide_need_no_numpy(installed):
+    """Neither does one load anything of experiments but the names (tests/twins/test_body.py: a robot without them)."""
+    program = f"""
+import sys, agents.robot, twins.body
+from agents.plugins import registry
+registry.load("zenpark.laws", "spring")
+for name, _, _, group in {REGISTERED}:
+    if group != registry.ENGINES:
+        registry.load(group, name)
+assert registry.struct("zenpark.laws", "spring").__module__ == "my_laws"
+assert "numpy" not in sys.modules
+assert {{each for each in sys.modules if each.startswith("experiments")}} == {{"experiments", "experiments.api"}}
+"""
+    path = os.pathsep.join([str(installed), str(ROOT)])
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=installed, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
 class Rover(threading.Thread):
     """Robot of the guide: turns and drives by the twists that it gets over UDP, and answers with its pose."""
 

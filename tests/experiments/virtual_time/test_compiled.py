@@ -1,7 +1,10 @@
 """Compiled stretches: the same as plain runs in every bit, for every registered plug-in, a user's too."""
 
+import importlib
 import math
 import os
+import re
+import sys
 import tempfile
 from dataclasses import replace
 from math import sqrt
@@ -221,6 +224,40 @@ def test_law_of_a_user_with_powers(assigned):
     assigned(lambda given: replace(given, law=Foreign(), trigger=Counting()))
     _, ticks = same(pair())
     assert ticks > 300
+
+
+SPRING = """
+class Spring(Gradient, frozen=True):
+    constant: float = 0.3
+
+    def pull(self, apart, link):
+        length = max(norm(apart), 1e-6)
+        k = self.constant * clamp((link.distance - length) / length, -0.5, 0.5)
+        return k * apart[0], k * apart[1], k * apart[2]
+
+    def error(self, apart, link):
+        return abs(link.distance - norm(apart))
+"""
+HOMES = "from agents.plugins.laws import Gradient\nfrom agents.vectors import clamp, norm\n"
+
+
+@pytest.mark.parametrize(
+    ("imports", "compiled"),
+    [(HOMES, True), ("from zenpark import Gradient, clamp, norm\n", True), ("import zenpark as zp\n", False)],
+)
+def test_law_of_a_user_by_its_imports(assigned, tmp_path, monkeypatch, imports, compiled):
+    """Names from `zenpark` compile as those from their homes; names of a module do not, and the reason is told."""
+    text = SPRING if compiled else re.sub(r"\b(Gradient|norm|clamp)\b", r"zp.\1", SPRING)
+    (tmp_path / "my_spring.py").write_text(imports + text, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "my_spring", raising=False)
+    law = importlib.import_module("my_spring").Spring()
+    assigned(lambda given: replace(given, law=law))
+    _, ticks = same(pair(duration_s=2.0))
+    assert bool(ticks) == compiled
+    assert [each for each in stretch.REFUSED.values() if "uses zp" not in each] == []
+    assert bool(stretch.REFUSED) != compiled
+    stretch.REFUSED.clear()
 
 
 @pytest.mark.parametrize(("law", "fault"), [(Trying, "try"), (Rounding, "hypot")])

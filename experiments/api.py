@@ -1,0 +1,113 @@
+"""Names for notebooks and plug-ins, which import them from `zenpark` and from nowhere else (docs/python.md).
+
+Each is imported when it is first asked for: a plug-in in the process of a robot loads what it names, and no numpy.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
+    from agents.body.kinds import KINDS, Kind
+    from agents.formation.link import Link
+    from agents.network.keys import Keys
+    from agents.network.messages import RunOrder
+    from agents.plugins.avoidance import Avoidance, measure_gap
+    from agents.plugins.law import Control, Law, RobotFacts, Said, View
+    from agents.plugins.laws import Gradient
+    from agents.plugins.planners import Planner
+    from agents.plugins.predictors import Predictor
+    from agents.plugins.triggers import Trigger
+    from agents.vectors import Vector, clamp, difference, distance, dot, norm, planar, wrap
+    from experiments.check import ideal_run
+    from experiments.check.check import check, figures
+    from experiments.definition import graph, rigidity
+    from experiments.file.document import Document, load, loads
+    from experiments.metrics import signals
+    from experiments.metrics.measurement import Measurement
+    from experiments.metrics.metric import Metric
+    from experiments.real_time.conductor.orders import send_run_order
+    from experiments.recording.trace import Trace
+    from experiments.report import style
+    from experiments.run import Run, folder, reopen, reopen_seeds, show, simulate
+    from experiments.sweep import pareto
+    from experiments.sweep.sweep import sweep
+    from twins.arrays import Array
+    from twins.engines.engine import EngineFactory
+    from twins.engines.point_mass import PointMassEngine, moving_models
+    from twins.models.ground import Ground
+
+__all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
+    # experiments
+    "load", "loads", "check", "simulate", "sweep", "reopen", "reopen_seeds", "show", "folder", "figures",
+    "Document", "Run", "Trace",
+    # laws
+    "Law", "Gradient", "Control", "Said", "View", "RobotFacts", "Link",
+    # other plug-ins of the file
+    "Trigger", "Predictor", "Planner", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
+    # metrics
+    "Metric", "Measurement", "Array",
+    # kinds and bodies
+    "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError", "call_all",
+    # vectors
+    "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap",
+    # orders to a run in real time
+    "RunOrder", "Keys", "send_run_order",
+    # modules of theory and of figures
+    "graph", "rigidity", "ideal_run", "signals", "pareto", "style",
+]  # fmt: skip
+
+HOMES: Final = {  # modules, and what of them is named above
+    "agents.body.interface": "Body BodyError BodyRequest BodyState call_all",
+    "agents.body.kinds": "KINDS Kind",
+    "agents.formation.link": "Link",
+    "agents.network.keys": "Keys",
+    "agents.network.messages": "RunOrder",
+    "agents.plugins.avoidance": "Avoidance measure_gap",
+    "agents.plugins.law": "Control Law RobotFacts Said View",
+    "agents.plugins.laws": "Gradient",
+    "agents.plugins.planners": "Planner",
+    "agents.plugins.predictors": "Predictor",
+    "agents.plugins.triggers": "Trigger",
+    "agents.vectors": "Vector clamp difference distance dot norm planar wrap",
+    "experiments.check": "ideal_run",
+    "experiments.check.check": "check figures",
+    "experiments.definition": "graph rigidity",
+    "experiments.file.document": "Document load loads",
+    "experiments.metrics": "signals",
+    "experiments.metrics.measurement": "Measurement",
+    "experiments.metrics.metric": "Metric",
+    "experiments.real_time.conductor.orders": "send_run_order",
+    "experiments.recording.trace": "Trace",
+    "experiments.report": "style",
+    "experiments.run": "Run folder reopen reopen_seeds show simulate",
+    "experiments.sweep": "pareto",
+    "experiments.sweep.sweep": "sweep",
+    "twins.arrays": "Array",
+    "twins.engines.engine": "EngineFactory",
+    "twins.engines.point_mass": "PointMassEngine moving_models",
+    "twins.models.ground": "Ground",
+}
+HOME: Final = {name: module for module, names in HOMES.items() for name in names.split()}
+
+
+@cache
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class, a function or a module
+    """What a name stands for; raises AttributeError, with the nearest name, if there is none."""
+    if name not in HOME:
+        message = f"module 'zenpark' has no attribute {name!r}"
+        if not name.startswith("__"):  # those Python itself asks for
+            from agents.plugins.registry import did_you_mean  # noqa: PLC0415 - in trouble only
+
+            message += f"; {did_you_mean(name, __all__)}"
+        raise AttributeError(message, name=name)
+    module = import_module(HOME[name])
+    found = getattr(module, name, None)
+    return import_module(f"{HOME[name]}.{name}") if found is None else found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,113 @@
+"""The names of `zenpark`: each has an example on its page, which runs; guides import from there alone."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import zenpark
+from experiments import api
+from tests.docs.test_references import PAGES, ROOT
+
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PAGE = (ROOT / "docs" / "python.md").read_text("utf-8")
+CODE = {
+    **{str(page.relative_to(ROOT)): BLOCK.findall(page.read_text("utf-8")) for page in PAGES},
+    **{
+        str(file.relative_to(ROOT)): [file.read_text("utf-8")]
+        for folder in ("tutorials", "course")
+        for file in (ROOT / "docs" / folder).rglob("*.py")
+    },
+}
+# what a plug-in that flies may import: nothing of it needs numpy or anything of `experiments`
+FLYING = (
+    *("Law", "Gradient", "Control", "Said", "View", "RobotFacts", "Link", "Trigger", "Predictor", "Planner"),
+    *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
+    *("call_all", "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap"),
+)
+
+
+def imported(tree: ast.AST) -> dict[str, str]:
+    """Names that code imports, with their modules."""
+    found = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            found |= {alias.name: node.module or "" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name: alias.name for alias in node.names}
+    return found
+
+
+def test_every_name_is_known_to_type_checkers_and_has_a_home():
+    tree = ast.parse(Path(api.__file__).read_text("utf-8"))
+    (typed,) = [node for node in tree.body if isinstance(node, ast.If)]
+    assert imported(typed) == api.HOME
+    assert sorted(zenpark.__all__) == sorted(api.HOME) == dir(zenpark)
+    for name in zenpark.__all__:
+        assert getattr(zenpark, name) is not None
+
+
+def test_unknown_names_are_refused_with_the_nearest():
+    with pytest.raises(AttributeError, match="no attribute 'Gradent'; did you mean 'Gradient'"):
+        _ = zenpark.Gradent
+    assert not hasattr(zenpark, "__wrapped__")
+
+
+@pytest.mark.slow
+def test_examples_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["page", str(tmp_path / "figures")])
+    monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
+    space: dict[str, object] = {"__name__": "page"}
+    for block in BLOCK.findall(PAGE):
+        exec(compile(block, "docs/python.md", "exec"), space)
+    assert (tmp_path / "figures" / "python-errors.pdf").exists()
+
+
+def test_every_name_has_an_example():
+    used: set[str] = set()
+    for block in BLOCK.findall(PAGE):
+        tree = ast.parse(block)
+        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        used |= {name for name, module in imported(tree).items() if module == "zenpark" and name in names}
+    assert used == {*zenpark.__all__}
+
+
+@pytest.mark.parametrize("place", [place for place, blocks in CODE.items() if blocks])
+def test_guides_import_from_nowhere_else(place):
+    ours = re.compile(r"(agents|bridges|twins|experiments|tools)\b")
+    found = [
+        f"{name} of {home}"
+        for each in CODE[place]
+        for name, home in imported(ast.parse(each)).items()
+        if ours.match(home)
+    ]
+    assert not found, "import it from zenpark (experiments/api.py, docs/python.md)"
+
+
+def loaded(program: str) -> set[str]:
+    """Modules that a process has that runs a program in a folder of its own."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "face")])
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sys.modules)"],
+        env={**os.environ, "PYTHONPATH": path},
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return set(done.stdout.split())
+
+
+def test_plugins_of_robots_load_no_more_than_they_name():
+    own = {"zenpark", "experiments", "experiments.api"}
+    assert loaded("import zenpark") == loaded("import __future__, functools, importlib, typing") | own
+    modules = loaded(f"from zenpark import {', '.join(FLYING)}")
+    assert "numpy" not in modules
+    assert {name for name in modules if name.startswith("experiments")} == {"experiments", "experiments.api"}
