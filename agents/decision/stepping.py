@@ -13,7 +13,7 @@ from typing import Any, Final
 from agents.decision.assignment import Assignment
 from agents.network.validation import ENORMOUS, MAX_NUMBERS
 from agents.plugins.calls import failure, wrong
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Values, View, is_known
+from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Values, View, is_known
 from agents.plugins.registry import FAILURES, PluginError
 from agents.vectors import Vector, is_finite
 
@@ -103,12 +103,17 @@ class Stepping:
 
     def _begin(self) -> dict[str, Values]:
         law = self._law
+        if not (isinstance(law.SAYS, Mapping) and all(isinstance(said, Said) for said in law.SAYS.values())):
+            raise PluginError(f"SAYS of the law {type(law).__name__} must name a Said for each variable")
         try:
-            memory = {name: tuple(map(float, values)) for name, values in law.begin(self.facts).items()}
+            begun = law.begin(self.facts)
         except PluginError:  # such as a library that is not installed: with its remedy
             raise
         except FAILURES as error:
             raise failure("law", law, error) from error
+        if not (isinstance(begun, Mapping) and all(_size(values) >= 0 for values in begun.values())):
+            raise wrong("law", law, "begin", begun, "a tuple of numbers for each variable")
+        memory = {name: tuple(map(float, values)) for name, values in begun.items()}
         if missing := [name for name in law.SAYS if name not in memory]:
             raise PluginError(f"`begin` of the law {type(law).__name__} lacks {', '.join(missing)}, which it SAYS")
         count = sum(len(memory[name]) for name in law.SAYS)

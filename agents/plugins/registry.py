@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
@@ -35,6 +36,7 @@ STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # 
 CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
 BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Law, AVOIDANCES: Avoidance}
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
+FACE: Final = "zenpark"  # module of the names that plug-ins import
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
 
 
@@ -84,7 +86,7 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
     try:
         return entry.load()
     except _IMPORT_FAILURES as error:
-        raise PluginError(f"{_origin(entry)} fails to import: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{_origin(entry)} fails to import: {_reason(error)}") from error
 
 
 def module(group: str, name: str) -> str:
@@ -204,6 +206,14 @@ def _registered(group: str) -> dict[str, list[EntryPoint]]:
         if entry.value not in {each.value for each in same}:  # a distribution may be found twice, by two paths
             same.append(entry)
     return found
+
+
+def _reason(error: BaseException) -> str:
+    """Why a module fails to import, with the nearest name where it asks `zenpark` for another."""
+    asked = re.search(r"import name '(\w+)'", str(error))
+    if asked and isinstance(error, ImportError) and error.name == FACE:
+        return f"{FACE} has no {asked[1]!r}; {did_you_mean(asked[1], dir(sys.modules[FACE]))}"
+    return f"{type(error).__name__}: {error}"
 
 
 def _origin(entry: EntryPoint) -> str:

@@ -23,7 +23,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.graph import edges
 from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
-from experiments.virtual_time.source import outside
+from experiments.virtual_time.source import is_foreign, outside
 
 QUIET: Final = np.errstate(all="ignore")  # absurd numbers overflow on their way to a finding that says so
 
@@ -38,9 +38,14 @@ def chance(analysis: Analysis) -> Iterator[Finding]:
 
 def compilation(analysis: Analysis) -> Iterator[Finding]:
     """Say what a plug-in that cannot be compiled costs."""
-    for text in (text for plugin in ticking_plugins(analysis.plan) for text in outside(plugin)[:1]):
-        cost = "runs in virtual time and sweeps take 10 to 20 times as long as compiled ones"
-        yield Finding("note", "uncompiled", f"{text}, which is not compiled: {cost} (docs/plugins.md, the subset)")
+    cost = "runs in virtual time and sweeps take 10 to 20 times as long as compiled ones"
+    for plugin in ticking_plugins(analysis.plan):
+        if not analysis.is_gradient and plugin is type(analysis.plan.law):
+            if is_foreign(plugin):
+                yield Finding("note", "uncompiled", f"laws that remember are not compiled: {cost}")
+            continue
+        for text in outside(plugin)[:1]:
+            yield Finding("note", "uncompiled", f"{text}, which is not compiled: {cost} (docs/plugins.md, the subset)")
 
 
 SUBJECTS: Final = (
@@ -49,6 +54,7 @@ SUBJECTS: Final = (
         theory.presence,
         theory.lengths,
         theory.realisation,
+        theory.offsets,
         theory.rigidity,
         theory.redundancy,
         theory.stability,

@@ -147,6 +147,23 @@ def _in_one_place(analysis: Analysis, shape: Shape) -> Finding:
     return Finding("error" if wanted else "warning", "in-one-place", message, remedy, ("formation", "links"))
 
 
+def offsets(analysis: Analysis) -> Iterator[Finding]:
+    """Check that the offsets of a law that remembers add up; what it makes of them is its own."""
+    if not analysis.is_gradient:
+        yield from _contradictions(analysis, "warning")
+
+
+def _contradictions(analysis: Analysis, severity: Severity, more: str = "") -> Iterator[Finding]:
+    """Finding on the shortest ring of links whose offsets do not add up."""
+    for ring in contradictions(analysis.asked.take(analysis.standing))[:1]:
+        names = [analysis.names[row] for row in ring.rows]
+        way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
+        message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart{more}"
+        link = int(np.flatnonzero(analysis.standing)[ring.link])
+        remedy = "give offsets of one drawing: those around a ring add up to zero"
+        yield Finding(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
+
+
 def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
     severity: Severity = "error" if shape.worst > FAR_OFF else "warning"
     anchors = analysis.anchors
@@ -157,14 +174,8 @@ def _unrealisable(analysis: Analysis, shape: Shape) -> Iterator[Finding]:
         yield Finding(severity, "anchor-not-realisable", message, remedy, ("formation", "anchors", name))
         return
     off = f"at best, {analysis.link(int(shape.error.argmax()))} is {1e3 * shape.worst:.1f} mm off"
-    rings = contradictions(analysis.asked.take(analysis.standing))
-    for ring in rings[:1]:
-        names = [analysis.names[row] for row in ring.rows]
-        way = f"around {join_names([*names, names[0]], 8)}" if len(names) > 2 else f"between {names[0]} and {names[1]}"
-        message = f"the offsets {way} do not add up: their ends are {1e3 * ring.gap:.1f} mm apart; {off}"
-        link = int(np.flatnonzero(analysis.standing)[ring.link])
-        remedy = "give offsets of one drawing: those around a ring add up to zero"
-        yield Finding(severity, "offsets-contradict", message, remedy, analysis.link_path(link))
+    rings = list(_contradictions(analysis, severity, f"; {off}"))
+    yield from rings
     found = conflicts(analysis.asked.take(_measured(analysis)), analysis.height)
     heights = [each for each in found if math.isfinite(each.ceiling)]
     for high in list(dict.fromkeys(each.high for each in heights)):

@@ -63,6 +63,15 @@ class Wide(Counting, frozen=True):
         return {"count": (0.0,) * 65}
 
 
+class Bare(Counting, frozen=True):
+    def begin(self, robot):
+        return {"count": 0.0}
+
+
+class Naming(Counting, frozen=True):
+    SAYS = ("count",)
+
+
 def given(law):
     return replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=())
 
@@ -130,6 +139,10 @@ def test_what_cannot_be_used_names_the_law(decides):
 def test_a_law_that_cannot_begin_is_named():
     with pytest.raises(PluginError, match="the law Failing failed: ZeroDivisionError"):
         Stepping(given(Failing()))
+    with pytest.raises(PluginError, match=r"`begin` of the law Bare must give a tuple of numbers for each variable"):
+        Stepping(given(Bare()))
+    with pytest.raises(PluginError, match="SAYS of the law Naming must name a Said for each variable"):
+        Stepping(given(Naming()))
     with pytest.raises(PluginError, match="the law Wide says 65 numbers; a pose carries 64"):
         Stepping(given(Wide()))
 

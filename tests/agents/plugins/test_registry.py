@@ -115,6 +115,15 @@ def test_failing_import_names_owner_and_reason(foreign):
         registry.load(foreign, "misnamed")
 
 
+def test_name_that_zenpark_has_not_gets_the_nearest(monkeypatch, tmp_path):
+    (tmp_path / "misled.py").write_text("from zenpark import law\n", "utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = EntryPoint("misled", "misled:Law", LAWS)
+    monkeypatch.setattr(registry, "_registered", lambda _: {"misled": [entry]})
+    with pytest.raises(registry.PluginError, match="fails to import: zenpark has no 'law'; did you mean 'Law'"):
+        registry.load(LAWS, "misled")
+
+
 def test_plug_in_must_be_a_struct(foreign):
     with pytest.raises(registry.PluginError, match=r"no msgspec.Struct"):
         registry.build(foreign, "function")

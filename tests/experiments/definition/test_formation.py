@@ -284,6 +284,14 @@ def test_offsets_that_do_not_add_up(written):
 
 
 @pytest.mark.usefixtures("unflown")
+def test_offsets_of_a_law_that_remembers_that_do_not_add_up(written):
+    square = SQUARE.replace("displacement", "leader-observer")
+    assert "offsets-contradict" not in codes(written(square))
+    found = codes(written(square.replace("[0.0, -0.6]", "[0.0, -0.7]")))["offsets-contradict"]
+    assert found.severity == "warning"
+
+
+@pytest.mark.usefixtures("unflown")
 def test_what_check_says_of_formations(written):
     assert codes(written(SQUARE))["rigid"].message == (
         "the formation is rigid, rank 6 of 6 in the motions that the robots have"
