@@ -1,4 +1,4 @@
 """Everything that an experiment file chooses by name: laws, triggers, predictors, planners, avoidances; their registry.
 
-May import: agents.formation, agents.vectors, agents.errors.
+May import: agents.errors, agents.formation, agents.user_folder, agents.vectors.
 """

@@ -2,7 +2,8 @@
 
 A trigger, law, planner, avoidance or engine is a frozen `msgspec.Struct` of its parameters; a body is a class, made
 with a `agents.body.interface.BodyRequest`; a kind of robot is an object `agents.body.kinds.Kind`. Any distribution may
-add one, for example under `[project.entry-points."zenpark.triggers"]` in its pyproject.toml.
+add one, for example under `[project.entry-points."zenpark.triggers"]` in its pyproject.toml. Structs of parameters may
+stand in a file as well, see `agents.plugins.files`.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
+from pathlib import Path
 from traceback import walk_tb
 from typing import Any, Final, Protocol
 
 import msgspec
 
 from agents.errors import ExplainedError
+from agents.plugins import files
 from agents.plugins.avoidance import Avoidance
 from agents.plugins.law import Law
 from agents.plugins.predictors import Predictor
@@ -75,6 +78,8 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
     Raises UnknownPlugin with the nearest name, or all of them; and PluginError, with the distributions, if two register
     different ones under this name, or if the module fails to import.
     """
+    if files.is_choice(name):
+        return _in_file(name)
     known = _registered(group)
     what = group.rpartition(".")[2]
     if name not in known:
@@ -87,6 +92,18 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
         return entry.load()
     except _IMPORT_FAILURES as error:
         raise PluginError(f"{_origin(entry)} fails to import: {_reason(error)}") from error
+
+
+def _in_file(name: str) -> Any:  # noqa: ANN401 - likewise
+    """The class in a file; raises PluginError, with the line, if it cannot be loaded."""
+    try:
+        return files.load(name)
+    except _IMPORT_FAILURES as error:
+        file = Path(name.partition(":")[0]).name
+        lines = [f", line {line}" for frame, line in walk_tb(error.__traceback__)
+                 if Path(frame.f_code.co_filename).name == file]  # fmt: skip
+        words = _reason(error) + "".join(lines[-1:])
+        raise PluginError(f"plug-in {files.plain(name)!r} cannot be loaded: {words}") from error
 
 
 def module(group: str, name: str) -> str:
@@ -119,16 +136,16 @@ def struct(group: str, name: str) -> type[msgspec.Struct]:
 
     Raises as `load`, and PluginError if it is no frozen struct, or inherits from another base than its group's.
     """
-    plugin, entry = load(group, name), _registered(group)[name][0]
+    plugin = load(group, name)
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
-        raise PluginError(f"{_origin(entry)} is no msgspec.Struct; its parameters must be its fields")
+        raise PluginError(f"{_origin_of(group, name)} is no msgspec.Struct; its parameters must be its fields")
     base = BASES.get(group, msgspec.Struct)
     if not issubclass(plugin, base):
-        raise PluginError(f"{_origin(entry)} must inherit from {base.__module__}.{base.__qualname__}")
+        raise PluginError(f"{_origin_of(group, name)} must inherit from {base.__module__}.{base.__qualname__}")
     if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
-            f"{_origin(entry)} can be changed, and would mix what it keeps of different robots and runs; declare it "
-            "with frozen=True and keep nothing in it (triggers: MEMORY)"
+            f"{_origin_of(group, name)} can be changed, and would mix what it keeps of different robots and runs; "
+            "declare it with frozen=True and keep nothing in it (triggers: MEMORY)"
         )
     return plugin
 
@@ -158,7 +175,10 @@ def culprit(error: BaseException) -> str | None:
     """The line of another distribution's plug-in in which an error came about; None if there is none."""
     owners = {entry.module: _name(dist) for entry, dist in _foreign()}
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
-        if (module := frame.f_globals.get("__name__")) in owners:
+        module = frame.f_globals.get("__name__", "")
+        if module.startswith(files.PREFIX):
+            return f"plug-in in {Path(frame.f_code.co_filename).name} failed in line {line}"
+        if module in owners:
             return f"plug-in {module} of {owners[module]} failed at {frame.f_code.co_filename}:{line}"
     return None
 
@@ -214,6 +234,10 @@ def _reason(error: BaseException) -> str:
     if asked and isinstance(error, ImportError) and error.name == FACE:
         return f"{FACE} has no {asked[1]!r}; {did_you_mean(asked[1], dir(sys.modules[FACE]))}"
     return f"{type(error).__name__}: {error}"
+
+
+def _origin_of(group: str, name: str) -> str:
+    return f"plug-in {files.plain(name)!r}" if files.is_choice(name) else _origin(_registered(group)[name][0])
 
 
 def _origin(entry: EntryPoint) -> str:

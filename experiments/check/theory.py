@@ -12,7 +12,7 @@ import numpy as np
 from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
-from agents.plugins import registry
+from agents.plugins import files, registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
@@ -346,7 +346,7 @@ def stability(analysis: Analysis) -> Iterator[Finding]:
     loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF or next(lengths(analysis), None) is not None:
         return
-    law, choice = analysis.law, registry.split(formation.law)[0]
+    law, choice = analysis.law, files.plain(registry.split(formation.law)[0])
     if not math.isfinite(loop.gain):
         place = shape.position
         offset = law_offsets(law, place, place[analysis.asked.sender], analysis.asked)

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from agents.plugins import files
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
@@ -45,6 +47,7 @@ class Document:
     # the arena file of each case that has one; of the file without cases under the empty name
     arenas: dict[str, ArenaFile] = field(default_factory=dict)
     overrides: Sequence[Override] = ()  # behind `--set`
+    plugins: dict[str, Path] = field(default_factory=dict)  # files of plug-ins, by their names in the experiment
 
     @property
     def source(self) -> Source:
@@ -56,10 +59,14 @@ class Document:
         return dict(self.resolved)
 
     def keep(self, file: Path) -> None:
-        """Writes the text to a file, and the arena files that it names beside it."""
+        """Writes the text to a file, and the arena files and files of plug-ins that it names beside it."""
         file.write_text(self.text, encoding="utf-8")
         for each in self.arenas.values():
             (file.parent / each.name).write_text(each.text, encoding="utf-8")
+        for choice, kept in self.plugins.items():
+            copy = file.parent / files.plain(choice).partition(":")[0]
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(kept.read_bytes())
 
     @property
     def listing(self) -> str:
@@ -109,8 +116,11 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
     is_json = _is_json(file) if is_json is None else is_json
     try:
         content = parsed(text, label, json=is_json)
-        source = Source(label, text, is_json, _overrides(flags, content))
-        source.refuse(structure.number_faults(content))
+        adopted = _Adopted(file.parent)
+        content = adopted.table(content)
+        overrides = [adopted.override(each) for each in _overrides(flags, content)]
+        source = Source(label, text, is_json, overrides)
+        source.refuse([*structure.number_faults(content), *adopted.faults])
         documents, tables = _resolved(file, source, content)
         nested = [
             Fault(("cases", name, key), f"a case cannot hold {key}", "they stand at the top of the file", on_key=True)
@@ -128,7 +138,47 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
     experiment = experiments[None]
     cases = {name: case for name, case in experiments.items() if name is not None} or {UNNAMED: experiment}
-    return Document(file, text, experiment, cases, source.arenas, source.overrides)
+    return Document(file, text, experiment, cases, source.arenas, source.overrides, adopted.plugins)
+
+
+@dataclass(frozen=True)
+class _Adopted:
+    """The files of plug-ins that a document names, adopted; see `agents.plugins.files`."""
+
+    folder: Path  # of the experiment file
+    plugins: dict[str, Path] = field(default_factory=dict)  # copies, by choice
+    faults: list[Fault] = field(default_factory=list)
+
+    def table(self, content: _Table) -> _Table:
+        """A document, with its cases, in which choices have the digest of their file."""
+        cases = {
+            name: structure.with_choices(each, (), partial(self._take, ("cases", name)))
+            for name, each in _tables(content).items()
+        }
+        document: _Table = structure.with_choices(_without_cases(content), (), partial(self._take, ()))
+        return {**content, **document, **({"cases": {**content["cases"], **cases}} if cases else {})}
+
+    def override(self, given: Override) -> Override:
+        """The same of a `--set`; raises DocumentError for a file that cannot be adopted."""
+        of_kind = given.path[-1] == "kind"  # set alone, of a choice that is a table
+        path, value = (given.path[:-1], {"kind": given.value}) if of_kind else (given.path, given.value)
+        known = len(self.faults)
+        changed = structure.with_choices(value, path, partial(self._take, ()))
+        for fault in self.faults[known:]:
+            raise given.refused(fault.message, fault.hint)
+        return replace(given, value=changed["kind"] if of_kind else changed)
+
+    def _take(self, above: Keys, name: str, path: Keys) -> str:
+        if not files.is_choice(name) or files.plain(name) != name:
+            return name
+        try:
+            choice, copy = files.adopt(name, self.folder)
+        except ValueError as error:
+            message, _, hint = str(error).partition("; ")
+            self.faults.append(Fault((*above, *path), message, hint))
+            return name
+        self.plugins[choice] = copy
+        return choice
 
 
 def _overrides(flags: Sequence[str], content: _Table) -> list[Override]:

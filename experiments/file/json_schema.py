@@ -15,7 +15,7 @@ from typing import Any, Final
 import msgspec
 
 from agents.body.kinds import KINDS
-from agents.plugins import registry
+from agents.plugins import files, registry
 from experiments.definition.experiment import Experiment
 from experiments.file.consistency import judged_metrics
 from experiments.file.overrides import ALONE, SHAPE
@@ -136,7 +136,9 @@ def _choice(group: str, definitions: dict[str, Any]) -> dict[str, Any]:
         own["properties"] = {"kind": {"const": name}, **own.get("properties", {})}
         own["required"] = ["kind", *own.get("required", [])]
         tables.append(own)
-    return {"anyOf": ([{"enum": bare}] if bare else []) + tables}
+    beside = {"type": "string", "pattern": f"^{files.CHOICE}$", "description": "a class in a file beside this one"}
+    tables.append({"type": "object", "properties": {"kind": beside}, "required": ["kind"]})
+    return {"anyOf": [*([{"enum": bare}] if bare else []), beside, *tables]}
 
 
 def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:

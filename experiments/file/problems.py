@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 
 from agents.errors import ExplainedError
+from agents.plugins.files import plain
 from agents.plugins.registry import did_you_mean
 
 Path = tuple[str | int, ...]
@@ -220,12 +221,12 @@ class DocumentError(ExplainedError, ValueError):
 
 def refusal(file: str, message: str, hint: str = "") -> DocumentError:
     """The error of one problem without a place in the text."""
-    return DocumentError([Problem(file, 0, 0, message, hint)])
+    return DocumentError([Problem(plain(file), 0, 0, plain(message), plain(hint))])
 
 
 def at_offset(file: str, text: str, offset: int, message: str, hint: str = "") -> Problem:
     line, column = line_column(text, offset)
-    return Problem(file, line, column, message, hint, text.split("\n")[line - 1])
+    return Problem(file, line, column, plain(message), plain(hint), text.split("\n")[line - 1])
 
 
 @dataclass(frozen=True)

@@ -210,7 +210,7 @@ def _walk(
 ) -> Iterator[Entry]:
     """Entries below a path; in a plug-in with the parameters that it cannot do without."""
     for name, field in node.get("properties", {}).items():
-        if name == "kind" and "const" in field:
+        if name == "kind" and {"const", "pattern"} & field.keys():  # of a plug-in
             continue
         key = f"{path}.{name}" if path else name
         yield _entry(key, field, name in node.get("required", []), definitions, needed)

@@ -11,7 +11,7 @@ import math
 import pathlib
 import re
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from inspect import getfile
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 import msgspec
 
 from agents.body.kinds import KINDS
-from agents.plugins import registry
+from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
@@ -85,15 +85,20 @@ def group_of(path: Path) -> str | None:
 
 def plugin_files(experiment: Experiment) -> set[pathlib.Path]:
     """Modules of the plug-ins and kinds that an experiment chooses; what those import is not among them."""
-    chosen = _choices(msgspec.to_builtins(experiment), ())
     kinds = {KINDS[robot.kind] for robot in (*experiment.robots.values(), *experiment.spares.values())}
     modules = {registry.module(registry.ROBOTS, kind.name) for kind in kinds}
     modules |= {kind.motion.partition(":")[0] for kind in kinds if isinstance(kind.motion, str)}
     modules |= {type(kind.steering).__module__ for kind in kinds if kind.steering is not None}
-    files = {pathlib.Path(getfile(importlib.import_module(name))) for name in modules}
-    return files | {
-        pathlib.Path(getfile(registry.struct(group, registry.split(choice)[0]))) for group, choice in chosen
+    modules_of_kinds = {pathlib.Path(getfile(importlib.import_module(name))) for name in modules}
+    return modules_of_kinds | {
+        pathlib.Path(getfile(registry.struct(group, kind))) for group, kind in chosen(experiment)
     }
+
+
+def chosen(experiment: Experiment) -> list[tuple[str, str]]:
+    """Group and name of every plug-in that an experiment chooses, kinds of robots aside."""
+    found = _choices(msgspec.to_builtins(experiment), ())
+    return [(group, registry.split(choice)[0]) for group, choice in found]
 
 
 def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a document
@@ -107,6 +112,21 @@ def _choices(value: Any, path: Path) -> Iterator[tuple[str, Any]]:  # noqa: ANN4
     elif isinstance(value, list | tuple):
         for number, each in enumerate(value):
             yield from _choices(each, (*path, number))
+
+
+def with_choices(value: Any, path: Path, change: Callable[[str, Path], str]) -> Any:  # noqa: ANN401 - a document
+    """A part of a document, which stands at `path`, with the name of every plug-in that is chosen in it changed."""
+    if group_of(path) is not None:
+        if isinstance(value, str):
+            return change(value, path)
+        if isinstance(value, dict) and isinstance(value.get("kind"), str):
+            return {**value, "kind": change(value["kind"], (*path, "kind"))}
+        return value
+    if isinstance(value, dict):
+        return {key: with_choices(each, (*path, key), change) for key, each in value.items()}
+    if isinstance(value, list):
+        return [with_choices(each, (*path, number), change) for number, each in enumerate(value)]
+    return value
 
 
 def parameters(group: str, kind: str) -> list[str]:
@@ -200,12 +220,13 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
         return [Fault((*path, "kind"), f"'{_name(path)}' needs its kind, as text", hint)]
     kind, given = registry.split(value)
     where = path if isinstance(value, str) else (*path, "kind")
-    if kind not in known:
+    if kind not in known and not files.is_choice(kind):
         return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
     try:
         struct = registry.struct(group, kind)
     except registry.PluginError as error:
-        return [Fault(where, str(error), f"repair or uninstall it, or choose another of the {what}")]
+        hint = "mend that file" if files.is_choice(kind) else "repair or uninstall it"
+        return [Fault(where, str(error), f"{hint}, or choose another of the {what}")]
     return _table(given, struct, path, (group, kind))
 
 

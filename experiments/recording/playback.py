@@ -19,6 +19,7 @@ from agents.body.kinds import KINDS, Figures
 from agents.decision.lifecycle import Phase
 from agents.network.messages import CentreState, Contact, Event, HostClock, Memory, State, Status, Variable, WorldState
 from agents.network.validation import ABSURD, FUTURE_S, is_count
+from agents.plugins.registry import PluginError
 from experiments.arrays import PoseTable, known_rows
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -105,6 +106,8 @@ class AboutRun:
             experiment = msgspec.json.decode(attached, type=Experiment)
             _ = Plan(experiment).one_way_links  # names of robots are not in the types
             return cls(about["case"], int(about["seed"]), about["clock"], announced, experiment)
+        except PluginError as error:
+            raise RecordingError(f"{records.path}: {error}") from None
         except (KeyError, ValueError, RecursionError) as error:
             text = f"holds no experiment that this version of zenpark can read ({error})"
             raise RecordingError(f"{records.path}: {text}") from None

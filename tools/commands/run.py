@@ -77,7 +77,8 @@ def run(
     lab: Lab = None,
     identity: As = "operator",
     yes: Annotated[
-        bool, typer.Option("--yes", help="Agrees to machines and devices that a bundle, or another user's file, names.")
+        bool,
+        typer.Option("--yes", help="Agrees to machines, devices and code that a bundle or another's file names."),
     ] = False,
     view: Annotated[bool, typer.Option("--view", help="Shows it in the browser, in three dimensions.")] = False,
     pace: Annotated[
@@ -219,6 +220,7 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
 
     import msgspec
 
+    from experiments.file.problems import refusal
     from experiments.real_time.conductor.conduct import RunOptions
     from experiments.recording import bundle
     from experiments.recording.run_folder import SOURCE
@@ -227,6 +229,10 @@ def _repeat(asked: RunOrigin, show: _Shown, lab: str | None, identity: str) -> i
     with TemporaryDirectory(prefix="zenpark-bundle-") as unpacked:
         former = Path(unpacked)
         origin = bundle.unpack(Path(asked.file), former)
+        code = [file.name for file in sorted(former.rglob("*.py")) if file.parent.name != "plugins"]
+        if code and not show.agreed:
+            hint = "unpack it and look at them, then agree with --yes"
+            raise refusal(asked.file, f"its run executes Python files of the bundle: {', '.join(code)}", hint)
         if origin.made_by is not None:
             text = (former / SOURCE).read_text("utf-8")
             warn([f"{asked.file}: {each}" for each in provenance(text).differences(origin.made_by)])

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 import tomllib
 from importlib import metadata
 
@@ -103,7 +104,9 @@ def test_the_schema_is_draft_7_and_knows_the_plugins():
     assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
     assert "prefixItems" not in text
     assert "$defs" not in text
-    by_name, *tables = schema["properties"]["trigger"]["anyOf"]
+    by_name, beside, *tables, table_beside = schema["properties"]["trigger"]["anyOf"]
+    assert re.search(beside["pattern"], "my_trigger.py:Mine")
+    assert table_beside["properties"]["kind"] == beside
     assert {"periodic", "send-on-delta"} <= set(by_name["enum"])
     kinds = {table["properties"]["kind"]["const"]: table for table in tables}
     assert kinds["send-on-delta"]["properties"]["threshold"]["exclusiveMinimum"] == 0
