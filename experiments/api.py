@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from agents.network.keys import Keys
     from agents.network.messages import RunOrder
     from agents.plugins.avoidance import Avoidance, measure_gap
-    from agents.plugins.law import Control, Law, RobotFacts, Said, View
+    from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, View
     from agents.plugins.laws import Gradient
     from agents.plugins.planners import Planner
     from agents.plugins.predictors import Predictor
@@ -45,7 +45,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "load", "loads", "check", "simulate", "sweep", "reopen", "reopen_seeds", "show", "folder", "figures",
     "Document", "Run", "Trace",
     # laws
-    "Law", "Gradient", "Control", "Said", "View", "RobotFacts", "Link",
+    "Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link",
     # other plug-ins of the file
     "Trigger", "Predictor", "Planner", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # metrics
@@ -67,7 +67,7 @@ HOMES: Final = {  # modules, and what of them is named above
     "agents.network.keys": "Keys",
     "agents.network.messages": "RunOrder",
     "agents.plugins.avoidance": "Avoidance measure_gap",
-    "agents.plugins.law": "Control Law RobotFacts Said View",
+    "agents.plugins.law": "Control Law Memory RobotFacts Said View",
     "agents.plugins.laws": "Gradient",
     "agents.plugins.planners": "Planner",
     "agents.plugins.predictors": "Predictor",

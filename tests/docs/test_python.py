@@ -27,7 +27,7 @@ CODE = {
 }
 # what a plug-in that flies may import: nothing of it needs numpy or anything of `experiments`
 FLYING = (
-    *("Law", "Gradient", "Control", "Said", "View", "RobotFacts", "Link", "Trigger", "Predictor", "Planner"),
+    *("Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link", "Trigger", "Predictor", "Planner"),
     *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
     *("call_all", "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap"),
 )
@@ -89,6 +89,18 @@ def test_guides_import_from_nowhere_else(place):
         if ours.match(home)
     ]
     assert not found, "import it from zenpark (experiments/api.py, docs/python.md)"
+
+
+@pytest.mark.slow
+def test_type_checkers_know_the_names(tmp_path):
+    """In a folder of the user's own, by what is installed."""
+    laws = [block for block in BLOCK.findall(PAGE) if "Clock(Law" in block or "Rope(Gradient" in block]
+    (tmp_path / "laws.py").write_text("\n".join([*laws, "from zenpark import nonsense", "wrong: int = norm(robot)"]))
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "laws.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    found = re.findall(r"\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
+    assert found == ["attr-defined", "assignment", "arg-type"], done.stdout
 
 
 def loaded(program: str) -> set[str]:
