@@ -383,6 +383,22 @@ def test_integral_action_leaves_no_error_in_a_wind(case, most):
 
 
 @pytest.mark.parametrize("case", CASES)
+def test_integral_action_needs_no_leader_for_the_shape(case):
+    text = index.find_file("integral").read_text()
+    text = (
+        text.replace('leader = "CF01"', "")
+        .replace('"CF01 > ', '"CF01 - ')
+        .replace("[5.0, 4.0, 2.5]", "[20.0, 20.0, 2.5]")
+    )
+    experiment = document.loads(text).cases()[case]
+    known = Logbook(simulate(experiment, 1), experiment, case).trace()
+    late = known.time > 37.0
+    assert np.linalg.norm(out_of_place(known)[late], axis=2).max() < 0.012
+    drift = known.true_position[-1, 0, :2] - known.true_position[known.time > 10.0][0, 0, :2]
+    assert np.linalg.norm(drift) > 0.5  # with the wind
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_displacement_keeps_an_error_in_a_wind(case):
     known = trace("integral", case, 'formation.law={ kind = "displacement" }')
     links = np.array([[2, 0, -1, 0], [0, 2, 0, -1], [-1, 0, 3, -1], [0, -1, -1, 2]])
