@@ -17,8 +17,9 @@ class Integral(Law, frozen=True):
     A constant disturbance, such as a wind, leaves no steady error of the links, for any κ (M. Andreasson,
     D. V. Dimarogonas, H. Sandberg, K. H. Johansson, "Distributed control of networked dynamical systems: static
     feedback, integral action and consensus", IEEE Transactions on Automatic Control 59(7), 2014). That is for single
-    integrators: bodies with lag bear a κ well below k. Without a leader the formation keeps its shape, and drifts with
-    the wind. z stays as it is while safety holds the robot, and never asks for more than `most`.
+    integrators: bodies that lag by T bear less than k/T, and a third of it with decisions at 10 Hz. Without a leader
+    the formation keeps its shape, and drifts with the wind. z stays as it is while safety holds the robot, and never
+    asks for more than `most`.
     """
 
     NEEDS: ClassVar[Need] = "relative"
