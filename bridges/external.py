@@ -16,7 +16,7 @@ import msgspec
 import zenoh
 
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState
+from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import uptime
 from agents.errors import ExplainedError
@@ -88,8 +88,8 @@ class _Robot:
         return self.stopped and (self.flight.flying or norm(self.velocity(now)) > SETTLED)
 
 
-class ExternalBody:
-    """Robots of another process; implements `agents.body.interface.Body`.
+class ExternalBody(Body):
+    """Robots of another process.
 
     Its own clock is `uptime` and starts at creation; `read` measures the offset of the caller's clock.
     """

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from agents.body.external_pose import PATIENCE_S, External, velocity_after
 from agents.body.interface import BodyRequest, BodyState, Disturbance
 from agents.body.kinds import Kind
+from agents.body.shadow_twin import Placeable
 from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
 from twins.engines.engine import Engine, EngineFactory, Motion, Stage, Touch
@@ -167,8 +168,8 @@ class Twin:
         noise.refill(self._jitter.noise, self._measurement.noise, self._drift.noise)
 
 
-class TwinBody:
-    """Simulated robots of any kinds; implements `agents.body.interface.Body`. Advances to the time of each `read`."""
+class TwinBody(Placeable):
+    """Simulated robots of any kinds. Advances to the time of each `read`."""
 
     begun_at: float  # common start on the clock of `read` [s], NaN while unknown; obstacles' plans start then
     engine: Engine

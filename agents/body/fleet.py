@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-from agents.body.interface import Body, BodyRequest, BodyState, call_all, inspect
+from agents.body.interface import Body, BodyRequest, BodyState, call_all
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from agents.vectors import Setpoint, Vector
 
 
-class Fleet:
-    """Bodies, each with the rows of the process that it carries; implements `agents.body.interface.Body`."""
+class Fleet(Body):
+    """Bodies, each with the rows of the process that it carries."""
 
     def __init__(self, parts: Sequence[tuple[Sequence[int], Body]]) -> None:
         """`parts` are bodies and their rows; together they carry all rows."""
@@ -58,7 +58,8 @@ class Fleet:
         body.locate(at, t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        return inspect(*self._carriers[row])
+        body, at = self._carriers[row]
+        return body.inspect(at)
 
     def close(self) -> None:
         call_all(body.close for _, body in self._parts)

@@ -6,10 +6,11 @@ The runtime finds bodies by the entry-point group `zenpark.bodies`: the word bef
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -142,67 +143,58 @@ class BodyState:
         self.note, self.refusal, self.scan = note, refusal, scan
 
 
-class Body(Protocol):
-    """Hardware or a twin of n robots. The `takes` of the kind of a row tells how its row of `command` is read.
+class Body(ABC):
+    """Base of all bodies: hardware or a twin of n robots.
 
+    The `takes` of the kind of a row tells how its row of `command` is read.
     Calls come from one thread, but for `land` and `stop`: these come from others too, more than once, and while another
     call runs or hangs (`agents.runtime.watchdog`, emergency stops). They must neither block nor need the loop to go on.
     A body of several rows commands all of them, even if one of them fails (`call_all`).
     """
 
+    @abstractmethod
     def open(self) -> None:
         """Connects, and returns when poses arrive; raises BodyError, with the remedy, if that fails."""
-        ...
 
+    @abstractmethod
     def read(self, t: float) -> Sequence[BodyState]:
         """The newest state of each robot at time `t` [s] of the process's clock. Never blocks; a twin advances to `t`.
 
         The states may be the same objects at every call, and others write to them: the body sets `velocity` and `note`
         each time.
         """
-        ...
 
+    @abstractmethod
     def command(self, setpoints: Sequence[Setpoint]) -> None:
         """Command a setpoint for each robot: x y z yaw, v_x v_y v_z yaw-rate, or v ω 0 0; NaN leaves it alone."""
-        ...
 
+    @abstractmethod
     def takeoff(self, rows: Sequence[int], heights: Sequence[float]) -> None:
         """Flying robots climb to `heights` [m] by themselves."""
-        ...
 
+    @abstractmethod
     def land(self, rows: Sequence[int]) -> None:
         """Flying rows descend and switch their motors off, ground robots halt, by themselves."""
-        ...
 
+    @abstractmethod
     def stop(self, rows: Sequence[int]) -> None:
         """Motors off, at once, wherever the rows are: the emergency stop.
 
         The order is repeated until the device confirms that its motors are off, or counts as gone; until then `flying`
         stays set for a flying row, and its note is `UNANSWERED`.
         """
-        ...
 
+    @abstractmethod
     def locate(self, row: int, t: float, position: Vector, yaw: float) -> None:
         """An externally measured pose of a robot: [m], yaw [rad] or NaN, taken at `t` on the clock of `read`."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Releases the device. Flying rows must have landed before."""
-        ...
-
-
-@runtime_checkable
-class Inspectable(Protocol):
-    """A body that knows more of its devices than their state; the method is optional for bodies."""
 
     def inspect(self, row: int) -> Inspection:
         """Facts about the device of a row: firmware, volts, load of its radio. Never blocks, moves nothing."""
-        ...
-
-
-def inspect(body: Body, row: int) -> Inspection:
-    """Facts about the device of a row; none for a body that cannot be inspected."""
-    return body.inspect(row) if isinstance(body, Inspectable) else Inspection()
+        return Inspection()
 
 
 class BodyError(ExplainedError, RuntimeError):

@@ -10,12 +10,13 @@ restarted shows the error of simulating the whole run: the drift of speed and ya
 from __future__ import annotations
 
 import contextlib
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf, isfinite, isnan, nan
-from typing import Final, Protocol
+from typing import Final
 
-from agents.body.interface import Body, BodyRequest, BodyState, Disturbance, inspect
+from agents.body.interface import Body, BodyRequest, BodyState, Disturbance
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from agents.vectors import UNKNOWN, Setpoint, Vector, is_finite
@@ -24,9 +25,10 @@ TWIN: Final = "twin"
 FRESH_S: Final = 0.25  # a pose older than this is not where the robot is
 
 
-class Placeable(Body, Protocol):
+class Placeable(Body):
     """A body whose robots can be placed, such as a twin."""
 
+    @abstractmethod
     def place(
         self,
         rows: Sequence[int],
@@ -36,11 +38,10 @@ class Placeable(Body, Protocol):
         velocities: Sequence[Vector] | None = None,
     ) -> None:
         """Puts robots at positions [m] with yaws [rad], in the air or not, moving [m/s] or at rest."""
-        ...
 
 
-class Shadowed:
-    """A body with twins beside some of its robots; implements `agents.body.interface.Body`, without effect on them.
+class Shadowed(Body):
+    """A body with twins beside some of its robots, without effect on them.
 
     A twin that fails is left alone from then on, and the notes of its robots say so.
     """
@@ -97,8 +98,8 @@ class Shadowed:
         self._body.locate(row, t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        """See `Inspectable.inspect`: of the robot, not of the twin."""
-        return inspect(self._body, row)
+        """See `Body.inspect`: of the robot, not of the twin."""
+        return self._body.inspect(row)
 
     def close(self) -> None:
         try:

@@ -165,6 +165,10 @@ class Avoidance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         """
         return inf
 
+    def kept_gap(self) -> float:
+        """Gap between surfaces that is kept [m], as a picture draws it."""
+        return self.clearance
+
     def deviate(self, goal: Vector, own: OwnState, near: Nearby, period: float) -> Vector:
         """Goal [m] to pursue in place of `goal` [m]; called every `period` [s]."""
         return goal

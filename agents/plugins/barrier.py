@@ -66,6 +66,9 @@ class Barrier(Avoidance, frozen=True):
         NotNegative, Meta(description="share of the barred velocity that is driven to the right instead")
     ] = 1.0
 
+    def kept_gap(self) -> float:
+        return self.margin
+
     def horizon(self, own: OwnState) -> float:
         """Beyond it b is greater than any speed."""
         return self.margin + (own.lag + 2.0 / self.alpha) * HURRY * own.speed

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from math import copysign, cos, inf, isfinite, isnan, nan, pi, sin, sqrt, tau
-from typing import Annotated, Final, Protocol
+from typing import Annotated, Final
 
 import msgspec
 from msgspec import Meta
@@ -20,23 +20,19 @@ Offset = Annotated[list[float], Meta(min_length=2, max_length=3)]
 NO_TARGET: Final[Pose] = (nan, nan, nan, nan)
 
 
-class Planner(Protocol):
-    """Target as a function of time."""
+class Planner(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all planners: target as a function of time."""
 
     def target(self, elapsed: float, anchor: Vector, heading: float) -> Pose:
         """Target x, y, z [m] and yaw [rad], NaN where any yaw will do.
 
         The leg began `elapsed` [s] ago, at `anchor` [m] with the yaw `heading` [rad].
         """
-        ...
+        raise TypeError(f"{type(self).__name__} must define `target`")
 
     def speed(self) -> float:
         """Largest speed of the target [m/s]."""
-        ...
-
-
-class Parameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Parameters of a planner, as they stand in the experiment file."""
+        raise TypeError(f"{type(self).__name__} must define `speed`")
 
 
 def spatial(place: Sequence[float], height: float) -> Vector:
@@ -44,7 +40,7 @@ def spatial(place: Sequence[float], height: float) -> Vector:
     return place[0], place[1], place[2] if len(place) > 2 else height
 
 
-class Hold(Parameters, frozen=True):
+class Hold(Planner, frozen=True):
     """Stay in place, or stand at `at`; turn to `yaw` if given."""
 
     at: Annotated[Offset | None, Meta(description="x, y (, z) [m]")] = None
@@ -58,7 +54,7 @@ class Hold(Parameters, frozen=True):
         return 0.0
 
 
-class Line(Parameters, frozen=True):
+class Line(Planner, frozen=True):
     """Straight line from the robot's place, at constant speed; then stay."""
 
     move_by: Annotated[Offset, Meta(description="x, y (, z) [m]")]
@@ -76,7 +72,7 @@ class Line(Parameters, frozen=True):
         return self.speed_
 
 
-class Waypoints(Parameters, frozen=True):
+class Waypoints(Planner, frozen=True):
     """Straight lines through points of the arena, at constant speed; then stay, or begin again with `loop`."""
 
     points: Annotated[list[Offset], Meta(min_length=1, description="x, y (, z) [m]")]
@@ -109,7 +105,7 @@ def _point_along(route: Sequence[Vector], way: float) -> Vector:
     return route[-1]
 
 
-class Circle(Parameters, frozen=True):
+class Circle(Planner, frozen=True):
     """Circle from the robot's place, along its heading, to the left (to the right with a negative radius)."""
 
     radius: Annotated[float, Meta(description="[m]")]
@@ -134,7 +130,7 @@ class Circle(Parameters, frozen=True):
         return tau * abs(self.radius) / self.period_s
 
 
-class Lemniscate(Parameters, frozen=True):
+class Lemniscate(Planner, frozen=True):
     """Figure of eight (Gerono's lemniscate) through the robot's place, leaving along its heading."""
 
     size: Annotated[Positive, Meta(description="half its length [m]")]

@@ -16,16 +16,12 @@ from functools import cache
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Literal, Protocol, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from agents.errors import ExplainedError
 from agents.plugins import files
-from agents.plugins.avoidance import Avoidance
-from agents.plugins.law import Law
-from agents.plugins.predictors import Predictor
-from agents.plugins.triggers import Trigger
 
 BODIES: Final = "zenpark.bodies"
 ROBOTS: Final = "zenpark.kinds"  # kinds of robots
@@ -37,10 +33,20 @@ AVOIDANCES: Final = "zenpark.avoidances"
 ENGINES: Final = "zenpark.engines"  # physics of the twins of a world
 STRUCTS: Final = (TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES, ENGINES)  # of which a file gives parameters
 CHOSEN: Final = (ROBOTS, *STRUCTS)  # of which a file names some
-BASES: Final = {TRIGGERS: Trigger, PREDICTORS: Predictor, LAWS: Law, AVOIDANCES: Avoidance}
 METRICS: Final = "zenpark.metrics"  # measured quantities, without parameters
 FACE: Final = "zenpark"  # module of the names that plug-ins import
 DEVICES: Final = "zenpark.devices"  # protocol twins: simulated far ends of the protocols of bodies
+# Base of the classes of each group, as `module:class`: what zenpark asks of a plug-in stands there, with its default.
+BASES: Final = {
+    BODIES: "agents.body.interface:Body",
+    TRIGGERS: "agents.plugins.triggers:Trigger",
+    LAWS: "agents.plugins.law:Law",
+    PREDICTORS: "agents.plugins.predictors:Predictor",
+    PLANNERS: "agents.plugins.planners:Planner",
+    AVOIDANCES: "agents.plugins.avoidance:Avoidance",
+    ENGINES: "twins.engines.engine:EngineFactory",
+    METRICS: "experiments.metrics.metric:Metric",
+}
 
 
 class _Groups(Protocol):
@@ -76,10 +82,10 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
     """The object registered under a name.
 
     Raises UnknownPlugin with the nearest name, or all of them; and PluginError, with the distributions, if two register
-    different ones under this name, or if the module fails to import.
+    different ones under this name, if the module fails to import, or if it is no class as the base of the group asks.
     """
     if files.is_choice(name):
-        return _in_file(name)
+        return _fitting(group, name, _in_file(name))
     known = _registered(group)
     what = group.rpartition(".")[2]
     if name not in known:
@@ -89,9 +95,25 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
         owners = " and ".join(_origin(each) for each in known[name])
         raise PluginError(f"{name!r} among the {what} is ambiguous: {owners}; give one of them another name")
     try:
-        return entry.load()
+        plugin = entry.load()
     except _IMPORT_FAILURES as error:
         raise PluginError(f"{_origin(entry)} fails to import: {_reason(error)}") from error
+    return _fitting(group, name, plugin)
+
+
+def _fitting(group: str, name: str, plugin: Any) -> Any:  # noqa: ANN401 - likewise
+    """The plug-in, if it is a class as the base of its group asks; else raises PluginError."""
+    if group not in BASES:
+        return plugin
+    origin, base = _origin_of(group, name), find(BASES[group], f"base of the {group.rpartition('.')[2]}")
+    if not (isinstance(plugin, type) and issubclass(plugin, base)):
+        raise PluginError(f"{origin} must be a class that inherits from {BASES[group].replace(':', '.')}")
+    if missing := [each for each in dir(plugin) if getattr(getattr(plugin, each), "__isabstractmethod__", False)]:
+        raise PluginError(f"{origin} lacks the methods {', '.join(missing)}")
+    for variable, allowed in _literals(base).items():
+        if (value := getattr(plugin, variable)) not in allowed:
+            raise PluginError(f"{origin}: {variable} = {value!r} is none of {allowed}")
+    return plugin
 
 
 def _in_file(name: str) -> Any:  # noqa: ANN401 - likewise
@@ -134,14 +156,11 @@ def find(path: str, what: str) -> Any:  # noqa: ANN401 - likewise
 def struct(group: str, name: str) -> type[msgspec.Struct]:
     """The struct of parameters registered under a name.
 
-    Raises as `load`, and PluginError if it is no frozen struct, or inherits from another base than its group's.
+    Raises as `load`, and PluginError if it is no frozen struct.
     """
     plugin = load(group, name)
     if not (isinstance(plugin, type) and issubclass(plugin, msgspec.Struct)):
         raise PluginError(f"{_origin_of(group, name)} is no msgspec.Struct; its parameters must be its fields")
-    base = BASES.get(group, msgspec.Struct)
-    if not issubclass(plugin, base):
-        raise PluginError(f"{_origin_of(group, name)} must inherit from {base.__module__}.{base.__qualname__}")
     if not plugin.__struct_config__.frozen:  # one object serves all robots and seeds: what it kept would leak
         raise PluginError(
             f"{_origin_of(group, name)} can be changed, and would mix what it keeps of different robots and runs; "
@@ -203,6 +222,14 @@ def _foreign() -> list[tuple[EntryPoint, Distribution]]:
     groups = (BODIES, DEVICES, METRICS, *CHOSEN)
     entries = (entry for group in groups for entry in _installed().select(group=group))
     return [(entry, entry.dist) for entry in entries if entry.dist is not None and _name(entry.dist) != "zenpark"]
+
+
+@cache
+def _literals(base: type) -> dict[str, tuple[object, ...]]:
+    """Class variables of a base that have one of a few values, with these."""
+    hints = {name: hint for name, hint in get_type_hints(base).items() if get_origin(hint) is ClassVar}
+    kinds = {name: get_args(hint)[0] for name, hint in hints.items()}
+    return {name: get_args(kind) for name, kind in kinds.items() if get_origin(kind) is Literal}
 
 
 @cache

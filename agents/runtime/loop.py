@@ -21,7 +21,7 @@ import msgspec
 import zenoh
 
 from agents.body.external_pose import External
-from agents.body.interface import Body, BodyState, call_all, inspect
+from agents.body.interface import Body, BodyState, call_all
 from agents.body.measured_positions import MeasuredPositions
 from agents.clock import Clock, uptime
 from agents.decision.assignment import Assignment
@@ -437,7 +437,7 @@ class Runtime:
             query.reply(key, messages.encode(reply, self._setup.encoding), encoding=self._mime)
 
     def _inspect(self, row: int, t: float) -> messages.Inspection:
-        known = inspect(self._body, row)
+        known = self._body.inspect(row)
         if not self._states:
             return known
         state = self._states[row]

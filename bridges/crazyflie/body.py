@@ -10,7 +10,7 @@ from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import BodyError, BodyRequest, BodyState, RangeScan
+from agents.body.interface import Body, BodyError, BodyRequest, BodyState, RangeScan
 from agents.network.messages import Inspection, number
 from agents.protocols.crazyflie import (
     Lighthouse,
@@ -35,8 +35,8 @@ MEASURING_S: Final = (
 )
 
 
-class CrazyflieBody:
-    """Crazyflies; implements `agents.body.interface.Body`. Raises BodyError for an invalid address or setting."""
+class CrazyflieBody(Body):
+    """Crazyflies. Raises BodyError for an invalid address or setting."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names
@@ -177,7 +177,7 @@ class CrazyflieBody:
             self._pilots[row].locate(self._zero + t, position, yaw)
 
     def inspect(self, row: int) -> Inspection:
-        """See `agents.body.interface.Inspectable`."""
+        """See `Body.inspect`."""
         load = self._loads[row]
         return Inspection(
             firmware=self._pilots[row].firmware,

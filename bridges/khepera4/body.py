@@ -9,7 +9,7 @@ from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import UNANSWERED, BodyError, BodyRequest, BodyState, RangeScan, settings
+from agents.body.interface import UNANSWERED, Body, BodyError, BodyRequest, BodyState, RangeScan, settings
 from agents.clock import uptime
 from agents.network.messages import Inspection
 from agents.protocols import khepera4 as protocol
@@ -19,8 +19,8 @@ from bridges.khepera4.link import Address, Khepera4Link
 OPEN_S: Final = 4.5  # deadline of the first odometry: that of a connection and of the first answer
 
 
-class KheperaBody:
-    """Khepera IV robots; implements `agents.body.interface.Body`."""
+class KheperaBody(Body):
+    """Khepera IV robots."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names = request.names

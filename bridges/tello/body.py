@@ -15,7 +15,7 @@ from typing import Final
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import FRESH_S, BodyError, BodyRequest, BodyState, call_all, settings
+from agents.body.interface import FRESH_S, Body, BodyError, BodyRequest, BodyState, call_all, settings
 from agents.clock import uptime
 from agents.protocols import tello as protocol
 from agents.vectors import UNKNOWN, ZERO, Setpoint, Vector
@@ -25,8 +25,8 @@ from bridges.tello.pilot import Duty, TelloPilot
 OPEN_S: Final = 3.0  # deadline of a drone's first state line
 
 
-class TelloBody:
-    """Tellos; implements `agents.body.interface.Body`. One process flies all Tellos of a computer."""
+class TelloBody(Body):
+    """Tellos. One process flies all Tellos of a computer."""
 
     def __init__(self, request: BodyRequest) -> None:
         self._names, self._kinds = request.names, request.kinds

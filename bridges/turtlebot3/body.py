@@ -16,7 +16,7 @@ import zenoh
 
 from agents.body.device_locks import Claims
 from agents.body.external_pose import External
-from agents.body.interface import BodyError, BodyRequest, BodyState, call_all
+from agents.body.interface import Body, BodyError, BodyRequest, BodyState, call_all
 from agents.clock import uptime
 from agents.errors import ExplainedError
 from agents.network import session as network
@@ -35,8 +35,8 @@ STANDSTILL_S: Final = 3.0  # how long `close` waits for the robots to stand
 Clock = Callable[[], float]
 
 
-class TurtleBot3:
-    """TurtleBot3 robots; implements `agents.body.interface.Body`. All topics are polled.
+class TurtleBot3(Body):
+    """TurtleBot3 robots. All topics are polled.
 
     Args:
         clock: Monotonic [s]; commands from before a suspension of the machine are old by it.

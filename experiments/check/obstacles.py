@@ -8,12 +8,10 @@ from typing import Final
 import numpy as np
 
 from agents.body.kinds import KINDS
-from agents.plugins import registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
 from experiments.definition.bodies import WORLD
 from experiments.definition.experiment import Robot
-from experiments.recording.trace import finds_contacts
 from twins import scene as outlines
 from twins.arrays import Array, Index, Mask
 from twins.scene import Obstacle
@@ -84,11 +82,11 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
 def contacts(analysis: Analysis) -> Iterator[Finding]:
     """Check that the engine computes the contacts for which the arena is made."""
     experiment, scene = analysis.experiment, analysis.scene
-    kind, _ = registry.split(experiment.world.engine)
-    touching = finds_contacts(kind)
+    touching = analysis.plan.finds_contacts
     for name, obstacle in experiment.arena.obstacles.items():
         if obstacle.mass is not None and not touching:
-            message = f"'{name}' has a mass, but in the engine '{kind}' nothing is pushed: it stands fast"
+            engine = analysis.plan.engine_name
+            message = f"'{name}' has a mass, but in the engine '{engine}' nothing is pushed: it stands fast"
             remedy = 'choose another: engine = "pymunk" in [world], or leave mass out'
             yield Finding("warning", "not-pushed", message, remedy, ("arena", "obstacles", name, "mass"))
     if touching and scene.walled:

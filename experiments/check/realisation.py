@@ -17,10 +17,10 @@ from agents.plugins.law import Law
 from agents.plugins.laws import Mixed
 from experiments.definition.formation import Anchored, anchor_errors, law_errors
 from experiments.definition.graph import Links, edges, part_of_rows
+from experiments.definition.links import TARGET_KINDS
 from experiments.definition.rigidity import Redundancy, Rigidity, redundancy, rigidity
 from twins.arrays import Array, Index, Mask, norm
 
-TAKES: Final = {"distance": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 TINY: Final = 1e-18  # [m²] no length is zero
 EXACT: Final = 1e-9  # [m] link errors below this are arithmetic
 ENOUGH: Final = 3e-4  # [m] distances written with four decimals are met as well as can be; a better shape is not sought
@@ -73,7 +73,7 @@ class Residuals:
 
 def targets_of_law(law: Law, links: Links) -> Links:
     """Links with the targets that the law reads: `distance` reads the distance of a relative position as well."""
-    wants = TAKES.get(law.NEEDS)
+    wants = TARGET_KINDS[law.NEEDS].wants
     if wants is None or links.wants is None:
         return links
     return msgspec.structs.replace(links, wants=None if wants == BY_DISTANCE else np.full(len(links), wants))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_NOTHING, BY_RELATIVE
-from agents.plugins.law import Law
+from agents.plugins.law import Law, Need
 from experiments.definition.experiment import Experiment, Link, Target
 
 _LINK: Final = re.compile(r"\s*(\w+)\s*([>-])\s*(\w+)\s*", re.ASCII)
@@ -16,6 +16,26 @@ _ALMOST: Final = re.compile(r"\s*(\w+)\s*([^\w\s]+)\s*(\w+)\s*", re.ASCII)
 FORM: Final = 'a link reads "A > B" (B receives from A) or "A - B" (both receive)'
 UNKNOWN: Final = (math.nan, math.nan, math.nan)
 RELEASE: Final = 1.1  # of the range: what separates coming from going, so that a link does not flicker
+
+
+class TargetKind(NamedTuple):
+    """What a law that needs a kind of target takes of a link."""
+
+    fields: tuple[str, ...]  # of `Target` that give it; the first is the one that a drawn shape gives
+    words: str
+    example: str  # as the file writes it
+    wants: int | None  # how the law takes every link, see `agents.formation.link`; None: by its own target
+
+
+NO_TARGET: Final = "nothing"  # in place of a field: a link alone
+_ANY: Final = TargetKind(("distance", "offset", "bearing"), "a distance, an offset or a bearing", "0.6", None)
+TARGET_KINDS: Final[dict[Need, TargetKind]] = {
+    "distance": TargetKind(("distance", "offset"), "a distance or an offset", "0.6", BY_DISTANCE),
+    "relative": TargetKind(("offset",), "an offset", "{ offset = [0.6, 0.0] }", BY_RELATIVE),
+    "bearing": TargetKind(("bearing", "offset"), "a bearing or an offset", "{ bearing = [1.0, 0.0] }", BY_BEARING),
+    "any": _ANY,
+    "nothing": _ANY._replace(fields=(*_ANY.fields, NO_TARGET)),
+}
 
 
 @dataclass(frozen=True)

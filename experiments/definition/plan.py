@@ -26,8 +26,9 @@ from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, kinds,
 from experiments.definition.experiment import Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links, adjacency
-from experiments.definition.links import OneWay, one_way_links
+from experiments.definition.links import TARGET_KINDS, OneWay, TargetKind, one_way_links
 from twins.arrays import Index
+from twins.engines.engine import EngineFactory
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,23 @@ class Plan:
     def kinds(self) -> tuple[Kind, ...]:
         return kinds(self.experiment, self.names)
 
+    @property
+    def law_name(self) -> str:
+        return registry.split(self.experiment.formation.law)[0]
+
     @cached_property
     def law(self) -> Law:
         built: Law = registry.build(registry.LAWS, self.experiment.formation.law)
         return built
+
+    @property
+    def target_kind(self) -> TargetKind:
+        """What the law takes of a link."""
+        return TARGET_KINDS[self.law.NEEDS]
+
+    @property
+    def trigger_name(self) -> str:
+        return registry.split(self.experiment.trigger)[0]
 
     @cached_property
     def trigger(self) -> Trigger:
@@ -68,18 +82,28 @@ class Plan:
         chosen = self.experiment.rates.wake
         return not self.trigger.TIMED if chosen is None else chosen
 
+    @property
+    def update_name(self) -> str:
+        """Empty without a control trigger."""
+        return registry.split(self.experiment.formation.update or "")[0]
+
     @cached_property
     def update(self) -> Trigger | None:
         """The control trigger; None: the law is computed at every decision."""
         chosen = self.experiment.formation.update
         return None if chosen is None else registry.build(registry.TRIGGERS, chosen)
 
+    @property
+    def needs_prediction(self) -> bool:
+        """Whether the trigger counts on neighbours that extrapolate."""
+        return self.trigger.PREDICTION != Trigger.PREDICTION
+
     @cached_property
     def predictor(self) -> Predictor:
         """Extrapolation between two transmissions: as the experiment says, else as its trigger or its law needs it."""
         chosen = self.experiment.prediction
         if chosen is None:
-            chosen = self.law.PREDICTION if self.trigger.PREDICTION == "hold" else self.trigger.PREDICTION
+            chosen = self.trigger.PREDICTION if self.needs_prediction else self.law.PREDICTION
         built: Predictor = registry.build(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
@@ -87,6 +111,23 @@ class Plan:
     def avoidance(self) -> Avoidance | None:
         chosen = self.experiment.avoidance
         return None if chosen is None else registry.build(registry.AVOIDANCES, chosen)
+
+    @property
+    def engine_name(self) -> str:
+        return registry.split(self.experiment.world.engine)[0]
+
+    @cached_property
+    def engine(self) -> EngineFactory:
+        built: EngineFactory = registry.build(registry.ENGINES, self.experiment.world.engine)
+        return built
+
+    @property
+    def finds_contacts(self) -> bool:
+        """Whether the engine finds contacts; not where a recording is read and that engine is not installed."""
+        try:
+            return self.engine.CONTACTS
+        except (registry.PluginError, msgspec.ValidationError):
+            return False
 
     @cached_property
     def legs_by_robot(self) -> dict[str, tuple[Leg, ...]]:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Final, cast
+from typing import Final
 
 import numpy as np
 
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
+from agents.formation.link import BY_BEARING
 from agents.plugins import registry
-from agents.plugins.law import Law
 from agents.plugins.laws import Gradient
+from agents.plugins.predictors import HOLD
 from agents.plugins.registry import did_you_mean
-from agents.plugins.triggers import Trigger
 from experiments.definition.bodies import WORLD, driven_kind, own_bodies
 from experiments.definition.experiment import (
     JUDGED,
@@ -28,7 +28,8 @@ from experiments.definition.experiment import (
     Robot,
     Target,
 )
-from experiments.definition.links import FORM, held_height, link_pairs
+from experiments.definition.links import FORM, NO_TARGET, held_height, link_pairs
+from experiments.definition.plan import Plan
 from experiments.file import consistency_network
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
 from twins import scene as outlines
@@ -75,24 +76,25 @@ ROUNDED: Final = 1e-3  # [m] heights written with three decimals
 _WALL: Final = "wall"  # name of the border of the arena in contacts
 
 
-def faults(experiment: Experiment) -> Iterator[Fault]:
+def faults(plan: Plan) -> Iterator[Fault]:
     """All contradictions between fields, with their paths in the file."""
+    experiment = plan.experiment
     yield from _rates(experiment)
     yield from _case_names(experiment.cases)
     yield from arena_faults(experiment.arena)
     for name, robot in experiment.robots.items():
-        yield from _robot(experiment, ("robots", name), robot)
+        yield from _robot(plan, ("robots", name), robot)
     for name, robot in experiment.spares.items():
-        yield from _robot(experiment, ("spares", name), robot)
+        yield from _robot(plan, ("spares", name), robot)
     yield from standby_faults(experiment)
     yield from _start_conflicts(experiment)
-    yield from _formation(experiment)
-    yield from consistency_network.channel_faults(experiment)
+    yield from _formation(plan)
+    yield from consistency_network.channel_faults(plan)
     yield from consistency_network.host_faults(experiment)
     yield from _timeline(experiment)
     yield from _architecture(experiment)
-    yield from _triggers(experiment)
-    yield from _remembering(experiment)
+    yield from _triggers(plan)
+    yield from _remembering(plan)
     for name in experiment.disturbance:
         known = ("all", *KINDS, *experiment.robots)
         if name not in known:
@@ -208,8 +210,8 @@ def divisor(body: float, wanted: float) -> float:
     return min(exact, key=lambda rate: abs(rate - wanted), default=body)
 
 
-def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
-    name = path[1]
+def _robot(plan: Plan, path: tuple[str, str], robot: Robot) -> Iterator[Fault]:
+    experiment, name = plan.experiment, path[1]
     yield from _names(experiment, path, robot)
     body = registry.body_name(robot.body)
     bodies = [*registry.names(registry.BODIES), *registry.names(registry.DEVICES)]
@@ -230,7 +232,7 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         elif body in ("twin", WORLD) and not has_model(kind):
             yield Fault((*path, "kind"), f"no twin of '{kind.name}'", TWINLESS)
         elif body in ("twin", WORLD):
-            yield from _engine(experiment, path, kind)
+            yield from _engine(plan, path, kind)
         yield from _hover(experiment, path, robot, kind)
     for number, sensor in enumerate(robot.sensors or []):
         if sensor not in SENSORS:
@@ -245,14 +247,12 @@ def _robot(experiment: Experiment, path: tuple[str, str], robot: Robot) -> Itera
         yield Fault((*path, "start", 2), "the yaw is in radians", f"{robot.start[2]:g} degrees are {radians:.4f}")
 
 
-def _engine(experiment: Experiment, path: tuple[str, str], kind: Kind) -> Iterator[Fault]:
+def _engine(plan: Plan, path: tuple[str, str], kind: Kind) -> Iterator[Fault]:
     try:
-        require_carried(registry.load(registry.ENGINES, registry.split(experiment.world.engine)[0]), [kind])
+        require_carried(plan.engine, [kind])
     except BodyError as error:
         message, _, hint = str(error).partition(": ")
         yield Fault((*path, "kind"), message, hint)
-    except registry.PluginError:  # the engine's own fault is told elsewhere
-        return
 
 
 def _known(name: str) -> Kind | None:
@@ -301,36 +301,30 @@ def _hover(experiment: Experiment, path: tuple[str, str], robot: Robot, kind: Ki
         yield Fault((*path, "hover"), f"'{name}' cannot hover at {robot.hover:g} m: {inside}", hint)
 
 
-def _triggers(experiment: Experiment) -> Iterator[Fault]:
+def _triggers(plan: Plan) -> Iterator[Fault]:
     """Triggers in the wrong place, or without the prediction that they need."""
-    kind, _ = registry.split(experiment.trigger)
-    spoken = cast(type[Trigger], registry.struct(registry.TRIGGERS, kind))
-    if "communication" not in spoken.PLACES:
+    kind, prediction, update = plan.trigger_name, plan.experiment.prediction, plan.update
+    if "communication" not in plan.trigger.PLACES:
         message = f"'{kind}' decides when the law is computed anew, not when a robot transmits"
         yield Fault(("trigger",), message, f"put it into [formation] as update = '{kind}', and another trigger here")
-    needed = spoken.PREDICTION
-    if experiment.prediction is not None and needed != "hold":
-        given, _ = registry.split(experiment.prediction)
-        if given == "hold":
-            message = f"'{kind}' counts on neighbours that extrapolate, but prediction = 'hold' says that they do not"
-            hint = f"leave prediction out, which means '{needed}', or take the trigger send-on-delta"
-            yield Fault(("prediction",), message, hint)
-    if experiment.formation.update is None:
+    if prediction is not None and plan.needs_prediction and plan.predictor is HOLD:
+        message = f"'{kind}' counts on neighbours that extrapolate, but prediction = 'hold' says that they do not"
+        hint = f"leave prediction out, which means '{plan.trigger.PREDICTION}', or take the trigger send-on-delta"
+        yield Fault(("prediction",), message, hint)
+    if update is None:
         return
-    kind, given_too = registry.split(experiment.formation.update)
-    if "control" not in cast(type[Trigger], registry.struct(registry.TRIGGERS, kind)).PLACES:
-        message = f"'{kind}' decides when a robot transmits, not when the law is computed anew"
+    if "control" not in update.PLACES:
+        message = f"'{plan.update_name}' decides when a robot transmits, not when the law is computed anew"
         yield Fault(("formation", "update"), message, "take another one, such as send-on-delta or relative-control")
-    if given_too.get("smoothing_s"):
+    if update.smoothing_s:
         message = "smoothing_s is for transmissions, and there are none where the law is computed"
         yield Fault(("formation", "update", "smoothing_s"), message, "leave it out", on_key=True)
 
 
-def _remembering(experiment: Experiment) -> Iterator[Fault]:
+def _remembering(plan: Plan) -> Iterator[Fault]:
     """What a law that is no gradient does not go with: it has no errors, and its memory is the robot's own."""
-    name, _ = registry.split(experiment.formation.law)
-    law = cast(type[Law], registry.struct(registry.LAWS, name))
-    if issubclass(law, Gradient):
+    experiment, name, kind = plan.experiment, plan.law_name, plan.trigger_name
+    if isinstance(plan.law, Gradient):
         return
     if experiment.formation.update is not None:
         message = f"the law '{name}' is no function of its input alone: a step that is left out would be lost"
@@ -339,14 +333,12 @@ def _remembering(experiment: Experiment) -> Iterator[Fault]:
         message = f"a central controller computes no law that remembers or gives velocities, as '{name}' does"
         yield Fault(("architecture",), message, 'write architecture = "distributed", or take another law', on_key=True)
     if experiment.formation.anchors:
-        message = f"anchors pull robots of the laws {GRADIENTS}; '{name}' does not know them"
+        message = f"anchors pull robots of laws that pull along links; '{name}' does not know them"
         yield Fault(("formation", "anchors"), message, "leave anchors out", on_key=True)
-    kind, _ = registry.split(experiment.trigger)
-    trigger = cast(type[Trigger], registry.struct(registry.TRIGGERS, kind))
-    if trigger.JUDGES_ERRORS:
+    if plan.trigger.JUDGES_ERRORS:
         message = f"'{kind}' judges errors of links, and the law '{name}' has none"
         yield Fault(("trigger",), message, "take another trigger, such as send-on-delta")
-    elif trigger.JUDGES_DRIFT and law.SAYS:
+    elif plan.trigger.JUDGES_DRIFT and plan.law.SAYS:
         message = f"'{kind}' waits by how the pose drifts; it does not see the variables that '{name}' says"
         yield Fault(("trigger",), message, "take another trigger, such as send-on-delta")
 
@@ -378,11 +370,11 @@ def _timeline(experiment: Experiment) -> Iterator[Fault]:
         before[leg.robot] = max(leg.at_s, before.get(leg.robot, -1.0))
 
 
-def _formation(experiment: Experiment) -> Iterator[Fault]:
+def _formation(plan: Plan) -> Iterator[Fault]:
     """All contradictions in [formation]."""
+    experiment, formation = plan.experiment, plan.experiment.formation
     found = list(_links(experiment))
     yield from found
-    formation = experiment.formation
     places = [("anchors", name) for name in formation.anchors] + [("shape", name) for name in formation.shape]
     for table, name in places:
         yield from unknown_robot(("formation", table, name), name, experiment.robots, on_key=True)
@@ -390,11 +382,11 @@ def _formation(experiment: Experiment) -> Iterator[Fault]:
         return  # what follows looks links up
     for text, link in experiment.formation.links.items():
         path = ("formation", "links", text)
-        yield from _asked(experiment, text, link, path)
+        yield from _asked(plan, text, link, path)
         if isinstance(link, Link):
             yield from after_the_end((*path, "from_s"), "link", link.from_s, experiment.duration_s)
     for number, change in enumerate(experiment.formation.changes):
-        yield from _change(experiment, number, change)
+        yield from _change(plan, number, change)
     near = experiment.formation.proximity
     if near is not None and near.distance is None and not experiment.formation.links:
         message = "there are no links that could come and go by range"
@@ -430,10 +422,6 @@ def _links(experiment: Experiment) -> Iterator[Fault]:
         given.update(dict.fromkeys(both, text))
 
 
-GRADIENTS: Final = "distance, displacement, bearing and mixed"
-NO_TARGET: Final = "nothing"  # what a link alone asks for
-
-
 def _kind_of(given: Target | float) -> str:
     """Name of the target of a link."""
     if not isinstance(given, Target):
@@ -441,20 +429,18 @@ def _kind_of(given: Target | float) -> str:
     return next((name for name in ("distance", "offset", "bearing") if getattr(given, name) is not None), NO_TARGET)
 
 
-def _asked(experiment: Experiment, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
+def _asked(plan: Plan, text: str, given: Target | float, path: Path) -> Iterator[Fault]:
     """Targets that the law does not take, or that robots with held heights cannot meet."""
-    name, _ = registry.split(experiment.formation.law)
-    needs, kind = cast(type[Law], registry.struct(registry.LAWS, name)).NEEDS, _kind_of(given)
-    can = {"distance": ("distance", "offset"), "relative": ("offset",), "bearing": ("bearing", "offset")}
-    words = {"distance": "a distance or an offset", "relative": "an offset", "bearing": "a bearing or an offset"}
-    if needs != "nothing" and kind == NO_TARGET:
+    experiment, name, needs, kind = plan.experiment, plan.law_name, plan.target_kind, _kind_of(given)
+    if kind not in needs.fields and kind == NO_TARGET:
         message = f"the law '{name}' needs a target of every link, and {text!r} has none"
-        yield Fault(path, message, f"give {words.get(needs, 'a distance, an offset or a bearing')}")
+        yield Fault(path, message, f"give {needs.words}")
         return
-    if needs in can and kind not in can[needs]:
-        message = f"the law '{name}' needs {words[needs]} of every link; this one asks for a {kind}"
-        example = {"relative": "{ offset = [0.6, 0.0] }", "bearing": "{ bearing = [1.0, 0.0] }"}.get(needs, "0.6")
-        hint = f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {example}'
+    if kind not in needs.fields:
+        message = f"the law '{name}' needs {needs.words} of every link; this one asks for a {kind}"
+        hint = (
+            f'draw all in [formation.shape] and write "{text}" = "shape", or write such as "{text}" = {needs.example}'
+        )
         yield Fault(path, message, f'{hint}, or take law = "mixed", which goes by each link')
         return
     if not isinstance(given, Target):
@@ -462,7 +448,7 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
     second, first = link_pairs(text)[0]
     rise = held_height(experiment, second) - held_height(experiment, first)
     if given.offset is not None:
-        if needs == "bearing" and not any(given.offset) and rise == 0.0:
+        if needs.wants == BY_BEARING and not any(given.offset) and rise == 0.0:
             yield Fault((*path, "offset"), "an offset of zeros has no direction", "give x, y other than 0")
         if len(given.offset) == 3 and abs(given.offset[2] - rise) > ROUNDED:
             message = f"'{second}' is held {rise:g} m above '{first}', not {given.offset[2]:g} m"
@@ -473,8 +459,8 @@ def _asked(experiment: Experiment, text: str, given: Target | float, path: Path)
         yield Fault((*path, "bearing", 2), message, "leave the third number out: a direction seen from above")
 
 
-def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fault]:
-    path = ("formation", "changes", number)
+def _change(plan: Plan, number: int, change: Change) -> Iterator[Fault]:
+    experiment, path = plan.experiment, ("formation", "changes", number)
     yield from after_the_end((*path, "at_s"), "change", change.at_s, experiment.duration_s)
     before = {pair: given for text, given in experiment.formation.links.items() for pair in link_pairs(text)}
     kinds = {_kind_of(given) for given in before.values()}
@@ -494,7 +480,7 @@ def _change(experiment: Experiment, number: int, change: Change) -> Iterator[Fau
             message = f"{text!r} asks for a {old} before, and for a {new} then: there is no way between them"
             yield Fault(where, message, f"give a {old}")
         else:
-            yield from _asked(experiment, text, given, where)
+            yield from _asked(plan, text, given, where)
     if change.rotate and kinds == {"distance"}:
         message = "nothing here knows a direction: distances are met whichever way the formation faces"
         yield Fault((*path, "rotate"), message, "give links an offset or a bearing, and law a law that goes by them")

@@ -133,11 +133,11 @@ AT: Final = ("channel", "links")
 ROUNDING: Final = 1e-9
 
 
-def channel_faults(experiment: Experiment) -> Iterator[Fault]:
+def channel_faults(plan: Plan) -> Iterator[Fault]:
     """All contradictions in [channel]."""
-    channel = experiment.channel
+    experiment, channel = plan.experiment, plan.experiment.channel
     yield from _bursts(channel, ("channel",), channel)
-    there = _pose_pairs(experiment) if channel.links or any(outage.links for outage in channel.outages) else None
+    there = _pose_pairs(plan) if channel.links or any(outage.links for outage in channel.outages) else None
     given: dict[tuple[str, str], str] = {}
     for text, own in channel.links.items():
         path = (*AT, text)
@@ -178,13 +178,12 @@ def _link(
         yield Fault(path, f"there is no link {sender} > {receiver}", hint, on_key=on_key)
 
 
-def _pose_pairs(experiment: Experiment) -> set[tuple[str, str]] | None:
+def _pose_pairs(plan: Plan) -> set[tuple[str, str]] | None:
     """The (receiver, sender) pairs of all links, for formation and avoidance; None if other faults hide them."""
     try:
-        links = Plan(experiment).pose_links
+        names, links = plan.names, plan.pose_links
     except (ValueError, KeyError):
         return None
-    names = tuple(experiment.robots)
     return {(names[i], names[j]) for i, j in zip(links.receiver.tolist(), links.sender.tolist(), strict=True)}
 
 

@@ -19,6 +19,7 @@ from agents.plugins import files
 from agents.plugins.registry import did_you_mean
 from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
 from experiments.file.overrides import Override, assign, fill_from_shape, merged, parse
@@ -131,7 +132,8 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
         shapes = {name: [*fill_from_shape(each), *structure.faults(each)] for name, each in documents.items()}
         source.refuse([*nested, *_each_once(shapes, tables)])
         experiments = {name: msgspec.convert(each, Experiment) for name, each in documents.items()}
-        source.refuse(_each_once({name: list(consistency.faults(each)) for name, each in experiments.items()}, tables))
+        found = {name: list(consistency.faults(Plan(each))) for name, each in experiments.items()}
+        source.refuse(_each_once(found, tables))
         if tables or not is_json:  # a case that was written as JSON names cases that are not in it
             source.refuse(consistency.criteria_faults(experiments[None], tables or [UNNAMED]))
     except RecursionError:

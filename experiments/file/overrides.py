@@ -12,10 +12,10 @@ from operator import attrgetter
 from typing import Any, Final, cast
 
 from agents.plugins import registry
-from agents.plugins.law import Law
+from agents.plugins.law import Law, Need
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
-from experiments.definition.links import link_pairs, pairs_or_none
+from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.problems import DocumentError, Fault, Path, refusal
 from experiments.file.structure import group_of, parameters
 
@@ -25,7 +25,6 @@ _SHAPES: Final = frozenset({"box", "radius", "wall"})
 SHAPE: Final = "shape"  # a link with its target from [formation.shape]
 ALONE: Final = "link"  # a link without a target
 _TARGETS: Final = frozenset({"distance", "offset", "bearing"})
-_TARGET_OF: Final = {"relative": "offset", "bearing": "bearing"}  # by what a law needs; else a distance
 _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 
@@ -147,7 +146,7 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
         if given == SHAPE or (shape is not None and isinstance(given, dict) and not _TARGETS & given.keys())
     ]
     links.update({text: {} for text, given in links.items() if given == ALONE})
-    word = _TARGET_OF.get(_needed_target(formation.get("law", _DEFAULTS.formation.law)), "distance")
+    word = TARGET_KINDS[_needed_target(formation.get("law", _DEFAULTS.formation.law))].fields[0]
     for text in bare:
         try:
             target = _target_in(shape or {}, document.get("robots"), text, word)
@@ -172,7 +171,7 @@ class _NoPlace(ValueError):
     """A link between robots without places; message and remedy."""
 
 
-def _needed_target(law: object) -> str:
+def _needed_target(law: object) -> Need:
     """Target that a law needs of every link; "any" if no such law is installed."""
     name = law.get("kind") if isinstance(law, Mapping) else law
     if not isinstance(name, str):

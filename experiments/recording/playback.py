@@ -283,7 +283,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         ),
         interventions=counted("interventions"),
         avoided=counted("avoided"),
-        contacts=contacts if contacts_watched(contacts, world) else None,
+        contacts=contacts if contacts_watched(contacts, world, plan) else None,
         world=world,
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),

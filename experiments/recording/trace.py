@@ -12,7 +12,6 @@ import numpy as np
 
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
-from agents.plugins import registry
 from experiments.arrays import PoseTable
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
@@ -26,15 +25,6 @@ WALL: Final = "wall"  # of the arena, in contacts
 M = TypeVar("M", Contact, WorldState)
 
 
-def finds_contacts(engine: str | Mapping[str, object]) -> bool:
-    """Whether an engine declares that it finds contacts, see `twins.engines.engine.EngineFactory`."""
-    try:
-        factory = registry.struct(registry.ENGINES, registry.split(engine)[0])
-    except (registry.PluginError, msgspec.ValidationError):  # a recording is read where that engine is not installed
-        return False
-    return bool(getattr(factory, "contacts", False))  # of an engine that does not say so, none were found
-
-
 def messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M, ...]:
     """Messages of a run that began at `start` [s], in order of time, with stamps that count from there."""
     kept = [
@@ -45,9 +35,9 @@ def messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M
     return tuple(sorted(kept, key=lambda each: each.stamp))
 
 
-def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState]) -> bool:
-    """Whether contacts were watched for: there are some, or an engine that would have found them."""
-    return bool(contacts) or any(finds_contacts(engine) for engine in {report.engine for report in world})
+def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState], plan: Plan) -> bool:
+    """Whether contacts were watched for: there are some, or the engine of the world would have found them."""
+    return bool(contacts) or (plan.finds_contacts and any(report.engine == plan.engine_name for report in world))
 
 
 @dataclass(frozen=True)

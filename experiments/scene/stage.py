@@ -154,7 +154,6 @@ class Stage:
         plan = Plan(experiment)
         avoidance = _if_installed(lambda: plan.avoidance)
         formation = _if_installed(lambda: plan.formation)
-        margin = getattr(avoidance, "margin", getattr(avoidance, "clearance", 0.0))
         return cls(
             title=experiment.title,
             names=plan.names,
@@ -164,7 +163,7 @@ class Stage:
             scene=bodies.scene(experiment),
             links=links([]) if formation is None else formation.links,
             leaders=() if formation is None else plan.leaders,
-            margin=float(margin),
+            margin=0.0 if avoidance is None else avoidance.kept_gap(),
             experiment=experiment,
             plan=plan,
         )

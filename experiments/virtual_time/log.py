@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from agents.decision.lifecycle import FINISHED, Phase
 from agents.decision.stepping import Words
 from agents.network import messages
-from agents.plugins import registry
 from agents.safety.hazards import Outcome
 from experiments.arrays import PoseTable
 from experiments.definition import bodies
@@ -32,7 +31,6 @@ from experiments.recording.trace import (
     Goals,
     Trace,
     contacts_watched,
-    finds_contacts,
     in_run,
     messages_in_run,
     received_in_run,
@@ -58,7 +56,8 @@ class Logbook:
     def __init__(self, log: Log, experiment: Experiment, case: str) -> None:
         self._log, self._experiment, self._case = log, experiment, case
         self._scene = bodies.scene(experiment)
-        self._links: Links = Plan(experiment).pose_links
+        self._plan = Plan(experiment)
+        self._links: Links = self._plan.pose_links
 
     @cached_property
     def goals(self) -> Goals | None:
@@ -108,7 +107,7 @@ class Logbook:
             ),
             interventions=log.interventions,
             avoided=log.avoided,
-            contacts=contacts if contacts_watched(contacts, world) else None,
+            contacts=contacts if contacts_watched(contacts, world, self._plan) else None,
             world=world,
             dropped=self._log.lost,
             foreign=np.zeros(len(log.names), dtype=np.intp),
@@ -325,8 +324,8 @@ class Logbook:
 
     def _world(self) -> Iterator[messages.WorldState]:
         """Reports of a world at 1 Hz; none where robots are alone in an empty place."""
-        log, chosen, scene = self._log, self._experiment.world.engine, self._scene
-        if log.lean or not (scene.names or log.touches or finds_contacts(chosen)):
+        log, scene = self._log, self._scene
+        if log.lean or not (scene.names or log.touches or self._plan.finds_contacts):
             return
         touched = np.sort([contact.stamp - EPOCH for contact in self._contacts()])
         whole = np.flatnonzero(np.abs(log.time - np.round(log.time)) < 0.5 / self._experiment.rates.state_hz - 1e-9)
@@ -334,7 +333,7 @@ class Logbook:
             t = float(log.time[k])
             yield messages.WorldState(
                 stamp=EPOCH + t,
-                engine=registry.split(chosen)[0],
+                engine=self._plan.engine_name,
                 time=t - float(log.time[0]),
                 factor=1.0,
                 load=0.0,

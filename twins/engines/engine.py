@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
+
+import msgspec
 
 from agents.body.interface import NO_ATTITUDE, Attitude, BodyError
 from agents.body.kinds import Kind
@@ -170,23 +172,20 @@ class Engine(Protocol):
         ...
 
 
-class EngineFactory(Protocol):
-    """Parameters of an engine.
+class EngineFactory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of all engines: their parameters."""
 
-    The class variable `contacts = True` declares that the engine detects contacts: a run without recorded contacts then
-    had none. For other engines contacts are computed from the recorded positions. An engine with the class variable
-    `carries`, motions of `agents.body.kinds`, carries these only.
-    """
+    CONTACTS: ClassVar[bool] = False  # detects contacts; else they are computed from the recorded positions
+    CARRIES: ClassVar[tuple[type, ...]] = (object,)  # motions of `agents.body.kinds` that it moves
 
     def build(self, stage: Stage) -> Engine:
         """Build an engine; raises BodyError with the remedy if a kind has no twin, or a library is missing."""
-        ...
+        raise TypeError(f"{type(self).__name__} must define `build`")
 
 
-def require_carried(engine: type[EngineFactory], kinds: Iterable[Kind]) -> None:
+def require_carried(engine: EngineFactory, kinds: Iterable[Kind]) -> None:
     """Raises BodyError for kinds whose motion an engine does not carry."""
-    carries: tuple[type, ...] = getattr(engine, "carries", (object,))
-    if refused := sorted({kind.name for kind in kinds if not isinstance(kind.motion, carries)}):
-        known = ", ".join(motion.__name__ for motion in carries)
+    if refused := sorted({kind.name for kind in kinds if not isinstance(kind.motion, engine.CARRIES)}):
+        known = ", ".join(motion.__name__ for motion in engine.CARRIES)
         which = ", ".join(map(repr, refused))
         raise BodyError(f"{which} does not move in this engine, which carries {known} alone: choose point-mass")

@@ -11,9 +11,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -22,7 +21,7 @@ from agents.body.kinds import Kind
 from agents.vectors import ZERO, Vector
 from twins.arrays import Array, Index, Mask, clamp, norm, some
 from twins.engines.crazyflie_cascade import RATE_HZ, Firmware
-from twins.engines.engine import Mirrored, Planar, Pose, Stage, Touch
+from twins.engines.engine import EngineFactory, Mirrored, Planar, Pose, Stage, Touch
 from twins.engines.mujoco_model import mjcf
 from twins.engines.point_mass import Moving, Orders, model, require_models
 from twins.models.onboard_flight import OnboardFlight
@@ -39,10 +38,8 @@ FULL_STATE: Final = 18  # time, then:
 PLACE, TURN, SPEED, SPIN, LIFT = slice(1, 4), slice(4, 8), slice(8, 11), slice(11, 14), slice(14, 18)
 
 
-class RigidBody(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RigidBody(EngineFactory, frozen=True):
     """Parameters of the MuJoCo engine."""
-
-    contacts: ClassVar[bool] = False
 
     motor_lag_s: Annotated[float, Meta(ge=0.01, le=0.1, description="time constant of a motor's thrust [s]")] = 0.03
 

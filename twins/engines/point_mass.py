@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, ClassVar, Final, Generic, TypeVar
-
-import msgspec
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from agents.body.interface import BodyError
 from agents.body.kinds import Flight, Holonomic, Kind, Steered, Wheels
 from agents.plugins import registry
 from agents.vectors import Setpoint, Vector
-from twins.engines.engine import Mirrored, Motion, Planar, Pose, Stage, Touch
+from twins.engines.engine import EngineFactory, Mirrored, Motion, Planar, Pose, Stage, Touch
 from twins.models.differential import Differential
 from twins.models.ground import Bicycle, Ground, Omni
 from twins.models.quadrotor import Quadrotor
@@ -22,10 +20,8 @@ if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
 Moving = Quadrotor | Differential | Ground | Mirrored
 
 
-class PointMass(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PointMass(EngineFactory, frozen=True):
     """The point-mass engine has no parameters."""
-
-    contacts: ClassVar[bool] = False
 
     def build(self, stage: Stage) -> PointMassEngine:
         return PointMassEngine(moving_models(stage), stage.dt, stage.scene)

@@ -7,14 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Final
 
-import msgspec
 import pymunk
 import pymunk.batch
 from msgspec import Meta
 
 from agents.body.kinds import Flight, Kind, Wheels
 from agents.vectors import Share, Vector, clamp, is_finite
-from twins.engines.engine import Mirrored, Pose, Stage, Touch, require_carried
+from twins.engines.engine import EngineFactory, Mirrored, Pose, Stage, Touch, require_carried
 from twins.engines.engine import Planar as Displacement
 from twins.engines.point_mass import Moving, Orders, moving_models, require_models
 from twins.engines.pymunk_contacts import Contacts, Layers
@@ -39,7 +38,7 @@ LEAP: Final = 10.0  # [m/s] faster motion of a plan is a jump
 Friction = Annotated[float, Meta(ge=0, le=10)]
 
 
-class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Planar(EngineFactory, frozen=True):
     """Parameters of the pymunk engine; all are chosen for plastic hulls and rubber wheels."""
 
     step_s: Annotated[float, Meta(gt=0, le=0.05, description="longest internal step [s]")] = 0.005
@@ -54,8 +53,8 @@ class Planar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     approach: Annotated[float, Meta(gt=0, le=20, description="closing speed up to which nothing overlaps [m/s]")] = 3.0
     iterations: Annotated[int, Meta(ge=1, le=200, description="of the contact solver in each step")] = 10
 
-    contacts: ClassVar[bool] = True
-    carries: ClassVar[tuple[type, ...]] = (Wheels, Flight)
+    CONTACTS: ClassVar[bool] = True
+    CARRIES: ClassVar[tuple[type, ...]] = (Wheels, Flight)
 
     def build(self, stage: Stage) -> PlanarEngine:
         return PlanarEngine(stage, self)
@@ -73,7 +72,7 @@ class PlanarEngine(Orders[Moving]):
     def __init__(self, stage: Stage, choice: Planar) -> None:
         """Raises BodyError for a kind without a twin, or with a motion that is not carried."""
         require_models(stage.kinds)
-        require_carried(Planar, itertools.compress(stage.kinds, (not each for each in stage.mirrored)))
+        require_carried(choice, itertools.compress(stage.kinds, (not each for each in stage.mirrored)))
         self.motions = moving_models(stage)
         self._dt, self.steps = stage.dt, max(1, math.ceil(stage.dt / choice.step_s - 1e-9))
         self._step = stage.dt / self.steps

@@ -6,7 +6,7 @@ import pytest
 
 from agents.body import fleet
 from agents.body.fleet import Fleet, assemble
-from agents.body.interface import BodyError, BodyState, inspect
+from agents.body.interface import Body, BodyError, BodyState
 from agents.network.messages import Inspection
 from agents.plugins import registry
 from experiments.definition import bodies
@@ -14,7 +14,7 @@ from experiments.definition.experiment import Experiment, Robot
 from twins.body import TwinBody
 
 
-class Recorded:
+class Recorded(Body):
     """A body that writes down what it is told; its state tells its rows apart."""
 
     def __init__(self, label, rows, *, broken=False):
@@ -150,4 +150,4 @@ class Told(Recorded):
 
 def test_rows_are_inspected_by_their_bodies():
     both = Fleet([((0, 2), Told(7.0, 2)), ((1,), Recorded(1.0, 1))])
-    assert [inspect(both, row) for row in range(3)] == [Inspection("7.0"), Inspection(), Inspection("7.1")]
+    assert [both.inspect(row) for row in range(3)] == [Inspection("7.0"), Inspection(), Inspection("7.1")]

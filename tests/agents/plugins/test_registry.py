@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+from agents.body.interface import Body
 from agents.plugins import registry
+from agents.plugins.law import Law
 from agents.plugins.registry import AVOIDANCES, BODIES, LAWS, PLANNERS, PREDICTORS, TRIGGERS
 
 GROUPS = (BODIES, TRIGGERS, PREDICTORS, LAWS, PLANNERS, AVOIDANCES)
@@ -26,6 +28,18 @@ class Keeper(msgspec.Struct, dict=True):
     width: float = 1.0
 
 
+class Glider(Body):
+    def read(self, t):
+        return []
+
+    def stop(self, rows):
+        pass
+
+
+class Pairs(Law, frozen=True):
+    NEEDS = "pairs"
+
+
 @pytest.fixture
 def foreign(monkeypatch):
     """A group of plug-ins as a stranger's distribution would register it."""
@@ -36,6 +50,8 @@ def foreign(monkeypatch):
         "misnamed": EntryPoint("misnamed", f"{here}:Puls", "test"),
         "function": EntryPoint("function", f"{here}:foreign", "test"),
         "keeper": EntryPoint("keeper", f"{here}:Keeper", "test"),
+        "glider": EntryPoint("glider", f"{here}:Glider", "test"),
+        "pairs": EntryPoint("pairs", f"{here}:Pairs", "test"),
     }
     listed = [
         *entries.values(),
@@ -149,13 +165,25 @@ def test_did_you_mean(word, known, answer):
     assert registry.did_you_mean(word, known) == answer
 
 
-@pytest.mark.parametrize(
-    ("group", "base"), [(LAWS, "law.Law"), (TRIGGERS, "triggers.Trigger"), (PREDICTORS, "predictors.Predictor")]
-)
+@pytest.mark.parametrize("group", registry.BASES)
+@pytest.mark.parametrize("name", ["pulse", "function"])
 @pytest.mark.usefixtures("foreign")
-def test_plug_in_inherits_from_its_base(group, base):
-    with pytest.raises(registry.PluginError, match=rf"'pulse' .* must inherit from agents\.plugins\.{base}"):
-        registry.build(group, {"kind": "pulse", "width": 1.0})
+def test_plug_in_inherits_from_its_base(group, name):
+    base = registry.BASES[group].replace(":", ".")
+    with pytest.raises(registry.PluginError, match=rf"'{name}' .* must be a class that inherits from {base}"):
+        registry.load(group, name)
+
+
+@pytest.mark.usefixtures("foreign")
+def test_incomplete_body_names_missing_methods():
+    with pytest.raises(registry.PluginError, match=r"'glider' .* lacks the methods close, command, land, locate, open"):
+        registry.load(BODIES, "glider")
+
+
+@pytest.mark.usefixtures("foreign")
+def test_unknown_class_variable_is_refused():
+    with pytest.raises(registry.PluginError, match=r"'pairs' .*: NEEDS = 'pairs' is none of \('distance', 'relative'"):
+        registry.struct(LAWS, "pairs")
 
 
 def test_ambiguous_name_is_refused(foreign):

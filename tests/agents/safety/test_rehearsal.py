@@ -8,7 +8,7 @@ import pytest
 
 from agents.decision.lifecycle import READY
 from agents.plugins.laws import Distance
-from agents.plugins.planners import Leg, Parameters
+from agents.plugins.planners import Leg, Planner
 from agents.plugins.predictors import Predictor
 from agents.plugins.registry import PluginError
 from agents.plugins.triggers import Trigger
@@ -33,7 +33,7 @@ class Pull(Distance, frozen=True):
         return self.answer
 
 
-class Way(Parameters, frozen=True):
+class Way(Planner, frozen=True):
     answer: object = None
 
     def target(self, elapsed, anchor, heading):

@@ -70,7 +70,9 @@ def test_keys_come_from_the_seed_and_the_names():
 
 
 def wrong(channel, **parts):
-    return [(".".join(map(str, f.path)), f.message, f.hint) for f in consistency.faults(experiment(channel, **parts))]
+    return [
+        (".".join(map(str, f.path)), f.message, f.hint) for f in consistency.faults(Plan(experiment(channel, **parts)))
+    ]
 
 
 @pytest.mark.parametrize(

@@ -58,12 +58,12 @@ def experiment(**more: Any) -> Experiment:
     ],
 )  # fmt: skip
 def test_reserves_that_nobody_could_call_upon(change: dict[str, object], path: tuple[str, ...], said: str) -> None:
-    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in consistency.faults(experiment(**change))]
+    found = [(fault.path, f"{fault.message}; {fault.hint}") for fault in consistency.faults(Plan(experiment(**change)))]
     assert any(where == path and said in what for where, what in found), found
 
 
 def test_what_is_right_is_not_complained_of() -> None:
-    assert not list(consistency.faults(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace")))
+    assert not list(consistency.faults(Plan(experiment(spares={"S": FLY, "T": BOT}, on_loss="replace"))))
 
 
 def test_without_those_on_standby_nothing_names_them() -> None:
@@ -82,7 +82,7 @@ def test_without_those_on_standby_nothing_names_them() -> None:
     assert list(made.channel.links) == ["A > B"]
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
-    assert not list(consistency.faults(made))
+    assert not list(consistency.faults(Plan(made)))
     assert reserves.without_standby(made) is made
 
 

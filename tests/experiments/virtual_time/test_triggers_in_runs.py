@@ -69,7 +69,7 @@ def updating(park, update):
 def test_triggers_where_they_make_no_sense_are_refused(park, change, path, message, hint):
     rest = {key: value for key, value in change.items() if key != "update"}
     wrong = changed(updating(park, change.get("update")), **rest)
-    (fault,) = consistency.faults(wrong)
+    (fault,) = consistency.faults(Plan(wrong))
     assert fault.path == path
     assert message in fault.message
     assert hint in fault.hint
@@ -87,7 +87,7 @@ def test_triggers_where_they_make_no_sense_are_refused(park, change, path, messa
 )
 def test_triggers_where_they_make_sense_are_not(park, change):
     rest = {key: value for key, value in change.items() if key != "update"}
-    assert not list(consistency.faults(changed(updating(park, change.get("update")), **rest)))
+    assert not list(consistency.faults(Plan(changed(updating(park, change.get("update")), **rest))))
 
 
 # ---------------------------------------------------------------- what is sent, believed and counted
