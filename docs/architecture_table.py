@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 
-from experiments.definition.experiment import Channel, Experiment
+from experiments.definition.experiment import Channel
 from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.sweep.runs import RunMetrics, run_metrics
@@ -29,16 +28,16 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-def flown(experiment: Experiment, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, float, float]:
+def flown(plan: Plan, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, float, float]:
     """Metrics of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
-    listeners = np.bincount(Plan(experiment).pose_links.sender, minlength=len(experiment.robots))
+    listeners = np.bincount(plan.pose_links.sender, minlength=len(plan.names))
     found: list[RunMetrics] = []
     messages, deliveries, delay = [], [], []
     for seed in seeds:
-        log = simulation.simulate(experiment, seed, lean=True)
-        book, time = Logbook(log, experiment, ""), log.sent.stamp
+        log = simulation.simulate(plan, seed, lean=True)
+        book, time = Logbook(log, plan, ""), log.sent.stamp
         found.append(run_metrics(book.trace()))
-        within = (time >= -1e-9) & (time < experiment.duration_s - 1e-9)
+        within = (time >= -1e-9) & (time < plan.experiment.duration_s - 1e-9)
         sent = np.bincount(log.sent.link[within], minlength=len(log.names))
         told, received = 0, 0
         if (seen := book.goals) is not None:
@@ -68,8 +67,8 @@ def main() -> None:
         first: list[RunMetrics] | None = None
         for delay_s in DELAYS_S:
             for who, case in cases.items():
-                experiment = msgspec.structs.replace(case, trigger=trigger, channel=Channel(delay_s=delay_s))
-                runs, messages, deliveries, late = flown(experiment, seeds)
+                plan = case.changed(trigger=trigger, channel=Channel(delay_s=delay_s))
+                runs, messages, deliveries, late = flown(plan, seeds)
                 first = first or runs
                 ratio = {what: mean(runs, what) / mean(first, what) for what in ("iae", "itae")}
                 formed = sum(run.values["acquired_s"] is not None for run in runs)

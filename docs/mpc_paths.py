@@ -19,10 +19,10 @@ SECONDS = (0.0, 2.0, 3.5, 8.0)  # of the panels
 
 def main() -> None:
     """Ways so far, and what the robots say of the next 3 s."""
-    experiment = document.read(index.find_file("mpc"), []).cases()["periodic"]
-    trace = Logbook(simulate(experiment, experiment.seed), experiment, "periodic").trace()
-    plans = trace.memory["path"].reshape(len(trace.time), len(experiment.robots), -1, 2)
-    colours = mpl.colormaps["turbo"](np.linspace(0.05, 0.95, len(experiment.robots)))
+    plan = document.read(index.find_file("mpc"), []).cases()["periodic"]
+    trace = Logbook(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
+    plans = trace.memory["path"].reshape(len(trace.time), len(plan.names), -1, 2)
+    colours = mpl.colormaps["turbo"](np.linspace(0.05, 0.95, len(plan.names)))
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 2.1), layout="constrained")
         for axes, seconds in zip(figure.subplots(1, len(SECONDS), sharey=True), SECONDS, strict=True):

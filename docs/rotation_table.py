@@ -50,7 +50,7 @@ def measured(name: str, experiment: Experiment) -> Row:
     plan, rate, error, messages = Plan(experiment), [], [], []
     follow = [row for row, each in enumerate(plan.names) if each != experiment.formation.leader]
     for seed in SEEDS:
-        log = simulation.simulate(experiment, seed)
+        log = simulation.simulate(plan, seed)
         late = (log.time >= SETTLED_S) & (log.time < experiment.duration_s)
         position, time = log.true_position[late], log.time[late]
         rate.append(1e3 * (net_rotation(position[:, follow], time) or 0.0))
@@ -112,7 +112,7 @@ def table() -> Iterator[Row]:
     yield measured("… dead zone 1 cm", by_law(five, DEAD))
     park = document.read("robotic-park").cases()
     for name, case in (("periodic", park["periodic"]), ("send-on-delta 1 cm", park["event"])):
-        alone = changed(case, timeline=[], duration_s=DURATION_S)
+        alone = changed(case.experiment, timeline=[], duration_s=DURATION_S)
         yield measured(f"reference, {name}", alone)
         yield measured("… dead zone 1 cm", by_law(alone, DEAD))
         yield measured(f"reference, ± 1 cm, {name}", disagreeing(alone, 0.01))

@@ -14,7 +14,8 @@ from typing import Any, Final
 
 import msgspec
 
-from experiments.definition.experiment import Channel, Experiment
+from experiments.definition.experiment import Channel
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.metrics import measure
 from experiments.metrics.results import CaseMetrics
@@ -52,10 +53,10 @@ UPDATES: Final[dict[str, dict[str, Any] | None]] = {
 }
 
 
-def measured(experiment: Experiment, seeds: Sequence[int]) -> list[CaseMetrics]:
+def measured(plan: Plan, seeds: Sequence[int]) -> list[CaseMetrics]:
     """The metrics of each seed."""
-    logs = (simulation.simulate(experiment, seed) for seed in seeds)
-    return [measure.measure(Logbook(log, experiment, "").trace()) for log in logs]
+    logs = (simulation.simulate(plan, seed) for seed in seeds)
+    return [measure.measure(Logbook(log, plan, "").trace()) for log in logs]
 
 
 def mean(cases: Sequence[CaseMetrics], index: str) -> float:
@@ -79,15 +80,15 @@ def written(choice: dict[str, Any] | None) -> str:
     return ", ".join(f"`{key} = {value}`" for key, value in parts.items())
 
 
-def communication(base: Experiment, seeds: Sequence[int]) -> None:
+def communication(base: Plan, seeds: Sequence[int]) -> None:
     """Who speaks when, on a good network and on a bad one."""
     print("| trigger | with | f [Hz] | saved | IAE | ITAE | belief | shortest | formed | IAE, bad | formed, bad |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
-    reference = measured(msgspec.structs.replace(base, trigger=MATCHED["periodic"]), seeds)
+    reference = measured(base.changed(trigger=MATCHED["periodic"]), seeds)
     f, iae, itae = (mean(reference, index) for index in ("f_hz", "iae", "itae"))
     for name, trigger in MATCHED.items():
-        good = measured(case := msgspec.structs.replace(base, trigger=trigger), seeds)
-        bad = measured(msgspec.structs.replace(case, channel=BAD), seeds)
+        good = measured(case := base.changed(trigger=trigger), seeds)
+        bad = measured(case.changed(channel=BAD), seeds)
         belief = 1e3 * fmean(each.belief_rms or 0.0 for each in good)
         print(
             f"| {name} | {written(trigger)} | {mean(good, 'f_hz'):.2f} | {100 * (1 - mean(good, 'f_hz') / f):.1f} % "
@@ -97,16 +98,16 @@ def communication(base: Experiment, seeds: Sequence[int]) -> None:
         )
 
 
-def control(base: Experiment, seeds: Sequence[int]) -> None:
+def control(base: Plan, seeds: Sequence[int]) -> None:
     """When the law is computed, with the chosen trigger for the messages."""
     print("| update | with | computed | f [Hz] | IAE | ITAE | J2 | formed |")
     print("|---|---|---|---|---|---|---|---|")
-    base = msgspec.structs.replace(base, trigger=CHOSEN)
+    base = base.changed(trigger=CHOSEN)
     reference = measured(base, seeds)
     iae, itae, j2 = mean(reference, "iae"), mean(reference, "itae"), fmean(case.j2 for case in reference)
     for name, update in UPDATES.items():
-        formation = msgspec.structs.replace(base.formation, update=update)
-        cases = measured(msgspec.structs.replace(base, formation=formation), seeds)
+        formation = msgspec.structs.replace(base.experiment.formation, update=update)
+        cases = measured(base.changed(formation=formation), seeds)
         followers = [robot for case in cases for robot in case.robots if robot.robot not in case.leaders]
         print(
             f"| {name} | {written(update)} | {fmean(robot.updates for robot in followers):.0f} "

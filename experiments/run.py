@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from agents.errors import ExplainedError
 from experiments.cores import KILLED, cores, pool
 from experiments.definition import standby
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
@@ -132,7 +132,7 @@ def _column(values: Sequence[Any]) -> list[Any]:
 
 
 Progress = Callable[[str, int, int], None]  # case, simulated seconds, seconds in all
-Watch = Callable[[str, Experiment], Callable[[simulation.Instant], object] | None]  # of a case
+Watch = Callable[[str, Plan], Callable[[simulation.Instant], object] | None]  # of a case
 
 
 def simulate(
@@ -167,7 +167,7 @@ def simulate_seeds(
     `progress` is called repeatedly. `watch` gives for each case what the simulation of the first seed calls, see
     `simulation.simulate`.
     """
-    _refuse_too_much(read.experiment, len(seeds))
+    _refuse_too_much(read.plan, len(seeds))
     folder = None if folder is None else Path(folder)
     if folder is not None:
         with suppress(OSError):  # the recording says so
@@ -182,19 +182,20 @@ def simulate_seeds(
             if processes is None
             else {(name, seed): processes.submit(_flown, name, works[name], seed) for name in works for seed in others}
         )
-        for name, experiment in works.items():
-            passing = partial(_pass_progress, progress, name, experiment.duration_s)
-            log = simulation.simulate(experiment, first, progress=passing, watch=watch(name, experiment))
-            logbook = Logbook(log, experiment, name)
+        for name, plan in works.items():
+            duration_s = plan.experiment.duration_s
+            passing = partial(_pass_progress, progress, name, duration_s)
+            log = simulation.simulate(plan, first, progress=passing, watch=watch(name, plan))
+            logbook = Logbook(log, plan, name)
             traces[0][name] = logbook.trace()
             metrics[0][name] = measure.measure(traces[0][name])
             if folder is not None:
                 logbook.record(folder / f"{name}.mcap", read.text)
             for k, seed in enumerate(others, 1):
                 future = shared.get((name, seed))
-                found = _flown(name, experiment, seed, passing) if future is None else _result(future)
+                found = _flown(name, plan, seed, passing) if future is None else _result(future)
                 traces[k][name], metrics[k][name] = found
-                passing(experiment.duration_s * (k + 1) / len(seeds))
+                passing(duration_s * (k + 1) / len(seeds))
             passing(math.inf)
     title, text = read.experiment.title, read.listing
     return [
@@ -206,9 +207,9 @@ def simulate_seeds(
 Flown = tuple[Trace, CaseMetrics]
 
 
-def _flown(name: str, experiment: Experiment, seed: int, progress: Callable[[float], object] = lambda _: None) -> Flown:
+def _flown(name: str, plan: Plan, seed: int, progress: Callable[[float], object] = lambda _: None) -> Flown:
     """Trace and metrics of a run of a case."""
-    trace = Logbook(simulation.simulate(experiment, seed, progress=progress), experiment, name).trace()
+    trace = Logbook(simulation.simulate(plan, seed, progress=progress), plan, name).trace()
     return trace, measure.measure(trace)
 
 
@@ -221,9 +222,9 @@ def _result(future: Future[Flown]) -> Flown:
 
 
 @contextmanager
-def _processes(works: Mapping[str, Experiment], seeds: int) -> Iterator[ProcessPoolExecutor | None]:
+def _processes(works: Mapping[str, Plan], seeds: int) -> Iterator[ProcessPoolExecutor | None]:
     """Processes for so many more seeds of these cases, None where to begin them would take longer."""
-    ticks = sum(case.duration_s * case.rates.body_hz * len(case.robots) for case in works.values())
+    ticks = sum(plan.experiment.duration_s * plan.experiment.rates.body_hz * len(plan.names) for plan in works.values())
     count = min(cores(), len(works) * seeds)
     if count < 2 or seeds * ticks < SHARED:
         yield None
@@ -232,8 +233,9 @@ def _processes(works: Mapping[str, Experiment], seeds: int) -> Iterator[ProcessP
         yield processes
 
 
-def _refuse_too_much(experiment: Experiment, seeds: int) -> None:
+def _refuse_too_much(plan: Plan, seeds: int) -> None:
     """Raises DocumentError for a run in virtual time that no memory holds."""
+    experiment = plan.experiment
     samples = experiment.duration_s * experiment.rates.state_hz * len(experiment.robots) * seeds
     if samples > MOST_SAMPLES:
         message = f"a run in virtual time of {samples:.2g} samples; {MOST_SAMPLES:.0e} fit into memory"
@@ -326,7 +328,7 @@ def read_back(folder: Path, recordings: Mapping[str, Path], notes: Sequence[str]
     source = folder / SOURCE
     arenas = sorted(set(folder.glob("*.toml")) - {source}) if source.exists() else []
     text = document.join_texts([file.read_text("utf-8") for file in [source, *arenas]]) if source.exists() else ""
-    title = next((trace.experiment.title for trace in traces.values()), "")
+    title = next((trace.plan.experiment.title for trace in traces.values()), "")
     run = _measured(title, traces, folder, text, remarks)
     told = {
         case: [each.removeprefix(f"{case}: ") for each in failures if each.startswith(f"{case}: ")] for case in traces

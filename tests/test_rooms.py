@@ -190,3 +190,42 @@ def test_every_folder_says_what_lives_there_and_imports_no_more_than_it_says():
         beyond += [f"{name} imports {to}" for name, to in sorted(others) if not f"{to}.".startswith(may)]
     assert not silent, "each __init__.py is a docstring: what lives there, and its last lines 'May import: ...'"
     assert not beyond, "the folder's __init__.py does not name that"
+
+
+# where an experiment is read and compiled: all others get a plan
+SEES_EXPERIMENTS = ("experiments.definition", "experiments.file", "experiments.authoring")
+COMPILES = {"experiments.definition.plan", "experiments.file.document"}
+CHOOSES_PLUGINS = {
+    "experiments.definition.plan",
+    "experiments.file.structure",  # structs of parameters, for the check of types
+    "experiments.metrics.metric",
+    "twins.body",  # the engine of a world
+}
+
+
+@cache
+def tree(name: str) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(modules()[name].read_text("utf-8"))))
+
+
+def calls(name: str) -> set[str]:
+    """Dotted names of what a module calls."""
+    called = (node.func for node in tree(name) if isinstance(node, ast.Call))
+    return {ast.unparse(each) for each in called if isinstance(each, ast.Name | ast.Attribute)}
+
+
+def sees_experiments(name: str) -> bool:
+    froms = [node for node in tree(name) if isinstance(node, ast.ImportFrom)]
+    words = {alias.name for node in froms if node.module == "experiments.definition.experiment" for alias in node.names}
+    return "Experiment" in words
+
+
+def test_experiments_are_compiled_once():
+    seen = {name for name in modules() if sees_experiments(name)}
+    assert not {name for name in seen if not name.startswith(SEES_EXPERIMENTS)}, "take a Plan"
+    assert {name for name in modules() if "Plan" in calls(name)} == COMPILES
+
+
+def test_plug_ins_are_chosen_in_one_place():
+    choosing = {"registry.build", "registry.split", "registry.struct"}
+    assert {name for name in modules() if calls(name) & choosing} == CHOOSES_PLUGINS

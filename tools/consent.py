@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from agents.network.endpoints import Endpoint
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
 from experiments.real_time.conductor.conduct import hardware
 from tools.terminal import say
@@ -22,11 +22,11 @@ def stranger(file: Path) -> bool:
     return file.exists() and file.stat().st_uid not in own
 
 
-def touched(cases: Iterable[Experiment]) -> list[str]:
+def touched(cases: Iterable[Plan]) -> list[str]:
     """Machines, devices and networks beyond this machine's own processes that a run in real time touches, in words."""
     every = list(cases)
     found = [f"device of {name}: {address}" for name, address in hardware(every).items() if address]
-    for case in every:
+    for case in (plan.experiment for plan in every):
         for name, host in case.hosts.items():
             if host.address is not None:
                 robots = ", ".join(host.robots)
@@ -44,7 +44,7 @@ def touched(cases: Iterable[Experiment]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def require(file: str, cases: Mapping[str, Experiment], *, given: bool) -> None:
+def require(file: str, cases: Mapping[str, Plan], *, given: bool) -> None:
     """Let the user agree to what a run in real time touches, which is named; nothing is asked where that is nothing.
 
     Args:

@@ -103,17 +103,22 @@ def load(group: str, name: str) -> Any:  # noqa: ANN401 - what it is depends on 
 
 def _fitting(group: str, name: str, plugin: Any) -> Any:  # noqa: ANN401 - likewise
     """The plug-in, if it is a class as the base of its group asks; else raises PluginError."""
-    if group not in BASES:
-        return plugin
-    origin, base = _origin_of(group, name), find(BASES[group], f"base of the {group.rpartition('.')[2]}")
-    if not (isinstance(plugin, type) and issubclass(plugin, base)):
-        raise PluginError(f"{origin} must be a class that inherits from {BASES[group].replace(':', '.')}")
-    if missing := [each for each in dir(plugin) if getattr(getattr(plugin, each), "__isabstractmethod__", False)]:
-        raise PluginError(f"{origin} lacks the methods {', '.join(missing)}")
-    for variable, allowed in _literals(base).items():
-        if (value := getattr(plugin, variable)) not in allowed:
-            raise PluginError(f"{origin}: {variable} = {value!r} is none of {allowed}")
+    if group in BASES and (fault := _fault_of(plugin, BASES[group])):
+        raise PluginError(f"{_origin_of(group, name)} {fault}")
     return plugin
+
+
+def _fault_of(plugin: Any, path: str) -> str:  # noqa: ANN401 - likewise
+    """What a plug-in lacks of the base at a `path`, `module:name`; empty for one that lacks nothing."""
+    base = find(path, "base of a plug-in")
+    if not (isinstance(plugin, type) and issubclass(plugin, base)):
+        return f"must be a class that inherits from {path.replace(':', '.')}"
+    if missing := [name for name in dir(plugin) if getattr(getattr(plugin, name), "__isabstractmethod__", False)]:
+        return f"lacks the methods {', '.join(missing)}"
+    values = ((name, getattr(plugin, name), allowed) for name, allowed in _literals(base).items())
+    return next(
+        (f"says {name} = {value!r}, none of {allowed}" for name, value, allowed in values if value not in allowed), ""
+    )
 
 
 def _in_file(name: str) -> Any:  # noqa: ANN401 - likewise

@@ -30,8 +30,7 @@ from experiments.check.realisation import (
     unfold_distances,
 )
 from experiments.check.stability import Modes, modes
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment, Link
+from experiments.definition.experiment import Link
 from experiments.definition.formation import (
     Anchored,
     Pattern,
@@ -82,10 +81,6 @@ class Analysis:
     scene: Scene  # what stands in the arena
 
     @property
-    def experiment(self) -> Experiment:
-        return self.plan.experiment
-
-    @property
     def pattern(self) -> Pattern:
         return self.plan.formation
 
@@ -115,7 +110,7 @@ class Analysis:
     @property
     def height(self) -> Array:
         """(N,) that each robot holds [m]: 0 on wheels."""
-        return np.array([held_height(self.experiment, name) for name in self.names])
+        return np.array([held_height(self.plan.experiment, name) for name in self.names])
 
     @property
     def limits(self) -> Limits:
@@ -135,19 +130,19 @@ class Analysis:
     @property
     def pull(self) -> Array:
         """(N,) the speed at which each robot follows a goal that is a full clamp away [m/s]."""
-        hz = self.experiment.rates.coordination_hz
-        return np.minimum(self.speed, closed_shares(self.kinds, hz) * self.experiment.formation.clamp * hz)
+        hz = self.plan.experiment.rates.coordination_hz
+        return np.minimum(self.speed, closed_shares(self.kinds, hz) * self.plan.experiment.formation.clamp * hz)
 
     @property
     def legs(self) -> list[tuple[int, str, Planner]]:
         """Number in the timeline, robot and planner of each leg."""
         built = {name: iter(legs) for name, legs in self.plan.legs_by_robot.items()}
-        return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.experiment.timeline)]
+        return [(k, leg.robot, next(built[leg.robot]).planner) for k, leg in enumerate(self.plan.experiment.timeline)]
 
     @property
     def departure(self) -> float:
         """Time of the first moving leg or the first change of shape after the start [s]; infinity without either."""
-        timeline = self.experiment.timeline
+        timeline = self.plan.experiment.timeline
         leaves = [timeline[k].at_s for k, _, plan in self.legs if plan.speed() > 0]
         return min((at for at in (*leaves, *(each.at for each in self.pattern.changes)) if at > 0), default=math.inf)
 
@@ -166,7 +161,7 @@ class Analysis:
     @property
     def mean_error(self) -> Array:
         """(T, E) of each link over the last `WINDOW_S` [m]."""
-        window = max(1, round(WINDOW_S * self.experiment.rates.coordination_hz))
+        window = max(1, round(WINDOW_S * self.plan.experiment.rates.coordination_hz))
         return moving_mean(self.error, window)
 
     @property
@@ -202,13 +197,13 @@ class Analysis:
             return None
         time = self.prediction.time
         worst = self.mean_error[time <= until + 1e-9].max(axis=1, initial=0.0)[:, None]
-        return after_last(worst > self.experiment.tolerance + FORGIVEN, time)[0] if len(worst) else None
+        return after_last(worst > self.plan.experiment.tolerance + FORGIVEN, time)[0] if len(worst) else None
 
     def stopped(self, at: int) -> Index:
         """Robots on wheels that stand at sample `at`, because their goals are too near to drive to."""
         at %= len(self.prediction.time)
         time, position, pattern = self.prediction.time, self.prediction.position, self.pattern
-        links, hz = pattern.at(float(time[at])), self.experiment.rates.coordination_hz
+        links, hz = pattern.at(float(time[at])), self.plan.experiment.rates.coordination_hz
         there, here = pattern.present(time[at : at + 1], position[at : at + 1]), position[at]
         links = links if there is None else links.take(there[0])
         offset = law_offsets(self.law, here, here[links.sender], links) + anchor_offsets(self.anchors, here)
@@ -230,7 +225,7 @@ class Analysis:
         wanted = self.links.receiver[number], self.links.sender[number]
         ends = tuple(self.names[row] for row in wanted)
         return next(
-            (("formation", "links", text) for text in self.experiment.formation.links if ends in link_pairs(text)),
+            (("formation", "links", text) for text in self.plan.experiment.formation.links if ends in link_pairs(text)),
             ("formation", "links"),
         )
 
@@ -244,7 +239,7 @@ class Analysis:
         place = dict(zip(self.names, np.round(self.shape.position, 5), strict=True))
         return {
             text: _fitting(given if isinstance(given, Link) else Link(distance=given), *link_pairs(text)[0], place)
-            for text, given in self.experiment.formation.links.items()
+            for text, given in self.plan.experiment.formation.links.items()
         }
 
 
@@ -263,13 +258,12 @@ def _fitting(given: Link, second: str, first: str, place: Mapping[str, Array]) -
     return msgspec.structs.replace(given, bearing=np.round(offset[:count] / norm(offset[:count]), 4).tolist())
 
 
-def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
+def analyse(plan: Plan, prediction: Prediction) -> Analysis:
     """Analysis of one case with this predicted motion."""
-    names = tuple(experiment.robots)
-    plan = Plan(experiment)
+    experiment, names = plan.experiment, plan.names
     law, kinds, pattern, anchors = plan.law, plan.kinds, plan.formation, plan.anchors_by_row
     links, rows, hz = pattern.links, len(names), experiment.rates.coordination_hz
-    starts, _ = bodies.start_poses(experiment, names)
+    starts, _ = plan.start_poses()
     start = np.array(starts)
     aloft = start.copy()
     aloft[:, 2] = [held_height(experiment, name) for name in names]
@@ -313,7 +307,7 @@ def analyse(experiment: Experiment, prediction: Prediction) -> Analysis:
         prediction=prediction,
         error=link_errors(law, pattern, prediction),
         anchored=anchor_errors(anchors, prediction.position),
-        scene=bodies.scene(experiment),
+        scene=plan.scene,
     )
 
 

@@ -19,8 +19,8 @@ from experiments.check.findings import FORGIVEN, MARK, NOT_RANDOM, Figures, Find
 from experiments.check.ideal_run import predict, ticking_plugins
 from experiments.check.realisation import algebraic_connectivity
 from experiments.definition import standby
-from experiments.definition.experiment import Experiment
 from experiments.definition.graph import edges
+from experiments.definition.plan import Plan
 from experiments.file.document import Document, Source, chosen
 from experiments.file.problems import Fault, Path, Place, Problem, nearest
 from experiments.virtual_time.source import is_foreign, outside
@@ -105,12 +105,12 @@ def unreadable(problem: Problem) -> Finding:
     return Finding("error", "document", problem.message, problem.hint, problem.place)
 
 
-def figures(experiment: Experiment) -> Figures:
-    return _figures(_analyses({"": experiment})[""])
+def figures(plan: Plan) -> Figures:
+    return _figures(_analyses({"": plan})[""])
 
 
 @QUIET
-def _analyses(cases: Mapping[str, Experiment]) -> dict[str, Analysis]:
+def _analyses(cases: Mapping[str, Plan]) -> dict[str, Analysis]:
     cases = {name: standby.without_standby(case) for name, case in cases.items()}
     return {name: analyse(case, predict(case)) for name, case in cases.items()}
 
@@ -151,7 +151,7 @@ def _finite(value: float) -> float | None:
 
 @QUIET
 def _figures(analysis: Analysis) -> Figures:
-    experiment = analysis.experiment
+    experiment = analysis.plan.experiment
     shape, planar, spatial, loop = analysis.shape, analysis.planar, analysis.spatial, analysis.modes
     spare = analysis.spare
     links, prediction, limits = analysis.links, analysis.prediction, analysis.limits

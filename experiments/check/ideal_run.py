@@ -18,8 +18,7 @@ import numpy as np
 
 from agents.body.kinds import Flight, Kind
 from agents.safety.hazards import Incident, Outcome
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment, World
+from experiments.definition.experiment import World
 from experiments.definition.plan import Plan
 from experiments.recording.trace import ROUNDING_S, sent_in_run
 from experiments.virtual_time import conductor, simulation, stretch
@@ -96,19 +95,19 @@ def _bearable_factor(response: Flight, hz: float) -> float:
     return low
 
 
-def has_noise(experiment: Experiment) -> bool:
+def has_noise(plan: Plan) -> bool:
     """Whether a robot is disturbed by noise."""
-    own = [bodies.disturbance(experiment, name) for name in experiment.robots]
+    own = [plan.disturbance(name) for name in plan.names]
     return any(each != each.without_noise() for each in own)
 
 
-def isolated(experiment: Experiment) -> Experiment:
+def isolated(plan: Plan) -> Plan:
     """The same without scatter, walls, obstacles, avoidance and shadows, as far as it is flown for `check`."""
+    experiment = plan.experiment
     robots = {
         name: msgspec.structs.replace(robot, shadow=None, sensors=None) for name, robot in experiment.robots.items()
     }
-    bare = msgspec.structs.replace(
-        experiment,
+    bare = plan.changed(
         title="",
         source="",
         cases={},
@@ -120,18 +119,18 @@ def isolated(experiment: Experiment) -> Experiment:
         safety=msgspec.structs.replace(experiment.safety, separation=None),
         rates=msgspec.structs.replace(experiment.rates, state_hz=experiment.rates.coordination_hz),
     )
-    rate = bare.rates.body_hz * len(robots)
-    seconds = max(1.0, math.floor(_work(bare, bare.duration_s * rate) / rate))
-    return msgspec.structs.replace(bare, duration_s=min(bare.duration_s, seconds))
+    rate = experiment.rates.body_hz * len(robots)
+    seconds = max(1.0, math.floor(_work(bare, experiment.duration_s * rate) / rate))
+    return bare.changed(duration_s=min(experiment.duration_s, seconds))
 
 
-def _work(bare: Experiment, ticks: float) -> float:
+def _work(bare: Plan, ticks: float) -> float:
     """Robot ticks that are flown of so many."""
     most = SPEED_UP * WORK
     if FLIGHTS * stretch.TICK_S * min(ticks, most) < stretch.COMPILES_S:  # to compile would take longer
         return WORK
-    flight = simulation.Flight(bare, bare.seed, quiet=True, lean=True)
-    if not stretch.possible(flight) or any(map(outside, ticking_plugins(Plan(bare)))):
+    flight = simulation.Flight(bare, bare.experiment.seed, quiet=True, lean=True)
+    if not stretch.possible(flight) or any(map(outside, ticking_plugins(bare))):
         return WORK
     stretch.WORK[0] += stretch.COMPILES_S  # the first flight is compiled as well
     return most
@@ -142,38 +141,42 @@ def ticking_plugins(plan: Plan) -> list[type]:
     return [type(each) for each in (plan.law, plan.trigger, plan.update, plan.predictor, plan.avoidance)]
 
 
-def predict(experiment: Experiment) -> Prediction:
+def predict(plan: Plan) -> Prediction:
     """Flight without noise from the common start to the end; a flight with noise at its side counts the messages."""
-    bare = isolated(experiment)
-    ideal = fly(bare, bare.seed, quiet=True)
-    if not has_noise(bare) or Plan(bare).trigger.TIMED:
-        return replace(ideal, messages_hz=ideal.transmissions / bare.duration_s)
-    noisy = fly(bare, bare.seed)
+    bare = isolated(plan)
+    seed, duration_s = bare.experiment.seed, bare.experiment.duration_s
+    ideal = fly(bare, seed, quiet=True)
+    if not has_noise(bare) or bare.trigger.TIMED:
+        return replace(ideal, messages_hz=ideal.transmissions / duration_s)
+    noisy = fly(bare, seed)
     if noisy.stuck and not ideal.stuck:  # only the noise holds the robots back
-        return replace(ideal, messages_hz=ideal.transmissions / bare.duration_s)
-    return replace(ideal, messages_hz=noisy.transmissions / bare.duration_s, noisy=noisy)
+        return replace(ideal, messages_hz=ideal.transmissions / duration_s)
+    return replace(ideal, messages_hz=noisy.transmissions / duration_s, noisy=noisy)
 
 
-def repetitions(bare: Experiment) -> int:
+def repetitions(bare: Plan) -> int:
     """Number of flights with different seeds: as many as take twice `WORK`, at most `REPETITIONS`."""
-    ticks = bare.duration_s * bare.rates.body_hz * len(bare.robots)
+    ticks = bare.experiment.duration_s * bare.experiment.rates.body_hz * len(bare.names)
     return max(1, min(REPETITIONS, int(2.0 * WORK / ticks)))
 
 
-def fly(bare: Experiment, seed: int, *, quiet: bool = False) -> Prediction:
+def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
     """Flight of what `isolated` made with a seed, `quiet`: without noise."""
+    experiment = bare.experiment
     try:
         log = simulation.simulate(bare, seed, quiet=quiet, lean=True, landing=False)
     except conductor.Stuck as stuck:
-        starts, _ = bodies.start_poses(bare, tuple(bare.robots))
+        starts, _ = bare.start_poses()
         position = np.array(starts)
-        position[:, 2] = [robot.hover or 0.0 for robot in bare.robots.values()]
+        position[:, 2] = [robot.hover or 0.0 for robot in experiment.robots.values()]
         return Prediction(np.zeros(1), position[None], transmissions=0, stuck=str(stuck))
     run = log.time >= -ROUNDING_S
     begun = (
-        (row, each) for row, each in log.incidents if each.outcome > Outcome.NONE and 0.0 <= each.time < bare.duration_s
+        (row, each)
+        for row, each in log.incidents
+        if each.outcome > Outcome.NONE and 0.0 <= each.time < experiment.duration_s
     )
-    sent = sent_in_run(log.sent, bare.duration_s)
+    sent = sent_in_run(log.sent, experiment.duration_s)
     return Prediction(log.time[run], log.true_position[run], tuple(begun), len(sent))
 
 

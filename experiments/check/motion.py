@@ -10,7 +10,6 @@ import numpy as np
 
 from agents.decision.position_control import REACHED
 from agents.formation.link import BY_DISTANCE, BY_RELATIVE
-from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.plugins.planners import Planner
 from agents.safety.hazards import Cause
@@ -54,7 +53,7 @@ def starts(analysis: Analysis) -> Iterator[Finding]:
 
 def flight(analysis: Analysis) -> Iterator[Finding]:
     """Report what stopped or disturbed the ideal run, and how much of it was flown."""
-    experiment, prediction = analysis.experiment, analysis.prediction
+    experiment, prediction = analysis.plan.experiment, analysis.prediction
     if prediction.stuck:
         message = f"the run does not begin, even undisturbed: {prediction.stuck}"
         yield Finding("error", "not-begun", message, "see what its robots wait for", ("robots",))
@@ -73,7 +72,7 @@ def flight(analysis: Analysis) -> Iterator[Finding]:
 
 def _cut(analysis: Analysis) -> bool:
     """Whether only the first part of the run was flown."""
-    experiment = analysis.experiment
+    experiment = analysis.plan.experiment
     return bool(analysis.prediction.time[-1] < experiment.duration_s - 1.0 / experiment.rates.coordination_hz)
 
 
@@ -84,7 +83,7 @@ def formation(analysis: Analysis) -> Iterator[Finding]:
 
 
 def _formation(analysis: Analysis) -> Iterator[Finding]:
-    experiment, prediction, shape = analysis.experiment, analysis.prediction, analysis.shape
+    experiment, prediction, shape = analysis.plan.experiment, analysis.prediction, analysis.shape
     last = analysis.error[-1]
     if (
         shape is None
@@ -116,10 +115,9 @@ def _formation(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("warning", "acquired-late", message, remedy, path)
     elif not prediction.transmissions and experiment.architecture == "distributed":
         moved = float(norm(prediction.position - prediction.position[0]).max())
-        kind = registry.split(experiment.trigger)[0]
         message = (
-            f"no robot transmits after its first pose: the trigger '{kind}' fires at nothing, though robots move by up "
-            f"to {moved:.2g} m, so neighbours are believed at their starts; {left} {allowed}"
+            f"no robot transmits after its first pose: the trigger '{analysis.plan.trigger_name}' fires at nothing, "
+            f"though robots move by up to {moved:.2g} m, so neighbours are believed at their starts; {left} {allowed}"
         )
         remedy = "look at the trigger's parameters: thresholds are in metres; maximum_silence_s bounds the silence"
         yield Finding("error", "silent", message, remedy, ("trigger",))
@@ -156,7 +154,7 @@ def anchors(analysis: Analysis) -> Iterator[Finding]:
         return
     last = analysis.anchored[-1]
     name, worst = analysis.names[places[int(last.argmax())][0]], 1e3 * float(last.max())
-    if worst <= 1e3 * analysis.experiment.tolerance:
+    if worst <= 1e3 * analysis.plan.experiment.tolerance:
         yield Finding(
             "note", "anchored", f"anchored robots reach their places: {name} is {worst:.0f} mm off at the end"
         )
@@ -184,7 +182,7 @@ def _on_the_wrong_side(analysis: Analysis) -> tuple[str, str] | None:
 
 def _stopped(analysis: Analysis, at: int, left: str) -> Finding | None:
     """Finding that wheeled robots which stand still at sample `at` prevent acquisition."""
-    experiment, links = analysis.experiment, analysis.pattern.links
+    experiment, links = analysis.plan.experiment, analysis.pattern.links
     off = np.flatnonzero(analysis.error[at] > experiment.tolerance)
     ends = np.union1d(links.receiver[off], links.sender[off])
     stopped = np.intersect1d(analysis.stopped(at), ends)
@@ -240,8 +238,8 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
             how = f"one is above the other then, with {each.gap:.2f} m between them, less than {CLEARANCE:g} m"
         message = f"{first} and {second} come within {each.distance:.2f} m at {each.time:.1f} s; {how}"
         path = ("robots", second, "start")
-        robots = analysis.experiment.robots
-        if analysis.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
+        robots = analysis.plan.experiment.robots
+        if analysis.plan.experiment.avoidance is None or not (robots[first].avoids or robots[second].avoids):
             remedy = "move the start of one of them" if each.gap < 0.0 else "hold heights that are farther apart"
             yield Finding("warning", "too-close", message, remedy, path)
         else:
@@ -264,7 +262,7 @@ def encounters(analysis: Analysis) -> Iterator[Finding]:
 
 def ceiling(analysis: Analysis) -> Iterator[Finding]:
     """Check that the overshoot of a take-off stays below the top of the arena."""
-    top = analysis.experiment.arena.size[2]
+    top = analysis.plan.experiment.arena.size[2]
     for name, kind, hover in zip(analysis.names, analysis.kinds, analysis.height.tolist(), strict=True):
         highest = (1.0 + kind.overshoot) * hover
         if kind.overshoot and highest > top + FORGIVEN:
@@ -287,7 +285,7 @@ def _first_time(analysis: Analysis, row: int, where: Mask) -> tuple[float, str]:
 def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
     name = analysis.names[row]
     time, place = _first_time(analysis, row, outside)
-    begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.experiment.timeline[k].at_s <= time]
+    begun = [k for k, robot, _ in analysis.legs if robot == name and analysis.plan.experiment.timeline[k].at_s <= time]
     message = f"{name} would leave the arena at {time:.1f} s, at {place}"
     if row in analysis.without_neighbours and begun:
         remedy = "shorten the plan, start it elsewhere, or enlarge size in [arena]"
@@ -298,7 +296,7 @@ def _left_arena(analysis: Analysis, row: int, outside: Mask) -> Finding:
 
 def speeds(analysis: Analysis) -> Iterator[Finding]:
     """Check that plans ask for no more speed than the robots have."""
-    names, timeline, problems = analysis.names, analysis.experiment.timeline, []
+    names, timeline, problems = analysis.names, analysis.plan.experiment.timeline, []
     for number, robot, plan in analysis.legs:
         row, asked, path = names.index(robot), plan.speed(), ("timeline", number, "plan")
         leads = row in analysis.without_neighbours
@@ -317,7 +315,7 @@ def speeds(analysis: Analysis) -> Iterator[Finding]:
         if has < asked:
             rates = f"follows at {has:.2g} m/s at most, {robot} leads at {asked:.2g} m/s"
             message = f"{names[analysis.follower]} {rates}: it lags, and catches up afterwards"
-            clamp = math.ceil(110.0 * analysis.experiment.formation.clamp * asked / has) / 100.0
+            clamp = math.ceil(110.0 * analysis.plan.experiment.formation.clamp * asked / has) / 100.0
             slow = asked > analysis.speed[analysis.follower]
             remedy = "lead more slowly" if slow else f"lead more slowly, or raise clamp in [formation] to {clamp:g}"
             problems.append(Finding("warning", "followers-lag", message, remedy, ("timeline", number, "plan")))
@@ -346,7 +344,7 @@ def turning(analysis: Analysis) -> Iterator[Finding]:
 
 def rates(analysis: Analysis) -> Iterator[Finding]:
     """Check the rates: trigger period against pose_hz, pose_hz against coordination_hz."""
-    rates, trigger = analysis.experiment.rates, analysis.plan.trigger
+    rates, trigger = analysis.plan.experiment.rates, analysis.plan.trigger
     asked = 1.0 / rates.pose_hz
     for field in ("period_s", "maximum_silence_s"):
         period = getattr(trigger, field, math.inf)
@@ -368,12 +366,13 @@ def rates(analysis: Analysis) -> Iterator[Finding]:
 
 def ends(analysis: Analysis) -> Iterator[Finding]:
     """Check that the last leg of each robot ends before the run."""
-    timeline, duration = analysis.experiment.timeline, analysis.experiment.duration_s
+    timeline, duration = analysis.plan.experiment.timeline, analysis.plan.experiment.duration_s
     last = {robot: (number, plan) for number, robot, plan in analysis.legs}
     for robot, (number, plan) in last.items():
         at, row = timeline[number].at_s, analysis.names.index(robot)
-        when = min(round(at * analysis.experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
-        lasts = _plan_duration(plan, analysis.prediction.position[when, row], analysis.experiment.robots[robot].start)
+        when = min(round(at * analysis.plan.experiment.rates.coordination_hz), len(analysis.prediction.time) - 1)
+        start = analysis.plan.experiment.robots[robot].start
+        lasts = _plan_duration(plan, analysis.prediction.position[when, row], start)
         if lasts is not None and at + lasts > duration * (1.0 + 1e-9) + 0.1:
             message = f"the leg of {robot} at {at:g} s lasts {lasts:.3g} s, but the run ends at {duration:g} s"
             remedy = f"give a duration_s of {math.ceil(at + lasts):g} or more, or a faster or shorter plan"

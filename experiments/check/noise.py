@@ -36,8 +36,8 @@ class Flights:
 
     @classmethod
     def of(cls, analysis: Analysis) -> Flights:
-        bare = isolated(analysis.experiment)
-        count, first = repetitions(bare), bare.seed
+        bare = isolated(analysis.plan)
+        count, first = repetitions(bare), bare.experiment.seed
         flown = [fly(bare, seed) for seed in range(first, first + count)]
         seeds = f"seed {first}" if count == 1 else f"seeds {first} to {first + count - 1}"
         return cls(tuple(analysis.flown(each) for each in flown if not each.stuck), seeds, count)
@@ -66,7 +66,7 @@ def with_noise(analysis: Analysis, finding: Finding) -> Finding:
 
     A trigger or the wheels leave robots alone whose errors are small. Noise moves them on.
     """
-    if finding.code not in WITHOUT or not has_noise(analysis.experiment):
+    if finding.code not in WITHOUT or not has_noise(analysis.plan):
         return finding
     flights = Flights.of(analysis)
     times, count = flights.acquired, flights.count
@@ -87,7 +87,7 @@ def acquired_note(analysis: Analysis, formed: float, left: str) -> Finding:
     delayed = None if analysis.noisy is None else analysis.noisy.acquired_for_good
     noisy = ""
     if delayed is not None and delayed > max(DELAYED * formed, formed + WINDOW_S):
-        noisy = f" without noise, {delayed:.1f} s with that of seed {analysis.experiment.seed}"
+        noisy = f" without noise, {delayed:.1f} s with that of seed {analysis.plan.experiment.seed}"
     return Finding("note", "acquired", f"the formation is acquired after {formed:.1f} s{noisy}; at the end {left}")
 
 
@@ -96,7 +96,7 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
 
     Flown with more seeds are those whose flight with noise beside the ideal one is late, and those that are soft.
     """
-    experiment, loop, shape = analysis.experiment, analysis.modes, analysis.shape
+    experiment, loop, shape = analysis.plan.experiment, analysis.modes, analysis.shape
     formed = analysis.acquired_for_good
     if (
         loop is None
@@ -104,7 +104,7 @@ def softness(analysis: Analysis) -> Iterator[Finding]:
         or shape.worst > FAR_OFF
         or formed is None
         or analysis.prediction.stuck
-        or not has_noise(experiment)
+        or not has_noise(analysis.plan)
     ):
         return
     soft = bool(loop.free) or SOFT * loop.slowest_s > experiment.duration_s
@@ -153,4 +153,4 @@ def _doubtful(analysis: Analysis, formed: float, late: float) -> bool:
         return found is None or found > late
     time = analysis.prediction.time
     settled = analysis.mean_error[(time >= formed) & (time <= analysis.spans_end[0] + 1e-9)]
-    return float(settled[len(settled) // 2 :].max(initial=0.0)) > NARROW * analysis.experiment.tolerance
+    return float(settled[len(settled) // 2 :].max(initial=0.0)) > NARROW * analysis.plan.experiment.tolerance

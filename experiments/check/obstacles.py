@@ -10,8 +10,7 @@ import numpy as np
 from agents.body.kinds import KINDS
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, join_names
-from experiments.definition.bodies import WORLD
-from experiments.definition.experiment import Robot
+from experiments.definition.experiment import WORLD, Robot
 from twins import scene as outlines
 from twins.arrays import Array, Index, Mask
 from twins.scene import Obstacle
@@ -38,8 +37,8 @@ def obstacles(analysis: Analysis) -> Iterator[Finding]:
     radius = np.array([kind.radius for kind in analysis.kinds])
     low, high = _heights(analysis, prediction.position[..., 2])
     poses = scene.along(prediction.time)
-    robots = analysis.experiment.robots.values()
-    avoids = np.array([robot.avoids for robot in robots]) & (analysis.experiment.avoidance is not None)
+    robots = analysis.plan.experiment.robots.values()
+    avoids = np.array([robot.avoids for robot in robots]) & (analysis.plan.experiment.avoidance is not None)
     met = []
     for number in range(len(scene.names)):
         gap = outlines.distance(scene, number, poses[:, None, number], prediction.position[..., :2]) - radius
@@ -81,7 +80,7 @@ def _met(analysis: Analysis, number: int, rows: Index, near: Mask, *, keeps: boo
 
 def contacts(analysis: Analysis) -> Iterator[Finding]:
     """Check that the engine computes the contacts for which the arena is made."""
-    experiment, scene = analysis.experiment, analysis.scene
+    experiment, scene = analysis.plan.experiment, analysis.scene
     touching = analysis.plan.finds_contacts
     for name, obstacle in experiment.arena.obstacles.items():
         if obstacle.mass is not None and not touching:
@@ -101,7 +100,7 @@ def contacts(analysis: Analysis) -> Iterator[Finding]:
 
 def perception(analysis: Analysis) -> Iterator[Finding]:
     """Check that robots with avoidance have sensors or neighbours to avoid by."""
-    experiment, scene = analysis.experiment, analysis.scene
+    experiment, scene = analysis.plan.experiment, analysis.scene
     avoidance = analysis.plan.avoidance
     if avoidance is None:
         return
@@ -126,7 +125,7 @@ def perception(analysis: Analysis) -> Iterator[Finding]:
 
 def reality(analysis: Analysis) -> Iterator[Finding]:
     """Check worlds, range sensors and shadows against the bodies of the robots."""
-    experiment, robots = analysis.experiment, analysis.experiment.robots
+    experiment, robots = analysis.plan.experiment, analysis.plan.experiment.robots
     peopled = any(robot.body == WORLD for robot in robots.values())
     bare = not (peopled or experiment.arena.obstacles or experiment.arena.walls)
     for name, robot in robots.items():

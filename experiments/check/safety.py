@@ -21,7 +21,7 @@ LISTED: Final = 12  # names
 
 def safety(analysis: Analysis) -> Iterator[Finding]:
     """Report settings of `[safety]` that contradict each other or the experiment."""
-    chosen = analysis.experiment.safety
+    chosen = analysis.plan.experiment.safety
     if chosen.battery_min < chosen.battery_low:
         message = f"robots take off at {chosen.battery_min:.0%} of charge, and land below {chosen.battery_low:.0%}"
         yield Finding("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
@@ -34,7 +34,7 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
 
 def batteries(analysis: Analysis) -> Iterator[Finding]:
     """Report all robots whose battery ends before the run, by their kinds."""
-    experiment, low = analysis.experiment, analysis.experiment.safety.battery_low
+    experiment, low = analysis.plan.experiment, analysis.plan.experiment.safety.battery_low
     if low <= 0.0:
         return
     names_of: dict[str, list[str]] = {}
@@ -88,7 +88,7 @@ def _separation(analysis: Analysis, limit: float) -> Iterator[Finding]:
 
 def libraries(analysis: Analysis) -> Iterator[Finding]:
     """Report bodies of robots of this machine whose library is missing."""
-    experiment = analysis.experiment
+    experiment = analysis.plan.experiment
     elsewhere = {name for host in experiment.hosts.values() for name in host.robots}
     for name, robot in experiment.robots.items():
         if name not in elsewhere and (library := bodies.missing_library(registry.body_name(robot.body))):
@@ -98,7 +98,7 @@ def libraries(analysis: Analysis) -> Iterator[Finding]:
 
 def devices(analysis: Analysis) -> Iterator[Finding]:
     """Report robots with the same address of a device, on one machine."""
-    experiment = analysis.experiment
+    experiment = analysis.plan.experiment
     host_of = {name: place for place, host in experiment.hosts.items() for name in host.robots}
     drivers: dict[tuple[str, str], str] = {}
     for name, robot in experiment.robots.items():
@@ -112,7 +112,7 @@ def devices(analysis: Analysis) -> Iterator[Finding]:
 
 def architecture(analysis: Analysis) -> Iterator[Finding]:
     """Describe the architecture; check the age of goals, and that the trigger suits guided robots."""
-    experiment, path = analysis.experiment, ("architecture",)
+    experiment, path = analysis.plan.experiment, ("architecture",)
     guided = analysis.plan.guided
     if not guided:
         return
@@ -129,6 +129,6 @@ def architecture(analysis: Analysis) -> Iterator[Finding]:
         remedy = "give safety.link_silence_s more than twice that, or decide more often"
         yield Finding("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
     if analysis.plan.trigger.JUDGES_ERRORS:
-        kind, _ = registry.split(experiment.trigger)
+        kind = analysis.plan.trigger_name
         message = f"the trigger '{kind}' judges by the formation error, which is 0 where the centre guides"
         yield Finding("warning", "error-unknown", message, "take another one, such as send-on-delta", ("trigger",))

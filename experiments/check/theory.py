@@ -12,7 +12,6 @@ import numpy as np
 from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
-from agents.plugins import files, registry
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
@@ -38,12 +37,12 @@ def network(analysis: Analysis) -> Iterator[Finding]:
     names, links = analysis.names, analysis.links
     path = ("formation", "links")
     if not len(links):
-        how = "goes to its anchor" if analysis.experiment.formation.anchors else "follows its own plan"
+        how = "goes to its anchor" if analysis.plan.experiment.formation.anchors else "follows its own plan"
         yield Finding("note", "no-formation", f"no links: every robot {how}, or stays where it is")
         return
     rows = len(names)
     linked = np.union1d(links.receiver, links.sender)
-    named = analysis.experiment.formation.leader
+    named = analysis.plan.experiment.formation.leader
     leaders = tuple(name for name in analysis.plan.leaders if name == named or names.index(name) in linked)
     sources = np.array([names.index(name) for name in leaders], dtype=np.intp)
     receives = np.isin(np.arange(rows), links.receiver)
@@ -59,7 +58,7 @@ def network(analysis: Analysis) -> Iterator[Finding]:
             remedy = f'add a link to one that does, such as "{leaders[0]} > {names[lost[0]]}"'
             problems.append(Finding("error", "leader-unknown", message, remedy, path))
     parts = analysis.parts - (rows - len(linked))  # robots without links go their own way
-    apart = analysis.experiment.avoidance is not None and len(leaders) >= analysis.parts
+    apart = analysis.plan.experiment.avoidance is not None and len(leaders) >= analysis.parts
     if parts > 1 and len(anchored) and reachable(links, rows, anchored)[linked].all():
         yield Finding("note", "parts", f"{parts} formations, each of which is anchored", "", path)
     elif parts > 1 and apart:
@@ -90,7 +89,7 @@ def network(analysis: Analysis) -> Iterator[Finding]:
 
 def lengths(analysis: Analysis) -> Iterator[Finding]:
     """Check that distances are no millimetres: most of them longer than the arena."""
-    distance, size = analysis.asked.distance[_measured(analysis)], np.array(analysis.experiment.arena.size)
+    distance, size = analysis.asked.distance[_measured(analysis)], np.array(analysis.plan.experiment.arena.size)
     if not len(distance) or float(np.median(distance)) <= float(norm(size)):
         return
     longest = int(np.flatnonzero(_measured(analysis))[distance.argmax()])
@@ -113,7 +112,7 @@ def realisation(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "realisable", f"{_asked(analysis)} can be met to {1e3 * shape.worst:.1f} mm")
     else:
         yield from _unrealisable(analysis, shape)
-    given = analysis.experiment.formation.changes
+    given = analysis.plan.experiment.formation.changes
     in_order = sorted(range(len(given)), key=lambda k: given[k].at_s)  # their numbers in the file
     for number, later in zip(in_order, analysis.later, strict=False):
         if later.worst > OFF and shape.worst <= OFF:
@@ -268,12 +267,12 @@ def presence(analysis: Analysis) -> Iterator[Finding]:
         yield Finding("note", "whole", message)
         return
     first = int(broken[0])
-    end = float(prediction.time[begins[first + 1]]) if first + 1 < len(begins) else analysis.experiment.duration_s
+    end = float(prediction.time[begins[first + 1]]) if first + 1 < len(begins) else analysis.plan.experiment.duration_s
     message = (
         f"the network falls into {apart[first]} parts from {prediction.time[begins[first]]:.1f} s "
         f"to {end:.1f} s, because links come and go"
     )
-    near = analysis.experiment.formation.proximity is not None
+    near = analysis.plan.experiment.formation.proximity is not None
     remedy = "start nearer to each other, or give a longer range" if near else "let links overlap in time"
     path: Path = ("formation", "proximity", "range") if near else ("formation", "links")
     yield Finding("warning", "comes-apart", message, remedy, path)
@@ -315,7 +314,7 @@ def law(analysis: Analysis) -> Iterator[Finding]:
 
 def load(analysis: Analysis) -> tuple[int, int, float]:
     """Payload of a pose with its numbers at their longest, and of what is said [bytes]; its largest rate [kbit/s]."""
-    plan, experiment = analysis.plan, analysis.experiment
+    plan, experiment = analysis.plan, analysis.plan.experiment
     name = max(analysis.names, key=len)
     said = Stepping(plan.assignment(name)).says if plan.law.SAYS else {}
     bare, whole = (
@@ -337,16 +336,15 @@ def strength(analysis: Analysis) -> str:
     double = law_offsets(law, place, place[links.sender], stronger)
     if analysis.anchors or not np.array_equal(single, double, equal_nan=True):
         return GAIN[law.PULLS_BY]
-    plugin = registry.struct(registry.LAWS, registry.split(analysis.experiment.formation.law)[0])
-    return f"the law's own parameters ({', '.join(plugin.__struct_fields__) or 'it has none yet'})"
+    return f"the law's own parameters ({', '.join(law.__struct_fields__) or 'it has none yet'})"
 
 
 def stability(analysis: Analysis) -> Iterator[Finding]:
     """Check that the sampled loop is stable near the shape."""
-    loop, shape, formation = analysis.modes, analysis.shape, analysis.experiment.formation
+    loop, shape, formation = analysis.modes, analysis.shape, analysis.plan.experiment.formation
     if loop is None or shape is None or shape.worst > FAR_OFF or next(lengths(analysis), None) is not None:
         return
-    law, choice = analysis.law, files.plain(registry.split(formation.law)[0])
+    law, choice = analysis.law, analysis.plan.law_name
     if not math.isfinite(loop.gain):
         place = shape.position
         offset = law_offsets(law, place, place[analysis.asked.sender], analysis.asked)

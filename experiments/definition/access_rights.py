@@ -15,18 +15,16 @@ from agents.network.access_control import ADMIN, Grant, Rights
 from agents.network.keys import Keys
 from agents.plugins import registry
 from agents.protocols import turtlebot3
-from experiments.definition import bodies
-from experiments.definition.bodies import VICON_TWIN
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import VICON_TWIN, WORLD, Robot
 from experiments.definition.plan import Plan
 
-FAR: Final = ("external", bodies.WORLD)  # bodies whose poses come from the process that carries them
+FAR: Final = ("external", WORLD)  # bodies whose poses come from the process that carries them
 MANY: Final = 16  # senders from which on the right is "*", if they are all robots: a router reads N² keys for minutes
 ROS: Final = ("ros2dds", "rmw")
 ROS_TWIN: Final = "turtlebot3-twin"
 
 
-def rights(cases: Iterable[Experiment]) -> Rights:
+def rights(cases: Iterable[Plan]) -> Rights:
     """Rights of all processes in the cases of an experiment, which share a router.
 
     Raises LabError if the cases are in different realms.
@@ -34,29 +32,30 @@ def rights(cases: Iterable[Experiment]) -> Rights:
     return reduce(Rights.joined, map(_rights, cases))
 
 
-def needed_identities(experiment: Experiment, operator: str = "operator") -> list[str]:
+def needed_identities(plan: Plan, operator: str = "operator") -> list[str]:
     """Identities whose certificates a run needs on the machine that starts it."""
+    experiment = plan.experiment
     robots = experiment.robots.values()
     abroad = {robot for host in experiment.hosts.values() for robot in host.robots}
     twins = any(robot.body in registry.names(registry.DEVICES) for robot in robots)
     services = {
-        "world": has_world(experiment),
+        "world": has_world(plan),
         "twin": twins or experiment.positioning == VICON_TWIN,
         "positioning": experiment.positioning is not None,
-        "centre": bool(Plan(experiment).guided),
+        "centre": bool(plan.guided),
     }
     here = [name for name in experiment.robots if name not in abroad]
     return ["router", operator, "recorder", *here, *(name for name, needed in services.items() if needed)]
 
 
-def has_world(experiment: Experiment) -> bool:
+def has_world(plan: Plan) -> bool:
     """Whether a run in real time needs the process of the world."""
-    return any(bodies.WORLD in (robot.body, robot.ranges) for robot in experiment.robots.values())
+    return any(WORLD in (robot.body, robot.ranges) for robot in plan.experiment.robots.values())
 
 
-def _rights(experiment: Experiment) -> Rights:
+def _rights(plan: Plan) -> Rights:
+    experiment, senders, guided = plan.experiment, senders_by_receiver(plan), plan.guided
     keys = Keys(experiment.network.realm)
-    senders, guided = senders_by_receiver(experiment), Plan(experiment).guided
     robots: dict[str, Grant] = {}
     for group in experiment.processes.values():
         others = sorted({sender for name in group for sender in senders[name]})
@@ -65,7 +64,7 @@ def _rights(experiment: Experiment) -> Rights:
         led = [name for name in group if name in guided]
         inputs = [*_key_per_name(group, keys.position, keys.ranges), *map(keys.goal, led)]
         own = [keys.below(name) for name in group]
-        foreign, tokens = _ros_keys(group, experiment)
+        foreign, tokens = _ros_keys(group, plan)
         grant = Grant(
             publish=[*own, *foreign],
             subscribe=[*inputs, *map(keys.pose, others), keys.estop, keys.experiment, *foreign],
@@ -83,18 +82,18 @@ def _rights(experiment: Experiment) -> Rights:
         robots |= dict.fromkeys(group, grant)
     network = experiment.network
     linked = network.routers > 1 or len(network.connect or ()) > 1
-    return Rights(keys.realm, robots, _roles(experiment, keys), linked)
+    return Rights(keys.realm, robots, _roles(plan, keys), linked)
 
 
-def _roles(experiment: Experiment, keys: Keys) -> dict[str, Grant]:
-    names, plan = experiment.robots, Plan(experiment)
+def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
+    names = plan.experiment.robots
     far = [name for name, robot in names.items() if robot.body in FAR]
-    ranged = [name for name, robot in names.items() if robot.body in FAR or robot.ranges == bodies.WORLD]
+    ranged = [name for name, robot in names.items() if robot.body in FAR or robot.ranges == WORLD]
     located = plan.externally_measured
     twins = [name for name, robot in names.items() if robot.body in registry.names(registry.DEVICES)]
     measured = sorted({*located, *twins})
     goals = _key_per_name(plan.guided, keys.goal)
-    foreign, tokens = _ros_keys(names, experiment)
+    foreign, tokens = _ros_keys(names, plan)
     everything = [keys.everything]
     observer = Grant(subscribe=everything, query=[keys.pose("*"), ADMIN], watch=everything)
     return {
@@ -146,9 +145,8 @@ def _key_per_name(names: Iterable[str], *of: Callable[[str], str]) -> list[str]:
     return [key(name) for name in names for key in of]
 
 
-def senders_by_receiver(experiment: Experiment) -> dict[str, set[str]]:
+def senders_by_receiver(plan: Plan) -> dict[str, set[str]]:
     """Senders of each robot: the poses to which its process subscribes."""
-    plan = Plan(experiment)
     links = plan.pose_links
     found: dict[str, set[str]] = {name: set() for name in plan.names}
     for receiver, sender in zip(links.receiver.tolist(), links.sender.tolist(), strict=True):
@@ -167,9 +165,9 @@ def _ros(name: str, robot: Robot) -> turtlebot3.Address | None:
     return turtlebot3.twin(name, chosen) if body == ROS_TWIN else turtlebot3.address(name, robot.body, chosen)
 
 
-def _ros_keys(names: Iterable[str], experiment: Experiment) -> tuple[list[str], list[str]]:
+def _ros_keys(names: Iterable[str], plan: Plan) -> tuple[list[str], list[str]]:
     """Keys outside the realm on which robots of ROS 2 send and receive, and their liveliness tokens."""
-    addresses = [_ros(name, experiment.robots[name]) for name in names]
+    addresses = [_ros(name, plan.experiment.robots[name]) for name in names]
     keys, tokens = set(), set()
     for address in filter(None, addresses):
         below, rmw = f"{address.namespace}/**" if address.namespace else "*", address.style == "rmw"

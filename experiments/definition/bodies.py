@@ -1,4 +1,4 @@
-"""Bodies of the robots: kind, start pose, disturbance, body request, and the scene around them."""
+"""Bodies of the robots: which drive which kind, their requests, start poses, and the world that they share."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from agents.body.interface import BodyError, BodyRequest, Disturbance
+from agents.body.interface import BodyError, BodyRequest
 from agents.body.kinds import KINDS, Kind
 from agents.network.keys import Keys
-from agents.plugins import registry
 from agents.vectors import Vector, clamp
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import VICON_TWIN, WORLD
+from experiments.definition.plan import Plan
 from twins import scene as outlines
 from twins.scene import Scene, World
 
+BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
 CLEAR: Final = 0.02  # [m] between robots that are scattered
-WORLD: Final = "world"  # the body of a robot that lives in the twin service
-VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
-BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 
 
 def missing_library(body: str) -> str:
@@ -42,27 +40,16 @@ def driven_kind(body: str) -> Kind | None:
     return next((kind for kind in KINDS.usable() if body in own_bodies(kind)), None)
 
 
-def kinds(experiment: Experiment, names: Sequence[str]) -> tuple[Kind, ...]:
-    return tuple(KINDS[experiment.robots[name].kind] for name in names)
-
-
-def start_poses(experiment: Experiment, names: Sequence[str]) -> tuple[list[Vector], list[float]]:
-    """Start poses of robots: positions on the floor [m] and yaws [rad]."""
-    given = [(*map(float, experiment.robots[name].start), 0.0)[:3] for name in names]
-    return [(x, y, 0.0) for x, y, _ in given], [yaw for _, _, yaw in given]
-
-
-def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> tuple[list[Vector], list[float]]:
-    """Start poses as `start_poses`, scattered by the seed, clear of other robots and of obstacles.
+def scattered_poses(plan: Plan, names: Sequence[str], seed: int) -> tuple[list[Vector], list[float]]:
+    """Start poses as `Plan.start_poses`, scattered by the seed, clear of other robots and of obstacles.
 
     Places are drawn for all robots of the experiment in the order of the file, so that all processes agree.
     """
-    everyone = tuple(experiment.robots)
-    positions, yaws = start_poses(experiment, everyone)
-    begin = experiment.start
+    experiment, robots, begin = plan.experiment, plan.kinds, plan.experiment.start
+    positions, yaws = plan.start_poses()
     if begin.scatter > 0.0 or begin.scatter_yaw > 0.0:
         rng = np.random.default_rng([seed, 0x73746172])
-        robots, stands = kinds(experiment, everyone), scene(experiment)
+        stands = plan.scene
         half_x, half_y = (0.5 * side - experiment.safety.margin for side in experiment.arena.size[:2])
         for row, (kind, (x, y, _)) in enumerate(zip(robots, tuple(positions), strict=True)):
             yaws[row] += begin.scatter_yaw * rng.uniform(-1.0, 1.0)
@@ -80,7 +67,7 @@ def scattered_poses(experiment: Experiment, names: Sequence[str], seed: int) -> 
                 if apart and _is_clear(stands, place, kind):
                     positions[row] = (*place, 0.0)
                     break
-    rows = [everyone.index(name) for name in names]
+    rows = [plan.names.index(name) for name in names]
     return [positions[row] for row in rows], [yaws[row] for row in rows]
 
 
@@ -93,8 +80,9 @@ def _is_clear(stands: Scene, place: tuple[float, float], kind: Kind) -> bool:
     )
 
 
-def shared_world(experiment: Experiment, names: Sequence[str], *, sensing: bool | None = None) -> World:
+def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = None) -> World:
     """World that `names` share; with range sensors where avoidance uses them, or as `sensing` says."""
+    experiment = plan.experiment
     used = experiment.avoidance is not None if sensing is None else sensing
     carried = []
     for name in names:
@@ -102,7 +90,7 @@ def shared_world(experiment: Experiment, names: Sequence[str], *, sensing: bool 
         own = KINDS[robot.kind].sensors if robot.sensors is None else tuple(robot.sensors)
         carried.append(own if used or robot.sensors else ())
     return World(
-        scene=scene(experiment),
+        scene=plan.scene,
         engine=experiment.world.engine,
         sensors=tuple(carried),
         sensor_noise=experiment.world.sensor_noise,
@@ -110,49 +98,28 @@ def shared_world(experiment: Experiment, names: Sequence[str], *, sensing: bool 
     )
 
 
-def scene(experiment: Experiment) -> Scene:
-    """Obstacles and walls of the arena."""
-    arena = experiment.arena
-    plans = {
-        name: registry.build(registry.PLANNERS, obstacle.plan)
-        for name, obstacle in arena.obstacles.items()
-        if obstacle.plan is not None
-    }
-    return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
-
-
-def shadow_periods(experiment: Experiment, names: Sequence[str]) -> list[float]:
+def shadow_periods(plan: Plan, names: Sequence[str]) -> list[float]:
     """Period at which each shadow twin is reset to its robot [s]: infinite for once, NaN without a shadow."""
     periods = []
     for name in names:
-        shadow = experiment.robots[name].shadow
+        shadow = plan.experiment.robots[name].shadow
         periods.append(nan if shadow is None else inf if shadow.restart_s is None else shadow.restart_s)
     return periods
 
 
-def disturbance(experiment: Experiment, name: str) -> Disturbance:
-    """Disturbance of a robot: `all`, overridden by its kind, overridden by its own name, field by field."""
-    merged: dict[str, object] = {}
-    for scope in ("all", experiment.robots[name].kind, name):
-        if (given := experiment.disturbance.get(scope)) is not None:
-            fields = msgspec.structs.asdict(given)
-            merged.update({field: value for field, value in fields.items() if value is not None})
-    return Disturbance(**merged)  # type: ignore[arg-type]
-
-
 def body_request(
-    experiment: Experiment, names: Sequence[str], seed: int, endpoints: Sequence[str] = (), *, quiet: bool = False
+    plan: Plan, names: Sequence[str], seed: int, endpoints: Sequence[str] = (), *, quiet: bool = False
 ) -> BodyRequest:
     """Request for the bodies of `names`, without noise if `quiet`; `endpoints` are the routers.
 
     Twins start where `scattered_poses` puts them; hardware is where it is.
     """
-    robots = [experiment.robots[name] for name in names]
-    given = [disturbance(experiment, name) for name in names]
-    positions, yaws = scattered_poses(experiment, names, seed)
+    experiment, robots = plan.experiment, [plan.experiment.robots[name] for name in names]
+    given = [plan.disturbance(name) for name in names]
+    positions, yaws = scattered_poses(plan, names, seed)
     return BodyRequest(
         names=tuple(names),
-        kinds=kinds(experiment, names),
+        kinds=tuple(KINDS[robot.kind] for robot in robots),
         addresses=tuple(robot.body for robot in robots),
         start=tuple(positions),
         yaw=tuple(yaws),
@@ -166,12 +133,13 @@ def body_request(
     )
 
 
-def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
+def choose_bodies(plan: Plan, bodies: str | None) -> Plan:
     """Replace the body of every robot by that of `--bodies`; without it, change nothing."""
     if bodies is None:
-        return experiment
+        return plan
     if bodies == "protocol":
-        return behind_protocols(experiment)
+        return behind_protocols(plan)
+    experiment = plan.experiment
     captured = bodies == WORLD and experiment.positioning == VICON_TWIN
     robots = {
         name: msgspec.structs.replace(
@@ -183,25 +151,26 @@ def choose_bodies(experiment: Experiment, bodies: str | None) -> Experiment:
         )
         for name, robot in experiment.robots.items()
     }
-    return msgspec.structs.replace(experiment, robots=robots)
+    return plan.changed(robots=robots)
 
 
-def behind_protocols(experiment: Experiment) -> Experiment:
+def behind_protocols(plan: Plan) -> Plan:
     """Put every robot behind its real bridge and a protocol twin, with simulated motion capture and radio.
 
     Raises BodyError if the kind of a robot has no protocol twin.
     """
-    twins = {name: KINDS[robot.kind].twin for name, robot in experiment.robots.items()}
-    if strangers := sorted({experiment.robots[name].kind for name, twin in twins.items() if twin is None}):
+    given = plan.experiment.robots
+    twins = {name: KINDS[robot.kind].twin for name, robot in given.items()}
+    if strangers := sorted({given[name].kind for name, twin in twins.items() if twin is None}):
         known = ", ".join(kind.name for kind in KINDS.usable() if kind.twin is not None)
         message = f"no protocol twin of {', '.join(map(repr, strangers))}, only of {known}"
         raise BodyError(f"--bodies protocol: {message}; choose --bodies twin or world")
     robots = {}
     for name, twin in twins.items():
         if twin is not None:
-            robot = experiment.robots[name]
+            robot = given[name]
             robots[name] = msgspec.structs.replace(
                 robot, body=twin.body, process=twin.process, position=twin.position,
                 device={**robot.device, **twin.device},
             )  # fmt: skip
-    return msgspec.structs.replace(experiment, robots=robots, positioning=VICON_TWIN)
+    return plan.changed(robots=robots, positioning=VICON_TWIN)

@@ -10,30 +10,28 @@ from agents.network import lab
 from agents.network.endpoints import EndpointError
 
 if TYPE_CHECKING:  # numpy comes with it, and an emergency stop waits for nothing that it does not need
-    from experiments.definition.experiment import Experiment
+    from experiments.definition.plan import Plan
 
 
-def lab_folder(experiment: Experiment, file: Path, chosen: str | None = None) -> Path | None:
+def lab_folder(plan: Plan, file: Path, chosen: str | None = None) -> Path | None:
     """Folder of the lab: that of the command line, or the one that the file names, beside the file."""
     if chosen is not None:
         return Path(chosen).absolute()
-    own = experiment.network.lab
+    own = plan.experiment.network.lab
     return None if own is None else file.absolute().parent / own
 
 
-def router_endpoints(
-    experiment: Experiment, file: Path, connect: Sequence[str], chosen: str | None = None
-) -> list[str]:
+def router_endpoints(plan: Plan, file: Path, connect: Sequence[str], chosen: str | None = None) -> list[str]:
     """Routers of an experiment, each with its lab if there is one; empty if neither file nor command names any.
 
     Args:
-        experiment: Its `network.connect` holds if the command line names none.
+        plan: Its `network.connect` holds if the command line names none.
 
     Raises:
         LabError: If a router of a lab asks for no certificates.
     """
-    endpoints = read_endpoints(connect) or experiment.network.connect or []
-    return lab.secured(endpoints, lab_folder(experiment, file, chosen))
+    endpoints = read_endpoints(connect) or plan.experiment.network.connect or []
+    return lab.secured(endpoints, lab_folder(plan, file, chosen))
 
 
 def read_endpoints(given: Iterable[str]) -> list[str]:

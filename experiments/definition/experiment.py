@@ -16,6 +16,9 @@ from agents.network.channel_model import AtLeastOne, Delay, LinkEffects
 from agents.vectors import NotNegative, Positive, Share
 from twins.scene import Obstacle, Planar
 
+WORLD: Final = "world"  # the body of a robot that lives in the twin service
+VICON_TWIN: Final = "vicon-twin"  # motion capture that is simulated as well
+
 Rate = Annotated[float, Meta(gt=0, le=2000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Vector = Annotated[list[float], Meta(min_length=2, max_length=3)]

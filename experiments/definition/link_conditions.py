@@ -10,8 +10,9 @@ from msgspec.structs import replace
 
 from agents.network import channel_model
 from agents.network.channel_model import Conditions, LinkEffects
-from experiments.definition.experiment import Channel, Experiment, LinkChannel
+from experiments.definition.experiment import Channel, LinkChannel
 from experiments.definition.links import link_pairs
+from experiments.definition.plan import Plan
 
 OWN_S: Final = Channel().delay_s  # any real network takes as long: to wait for it would cost a tick in ten milliseconds
 TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
@@ -19,9 +20,9 @@ TO_CENTRE, FROM_CENTRE = "to centre", "from centre"  # streams
 Ends = Sequence[tuple[str, str]]  # sender and receiver of each link, by name
 
 
-def models_network(experiment: Experiment) -> bool:
+def models_network(plan: Plan) -> bool:
     """Whether the file asks for any network effect."""
-    return experiment.channel != Channel()
+    return plan.experiment.channel != Channel()
 
 
 def link_effects(channel: Channel, own: LinkChannel | None = None) -> LinkEffects:
@@ -32,9 +33,7 @@ def link_effects(channel: Channel, own: LinkChannel | None = None) -> LinkEffect
     return LinkEffects(**effects)
 
 
-def conditions_of(
-    experiment: Experiment, ends: Ends, seed: int, *, stream: str = "", real: bool = False
-) -> list[Conditions]:
+def conditions_of(plan: Plan, ends: Ends, seed: int, *, stream: str = "", real: bool = False) -> list[Conditions]:
     """Conditions of links between these `ends`.
 
     Args:
@@ -42,13 +41,13 @@ def conditions_of(
         stream: Other messages between the same robots have another one, and their own random numbers.
         real: The network has a delay of its own.
     """
-    channel, more = experiment.channel, (stream,) if stream else ()
+    channel, more = plan.experiment.channel, (stream,) if stream else ()
     own = {pair: effects for text, effects in channel.links.items() for pair in link_pairs(text)}
     found = []
     for sender, receiver in ends:
         given = own.get((receiver, sender))
         effects = link_effects(channel, given)
-        bare = Conditions.of(effects, _outages(channel, sender, receiver), experiment.duration_s)
+        bare = Conditions.of(effects, _outages(channel, sender, receiver), plan.experiment.duration_s)
         if real and bare.delay <= OWN_S:
             bare = replace(bare, delay=0.0)
         found.append(replace(bare, key=channel_model.key(seed, sender, receiver, *more)) if bare.random else bare)

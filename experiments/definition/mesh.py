@@ -10,14 +10,13 @@ from agents.network import lab
 from agents.network.access_control import Rights
 from agents.network.endpoints import Endpoint, free_endpoint
 from experiments.definition import access_rights
-from experiments.definition.bodies import VICON_TWIN
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import VICON_TWIN
 from experiments.definition.plan import Plan
 
 ENDPOINTS: Final = "network.txt"  # for --connect @FOLDER/network.txt, which looks at a run
 
 
-def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
+def member_endpoints(cases: Iterable[Plan], *, secure: bool) -> list[str]:
     """Endpoints of all members of a mesh, each with its owner: robots, then support processes.
 
     All cases of a file have the same: a robot is at one place in all of them.
@@ -27,13 +26,14 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     """
     found: dict[str, str] = {}
     services: dict[str, None] = {"recorder": None}
-    for case in cases:
+    for plan in cases:
+        case = plan.experiment
         for group in case.processes.values():
             given = next((case.network.addresses[name] for name in group if name in case.network.addresses), "")
             found.setdefault(topology.TOGETHER.join(group), given)
-        if access_rights.has_world(case):
+        if access_rights.has_world(plan):
             services["world"] = None
-        if Plan(case).guided:
+        if plan.guided:
             services["centre"] = None
         if case.positioning == VICON_TWIN:
             services[VICON_TWIN] = None
@@ -48,8 +48,9 @@ def member_endpoints(cases: Iterable[Experiment], *, secure: bool) -> list[str]:
     return [topology.owned(endpoint, name) for name, endpoint in found.items()]
 
 
-def listening_hosts(experiment: Experiment) -> dict[str, list[str]]:
+def listening_hosts(plan: Plan) -> dict[str, list[str]]:
     """Host names at which the identities of a lab listen in a mesh; empty with routers."""
+    experiment = plan.experiment
     if experiment.network.topology != "mesh":
         return {}
     here = ["localhost", "127.0.0.1", "::1"]
@@ -58,15 +59,15 @@ def listening_hosts(experiment: Experiment) -> dict[str, list[str]]:
     return {**dict.fromkeys(("recorder", "world", "centre", "twin", "operator"), here), **robots}
 
 
-def neighbour_endpoints(experiment: Experiment, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
+def neighbour_endpoints(plan: Plan, names: Sequence[str], endpoints: Sequence[str]) -> list[str]:
     """Endpoints to which robots of one process connect, see `agents.network.endpoints`."""
     if not topology.is_mesh(endpoints):
         return list(endpoints)
-    return topology.near(endpoints, access_rights.senders_by_receiver(experiment), names)
+    return topology.near(endpoints, access_rights.senders_by_receiver(plan), names)
 
 
-def member_rights(experiment: Experiment, endpoints: Sequence[str]) -> Rights | None:
+def member_rights(plan: Plan, endpoints: Sequence[str]) -> Rights | None:
     """Rights that a member of a mesh enforces itself; None with routers, or without a lab."""
     if not topology.is_mesh(endpoints) or lab.lab_of(endpoints) is None:
         return None
-    return access_rights.rights([experiment])
+    return access_rights.rights([plan])

@@ -6,29 +6,55 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
-from agents.body.kinds import Kind
+from agents.body.interface import Disturbance
+from agents.body.kinds import KINDS, Kind
 from agents.body.limits import Limits
 from agents.decision.assignment import Assignment
 from agents.decision.neighbours import Incoming
 from agents.formation.anchors import Anchor
 from agents.formation.link import Link
-from agents.plugins import registry
+from agents.plugins import files, registry
 from agents.plugins.avoidance import Avoidance
 from agents.plugins.law import Law
 from agents.plugins.planners import Leg
 from agents.plugins.predictors import HOLD, Predictor
 from agents.plugins.triggers import Periodic, Trigger
-from experiments.definition.bodies import VICON_TWIN, WORLD, disturbance, kinds, start_poses
-from experiments.definition.experiment import Experiment, Hybrid
+from agents.vectors import Vector
+from experiments.definition.experiment import VICON_TWIN, WORLD, Choice, Experiment, Hybrid
 from experiments.definition.formation import Pattern, compile_anchors, linked
 from experiments.definition.graph import Links, adjacency
 from experiments.definition.links import TARGET_KINDS, OneWay, TargetKind, one_way_links
 from twins.arrays import Index
 from twins.engines.engine import EngineFactory
+from twins.scene import Scene
+
+
+def _name(choice: Choice) -> str:
+    """Name of the plug-in of a choice."""
+    return registry.split(choice)[0]
+
+
+def _plain(choice: Choice) -> str:
+    """The same for people: of a plug-in in a file without its digest."""
+    return files.plain(_name(choice))
+
+
+def _built(group: str, choice: Choice) -> Any:  # noqa: ANN401 - what it is depends on the group
+    return registry.build(group, choice)
+
+
+def finds_contacts(engine: Choice) -> bool:
+    """Whether an engine finds contacts; not where a recording is read and that engine is not installed."""
+    try:
+        chosen = cast(type[EngineFactory], registry.struct(registry.ENGINES, _name(engine)))
+    except (registry.PluginError, msgspec.ValidationError):
+        return False
+    return chosen.CONTACTS
 
 
 @dataclass(frozen=True)
@@ -45,21 +71,39 @@ class Plan:
 
     experiment: Experiment
 
+    def __reduce__(self) -> tuple[type[Plan], tuple[Experiment]]:
+        """Other processes get the experiment, and resolve it themselves."""
+        return Plan, (self.experiment,)
+
+    @classmethod
+    def made(cls, **fields: Any) -> Plan:  # noqa: ANN401 - of an experiment
+        """The plan of an experiment that stands in no file."""
+        return cls(Experiment(**fields))
+
+    @classmethod
+    def decoded(cls, text: str | bytes) -> Plan:
+        """The plan of an experiment in JSON; raises msgspec.DecodeError or msgspec.ValidationError for another text."""
+        return cls(msgspec.json.decode(text, type=Experiment))
+
+    def changed(self, **fields: Any) -> Plan:  # noqa: ANN401 - of an experiment
+        """The plan of the experiment with other values of some fields."""
+        return Plan(msgspec.structs.replace(self.experiment, **fields))
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(self.experiment.robots)
 
     @cached_property
     def kinds(self) -> tuple[Kind, ...]:
-        return kinds(self.experiment, self.names)
+        return tuple(KINDS[robot.kind] for robot in self.experiment.robots.values())
 
     @property
     def law_name(self) -> str:
-        return registry.split(self.experiment.formation.law)[0]
+        return _plain(self.experiment.formation.law)
 
     @cached_property
     def law(self) -> Law:
-        built: Law = registry.build(registry.LAWS, self.experiment.formation.law)
+        built: Law = _built(registry.LAWS, self.experiment.formation.law)
         return built
 
     @property
@@ -69,11 +113,11 @@ class Plan:
 
     @property
     def trigger_name(self) -> str:
-        return registry.split(self.experiment.trigger)[0]
+        return _plain(self.experiment.trigger)
 
     @cached_property
     def trigger(self) -> Trigger:
-        built: Trigger = registry.build(registry.TRIGGERS, self.experiment.trigger)
+        built: Trigger = _built(registry.TRIGGERS, self.experiment.trigger)
         return built
 
     @property
@@ -85,13 +129,13 @@ class Plan:
     @property
     def update_name(self) -> str:
         """Empty without a control trigger."""
-        return registry.split(self.experiment.formation.update or "")[0]
+        return _plain(self.experiment.formation.update or "")
 
     @cached_property
     def update(self) -> Trigger | None:
         """The control trigger; None: the law is computed at every decision."""
         chosen = self.experiment.formation.update
-        return None if chosen is None else registry.build(registry.TRIGGERS, chosen)
+        return None if chosen is None else _built(registry.TRIGGERS, chosen)
 
     @property
     def needs_prediction(self) -> bool:
@@ -104,36 +148,33 @@ class Plan:
         chosen = self.experiment.prediction
         if chosen is None:
             chosen = self.trigger.PREDICTION if self.needs_prediction else self.law.PREDICTION
-        built: Predictor = registry.build(registry.PREDICTORS, chosen)
+        built: Predictor = _built(registry.PREDICTORS, chosen)
         return HOLD if built == HOLD else built
 
     @cached_property
     def avoidance(self) -> Avoidance | None:
         chosen = self.experiment.avoidance
-        return None if chosen is None else registry.build(registry.AVOIDANCES, chosen)
+        return None if chosen is None else _built(registry.AVOIDANCES, chosen)
 
     @property
     def engine_name(self) -> str:
-        return registry.split(self.experiment.world.engine)[0]
+        return _name(self.experiment.world.engine)
 
     @cached_property
     def engine(self) -> EngineFactory:
-        built: EngineFactory = registry.build(registry.ENGINES, self.experiment.world.engine)
+        built: EngineFactory = _built(registry.ENGINES, self.experiment.world.engine)
         return built
 
     @property
     def finds_contacts(self) -> bool:
-        """Whether the engine finds contacts; not where a recording is read and that engine is not installed."""
-        try:
-            return self.engine.CONTACTS
-        except (registry.PluginError, msgspec.ValidationError):
-            return False
+        """Whether the engine finds contacts."""
+        return finds_contacts(self.experiment.world.engine)
 
     @cached_property
     def legs_by_robot(self) -> dict[str, tuple[Leg, ...]]:
         found: dict[str, tuple[Leg, ...]] = {}
         for leg in self.experiment.timeline:
-            planned = Leg(leg.at_s, registry.build(registry.PLANNERS, leg.plan))
+            planned = Leg(leg.at_s, _built(registry.PLANNERS, leg.plan))
             found[leg.robot] = (*found.get(leg.robot, ()), planned)
         return found
 
@@ -229,7 +270,7 @@ class Plan:
     @cached_property
     def starts(self) -> tuple[tuple[str, float, float, float], ...]:
         """Name of each robot, x and y where it begins [m], and its radius [m]."""
-        starts, _ = start_poses(self.experiment, self.names)
+        starts, _ = self.start_poses()
         return tuple(
             (name, x, y, kind.radius) for name, (x, y, _), kind in zip(self.names, starts, self.kinds, strict=True)
         )
@@ -283,7 +324,7 @@ class Plan:
     def uses_chance(self) -> bool:
         """Whether anything depends on the seed: starts, noise of twins, the modelled network."""
         experiment = self.experiment
-        nature = [disturbance(experiment, name) for name in self.names]
+        nature = [self.disturbance(name) for name in self.names]
         noisy = any(
             each.position_sigma
             or each.yaw_sigma
@@ -296,6 +337,31 @@ class Plan:
         lossy = channel.loss or channel.jitter_s or any(each.loss or each.jitter_s for each in links)
         sees = experiment.avoidance is not None and experiment.world.sensor_noise > 0.0
         return bool(noisy or scattered or lossy or sees)
+
+    def start_poses(self) -> tuple[list[Vector], list[float]]:
+        """Positions on the floor [m] and yaws [rad] of the robots at the start, as the file has them."""
+        given = [(*map(float, robot.start), 0.0)[:3] for robot in self.experiment.robots.values()]
+        return [(x, y, 0.0) for x, y, _ in given], [yaw for _, _, yaw in given]
+
+    @property
+    def scene(self) -> Scene:
+        """Obstacles and walls of the arena."""
+        arena = self.experiment.arena
+        plans = {
+            name: _built(registry.PLANNERS, obstacle.plan)
+            for name, obstacle in arena.obstacles.items()
+            if obstacle.plan is not None
+        }
+        return Scene.furnished(arena.size, arena.obstacles, plans, walled=arena.walls)
+
+    def disturbance(self, name: str) -> Disturbance:
+        """Disturbance of a robot: `all`, overridden by its kind, overridden by its own name, field by field."""
+        merged: dict[str, object] = {}
+        for scope in ("all", self.experiment.robots[name].kind, name):
+            if (given := self.experiment.disturbance.get(scope)) is not None:
+                fields = msgspec.structs.asdict(given)
+                merged.update({field: value for field, value in fields.items() if value is not None})
+        return Disturbance(**merged)  # type: ignore[arg-type]
 
     def rows(self, names: Sequence[str]) -> Index:
         return np.array([self.names.index(name) for name in names], dtype=np.intp)

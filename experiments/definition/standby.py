@@ -7,17 +7,19 @@ from typing import TypeVar
 
 import msgspec
 
-from experiments.definition.experiment import Experiment, Hybrid
+from experiments.definition.experiment import Hybrid
 from experiments.definition.links import link_pairs
+from experiments.definition.plan import Plan
 
 T = TypeVar("T")
 
 
-def without_standby(experiment: Experiment, added: Collection[str] = ()) -> Experiment:
+def without_standby(plan: Plan, added: Collection[str] = ()) -> Plan:
     """Remove the robots on standby, but those `added`: none is in virtual time, or before `./zenpark robot add`."""
+    experiment = plan.experiment
     robots = {name: robot for name, robot in experiment.robots.items() if not robot.standby or name in added}
     if len(robots) == len(experiment.robots):
-        return experiment
+        return plan
     formation, channel, architecture = experiment.formation, experiment.channel, experiment.architecture
     links = _links_between(formation.links, robots)
     changes = [
@@ -40,8 +42,7 @@ def without_standby(experiment: Experiment, added: Collection[str] = ()) -> Expe
         led = [name for name in architecture.robots if name in robots]
         hybrid = Hybrid(architecture.kind, led)
         architecture = "distributed" if not led else "centralised" if len(led) == len(robots) else hybrid
-    return msgspec.structs.replace(
-        experiment,
+    return plan.changed(
         robots=robots,
         formation=msgspec.structs.replace(
             formation,
@@ -65,6 +66,7 @@ def _links_between(links: Mapping[str, T], robots: Collection[str]) -> dict[str,
     return {text: to for text, to in links.items() if {*link_pairs(text)[0]} <= {*robots}}
 
 
-def robots_without_address(experiment: Experiment) -> dict[str, str]:
+def robots_without_address(plan: Plan) -> dict[str, str]:
     """Robots whose host has no address, so that they are not started from here; robot to host."""
-    return {robot: name for name, host in experiment.hosts.items() if host.address is None for robot in host.robots}
+    hosts = plan.experiment.hosts.items()
+    return {robot: name for name, host in hosts if host.address is None for robot in host.robots}

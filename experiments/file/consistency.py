@@ -15,10 +15,11 @@ from agents.plugins import registry
 from agents.plugins.laws import Gradient
 from agents.plugins.predictors import HOLD
 from agents.plugins.registry import did_you_mean
-from experiments.definition.bodies import WORLD, driven_kind, own_bodies
+from experiments.definition.bodies import driven_kind, own_bodies
 from experiments.definition.experiment import (
     JUDGED,
     MEAN,
+    WORLD,
     WORST,
     Arena,
     Change,
@@ -107,14 +108,14 @@ def judged_metrics() -> list[str]:
     return [*JUDGED, *registry.names(registry.METRICS)]
 
 
-def criteria_faults(experiment: Experiment, cases: Iterable[str]) -> Iterator[Fault]:
+def criteria_faults(plan: Plan, cases: Iterable[str]) -> Iterator[Fault]:
     """Faults of the criteria of a file with these cases."""
     cases = list(cases)
-    for number, each in enumerate(experiment.criteria):
+    for number, each in enumerate(plan.experiment.criteria):
         path = ("criteria", number)
         if each.metric is not None and each.metric not in (known := judged_metrics()):
             yield Fault((*path, "metric"), f"no {each.metric!r} among the metrics", did_you_mean(each.metric, known))
-        if each.of not in (known := [MEAN, WORST, *experiment.robots]):
+        if each.of not in (known := [MEAN, WORST, *plan.names]):
             yield Fault((*path, "of"), f"no robot is called '{each.of}'", did_you_mean(each.of, known))
         for key in ("case", "relative_to"):
             name = getattr(each, key)

@@ -1,7 +1,7 @@
 """Reading of an experiment file, its cases and the changes of the command line, with all errors at once.
 
 document = read("robotic-park", ["robots.CF01.hover=0.7"])
-for name, experiment in document.cases().items(): ...
+for name, plan in document.cases().items(): ...
 """
 
 from __future__ import annotations
@@ -43,20 +43,24 @@ class Document:
     path: Path  # the file that was read
     text: str  # as it stands there
     # what it says, before any case changes it; `--set` is in it. Its arena is complete, whatever file it begins with.
-    experiment: Experiment
-    resolved: Mapping[str, Experiment]
+    plan: Plan
+    resolved: Mapping[str, Plan]
     # the arena file of each case that has one; of the file without cases under the empty name
     arenas: dict[str, ArenaFile] = field(default_factory=dict)
     overrides: Sequence[Override] = ()  # behind `--set`
     plugins: dict[str, Path] = field(default_factory=dict)  # files of plug-ins, by their names in the experiment
 
     @property
+    def experiment(self) -> Experiment:
+        return self.plan.experiment
+
+    @property
     def source(self) -> Source:
         """Places of its keys."""
         return Source(str(self.path), self.text, _is_json(self.path), self.overrides, self.arenas)
 
-    def cases(self) -> dict[str, Experiment]:
-        """Each case as an experiment of its own, in the order of the file; one called "default" if it has none."""
+    def cases(self) -> dict[str, Plan]:
+        """Each case, compiled, in the order of the file; one called "default" if it has none."""
         return dict(self.resolved)
 
     def keep(self, file: Path) -> None:
@@ -131,16 +135,15 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
         ]
         shapes = {name: [*fill_from_shape(each), *structure.faults(each)] for name, each in documents.items()}
         source.refuse([*nested, *_each_once(shapes, tables)])
-        experiments = {name: msgspec.convert(each, Experiment) for name, each in documents.items()}
-        found = {name: list(consistency.faults(Plan(each))) for name, each in experiments.items()}
+        plans = {name: Plan(msgspec.convert(each, Experiment)) for name, each in documents.items()}
+        found = {name: list(consistency.faults(plan)) for name, plan in plans.items()}
         source.refuse(_each_once(found, tables))
         if tables or not is_json:  # a case that was written as JSON names cases that are not in it
-            source.refuse(consistency.criteria_faults(experiments[None], tables or [UNNAMED]))
+            source.refuse(consistency.criteria_faults(plans[None], tables or [UNNAMED]))
     except RecursionError:
         raise refusal(label, "tables or lists are nested too deeply", "flatten them") from None
-    experiment = experiments[None]
-    cases = {name: case for name, case in experiments.items() if name is not None} or {UNNAMED: experiment}
-    return Document(file, text, experiment, cases, source.arenas, source.overrides, adopted.plugins)
+    cases = {name: plan for name, plan in plans.items() if name is not None} or {UNNAMED: plans[None]}
+    return Document(file, text, plans[None], cases, source.arenas, source.overrides, adopted.plugins)
 
 
 @dataclass(frozen=True)
@@ -228,9 +231,9 @@ def join_texts(texts: Sequence[str]) -> str:
     return "\n\n# ---- the arena file ----\n\n".join(texts)
 
 
-def write_json(experiment: Experiment) -> bytes:
+def write_json(plan: Plan) -> bytes:
     """The experiment as JSON that `read` takes; what has its default is left out."""
-    return msgspec.json.format(msgspec.json.encode(experiment), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(plan.experiment), indent=2) + b"\n"
 
 
 def _resolved(file: Path, source: Source, content: _Table) -> tuple[dict[str | None, _Table], dict[str, _Table]]:
@@ -328,22 +331,22 @@ def _beginning(table: object, path: Keys) -> Keys:
     return path
 
 
-def case_document(experiment: Experiment, case: str = UNNAMED) -> bytes:
+def case_document(plan: Plan, case: str = UNNAMED) -> bytes:
     """A case as one line of JSON for a robot without a file; without criteria and the hosts of the other robots.
 
     Its name comes with it: `Document.cases` of what is received has this case alone.
     """
-    arena = msgspec.structs.replace(experiment.arena, file=None)  # what stood there is in it
+    arena = msgspec.structs.replace(plan.experiment.arena, file=None)  # what stood there is in it
     cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
-    return msgspec.json.encode(msgspec.structs.replace(experiment, arena=arena, hosts={}, criteria=[], cases=cases))
+    return msgspec.json.encode(plan.changed(arena=arena, hosts={}, criteria=[], cases=cases).experiment)
 
 
-def chosen_case(read: Document, name: str | None) -> Experiment:
+def chosen_case(read: Document, name: str | None) -> Plan:
     """A case of an experiment by name, the first if none is named; raises as `chosen`."""
     return next(iter(chosen(read, [] if name is None else [name]).values()))
 
 
-def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Experiment]:
+def chosen(read: Document, names: Sequence[str] = ()) -> dict[str, Plan]:
     """The cases of an experiment, all or those named, in the order of the file.
 
     Raises DocumentError if it has no case of that name.

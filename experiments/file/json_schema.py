@@ -20,7 +20,7 @@ from experiments.definition.experiment import Experiment
 from experiments.file.consistency import judged_metrics
 from experiments.file.overrides import ALONE, SHAPE
 from experiments.file.problems import Path
-from experiments.file.structure import LARGEST, group_of
+from experiments.file.structure import LARGEST, group_of, struct_of
 
 _OWNERS: Final[dict[str, Path]] = {  # structs with a choice of a plug-in, and where each stands in a file
     "Experiment": (),
@@ -146,7 +146,7 @@ def _parameters(group: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
     Raises PluginError if the plug-in cannot be used, or no file can have a parameter of the type.
     """
-    chosen = registry.struct(group, name)
+    chosen = struct_of(group, name)
     try:
         (reference,), parts = msgspec.json.schema_components([chosen], ref_template="#/definitions/{name}")
     except (TypeError, NameError) as error:

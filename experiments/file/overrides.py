@@ -17,7 +17,7 @@ from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.problems import DocumentError, Fault, Path, refusal
-from experiments.file.structure import group_of, parameters
+from experiments.file.structure import group_of, parameters, struct_of
 
 _PART: Final = re.compile(r"\s*+(?:\"([^\"]*)\"|'([^']*)'|([^.\"']++))\s*+(?:\.|$)")
 _KEY: Final = re.compile(rf"(?:{_PART.pattern})++(?<!\.)")
@@ -177,7 +177,7 @@ def _needed_target(law: object) -> Need:
     if not isinstance(name, str):
         return "any"
     try:
-        return cast(type[Law], registry.struct(registry.LAWS, name)).NEEDS
+        return cast(type[Law], struct_of(registry.LAWS, name)).NEEDS
     except registry.PluginError:  # said with its place where the law is read
         return "any"
 

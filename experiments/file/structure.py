@@ -22,6 +22,7 @@ from agents.body.kinds import KINDS
 from agents.plugins import files, registry
 from agents.plugins.registry import did_you_mean
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError, Fault, Path, Problem, refusal, shown
 
 LARGEST: Final = 1e12  # in any unit; squares and products of larger numbers are not finite for long
@@ -83,16 +84,15 @@ def group_of(path: Path) -> str | None:
     return _GROUPS.get(path if len(path) < 3 else (*path[:-2], type(path[-2]), path[-1]))
 
 
-def plugin_files(experiment: Experiment) -> set[pathlib.Path]:
+def plugin_files(plan: Plan) -> set[pathlib.Path]:
     """Modules of the plug-ins and kinds that an experiment chooses; what those import is not among them."""
+    experiment = plan.experiment
     kinds = {KINDS[robot.kind] for robot in (*experiment.robots.values(), *experiment.spares.values())}
     modules = {registry.module(registry.ROBOTS, kind.name) for kind in kinds}
     modules |= {kind.motion.partition(":")[0] for kind in kinds if isinstance(kind.motion, str)}
     modules |= {type(kind.steering).__module__ for kind in kinds if kind.steering is not None}
     modules_of_kinds = {pathlib.Path(getfile(importlib.import_module(name))) for name in modules}
-    return modules_of_kinds | {
-        pathlib.Path(getfile(registry.struct(group, kind))) for group, kind in chosen(experiment)
-    }
+    return modules_of_kinds | {pathlib.Path(getfile(struct_of(group, kind))) for group, kind in chosen(experiment)}
 
 
 def chosen(experiment: Experiment) -> list[tuple[str, str]]:
@@ -129,10 +129,15 @@ def with_choices(value: Any, path: Path, change: Callable[[str, Path], str]) -> 
     return value
 
 
+def struct_of(group: str, kind: str) -> type[msgspec.Struct]:
+    """The struct of parameters of a plug-in; raises PluginError if it cannot be used."""
+    return registry.struct(group, kind)
+
+
 def parameters(group: str, kind: str) -> list[str]:
     """Names of the parameters of a plug-in, none if it cannot be used."""
     try:
-        return list(_fields_of(registry.struct(group, kind)))
+        return list(_fields_of(struct_of(group, kind)))
     except registry.PluginError:
         return []
 
@@ -223,7 +228,7 @@ def _choice(value: str | dict[str, Any], group: str, path: Path) -> list[Fault]:
     if kind not in known and not files.is_choice(kind):
         return [Fault(where, f"no {shown(kind)} among the {what}", did_you_mean(kind, known))]
     try:
-        struct = registry.struct(group, kind)
+        struct = struct_of(group, kind)
     except registry.PluginError as error:
         hint = "mend that file" if files.is_choice(kind) else "repair or uninstall it"
         return [Fault(where, str(error), f"{hint}, or choose another of the {what}")]

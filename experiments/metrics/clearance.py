@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.body.kinds import KINDS
 from agents.plugins import registry
-from experiments.definition import bodies
+from experiments.definition.experiment import WORLD
 from experiments.metrics.results import Approach, Collision
 from experiments.recording.trace import WALL, Trace
 from twins import scene as outlines
@@ -60,8 +60,8 @@ def collisions(trace: Trace, clearance: Clearance) -> tuple[Collision, ...]:
     """
     if trace.contacts is None:
         return clearance.overlaps
-    robots = trace.experiment.robots
-    in_world = {name for name in trace.robots if registry.body_name(robots[name].body) == bodies.WORLD}
+    robots = trace.plan.experiment.robots
+    in_world = {name for name in trace.robots if registry.body_name(robots[name].body) == WORLD}
     carried = {*trace.robots} if trace.clock == "virtual" else in_world
     reported = [
         Collision(each.stamp, each.first, each.second, each.impulse, each.overlap)
@@ -84,7 +84,7 @@ class _Cylinders:
 
     @classmethod
     def of_trace(cls, trace: Trace) -> _Cylinders:
-        kinds = [KINDS[trace.experiment.robots[name].kind] for name in trace.robots]
+        kinds = [KINDS[trace.plan.experiment.robots[name].kind] for name in trace.robots]
         height = np.array([kind.height for kind in kinds])
         radius, flies = np.array([kind.radius for kind in kinds]), np.array([kind.flies for kind in kinds])
         bottom = trace.true_position[..., 2]
@@ -124,7 +124,7 @@ def _overlaps(time: Array, gap: Array, between: tuple[str, str]) -> list[Collisi
 
 def _to_things(trace: Trace, solid: _Cylinders) -> Iterator[tuple[str, Array]]:
     """Each obstacle, and the arena's walls, with the gaps (T, N) of all robots to it."""
-    scene = bodies.scene(trace.experiment)
+    scene = trace.plan.scene
     poses = scene.along(trace.time)
     for k, name in enumerate(scene.names):
         if trace.contacts is not None and math.isfinite(scene.mass[k]):

@@ -115,9 +115,9 @@ def measure(trace: Trace) -> CaseMetrics:
         seed=trace.seed,
         clock=trace.clock,
         duration_s=float(trace.time[-1] - trace.time[0]),
-        planned_s=trace.experiment.duration_s,
+        planned_s=trace.plan.experiment.duration_s,
         interrupted=ended_early(trace),
-        tolerance=trace.experiment.tolerance,
+        tolerance=trace.plan.experiment.tolerance,
         starts_s=tuple(start for start, _, _ in shared.bounds),
         robots=robots,
         leaders=shared.leaders,
@@ -138,7 +138,7 @@ def measure(trace: Trace) -> CaseMetrics:
         lost=int(trace.lost.sum()),
         dropped=int(shared.dropped.sum()),
         passages=link_passages(trace),
-        modelled=link_conditions.models_network(trace.experiment),
+        modelled=link_conditions.models_network(trace.plan),
         missed_deadlines=int(trace.missed_deadlines.sum()),
         missed_share=_share(trace.missed_deadlines.sum(), ticks + int(trace.missed_deadlines.sum())),
         collisions=touched,
@@ -160,14 +160,14 @@ def measure(trace: Trace) -> CaseMetrics:
         guidance=centralised.guidance(trace),
         measures=_law_measures(shared, kept),
         metric_faults=(*unusable_metrics(), *faults),
-        criteria=tuple(trace.experiment.criteria),
+        criteria=tuple(trace.plan.experiment.criteria),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
 
 
 def ended_early(trace: Trace) -> bool:
     """Whether a run ended before its time; a whole one may end one sample short."""
-    return float(trace.time[-1]) < trace.experiment.duration_s - 1.5 * float(trace.time[1] - trace.time[0])
+    return float(trace.time[-1]) < trace.plan.experiment.duration_s - 1.5 * float(trace.time[1] - trace.time[0])
 
 
 def _robots(
@@ -215,7 +215,7 @@ def _robots(
     return tuple(
         RobotMetrics(
             robot=name,
-            kind=trace.experiment.robots[name].kind,
+            kind=trace.plan.experiment.robots[name].kind,
             residual=shared.phases[0][i].residual,
             worst=shared.phases[0][i].worst,
             phases=tuple(phase[i] for phase in shared.phases[1:]),
@@ -252,7 +252,8 @@ def _law_measures(shared: Measurement, rows: Sequence[int]) -> dict[str, LawMeas
 
 def _distance_to_goal(trace: Trace, net: Links, row: int) -> float | None:
     """Distance of a robot with a plan from its goal at the end [m]; None: no plan, or not known."""
-    began = [leg for leg in trace.experiment.timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
+    timeline = trace.plan.experiment.timeline
+    began = [leg for leg in timeline if leg.robot == trace.robots[row] and leg.at_s < trace.time[-1]]
     if not began or row in net.receiver:
         return None
     return _number(float(norm(trace.goal[-1, row] - trace.position[-1, row])))

@@ -111,7 +111,7 @@ class Measurement:
 
     def _acquired(self, phase: int) -> list[float | None]:
         _, begin, end = self.bounds[phase]
-        return self.errors.part(begin, end).acquired(self.window, self.trace.experiment.tolerance)
+        return self.errors.part(begin, end).acquired(self.window, self.trace.plan.experiment.tolerance)
 
     @cached_property
     def settled(self) -> list[float | None]:

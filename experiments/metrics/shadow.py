@@ -42,7 +42,7 @@ def agreement(trace: Trace) -> list[ShadowMetrics | None]:
     found: list[ShadowMetrics | None] = []
     for i, name in enumerate(trace.robots):
         mine = known[:, i]
-        chosen = trace.experiment.robots[name].shadow
+        chosen = trace.plan.experiment.robots[name].shadow
         if not mine.any():
             found.append(None)
             continue

@@ -29,7 +29,7 @@ RETURN_S: Final = 3.0  # robots come back one after the other when the network d
 def phase_starts(trace: Trace) -> tuple[float, ...]:
     """Beginnings of the phases [s]: common start, each leg of the timeline and each change of shape in the run."""
     first, last = float(trace.time[0]), float(trace.time[-1])
-    experiment = trace.experiment
+    experiment = trace.plan.experiment
     begins = {leg.at_s for leg in experiment.timeline} | {change.at_s for change in experiment.formation.changes}
     return (first, *sorted(at for at in begins if first < at < last))
 
@@ -293,7 +293,7 @@ def closest_distance(position: Array) -> float:
 
 def outside_arena(trace: Trace) -> Array:
     """Largest distance of each robot outside the arena (N,) [m]; negative if it never was outside."""
-    size = np.array(trace.experiment.arena.size)
+    size = np.array(trace.plan.experiment.arena.size)
     centre = np.array([0.0, 0.0, 0.5 * size[2]])  # the floor is at z = 0
     beyond = (np.abs(trace.true_position - centre) - 0.5 * size).max(axis=2)
     return np.asarray(np.where(np.isfinite(beyond), beyond, -np.inf).max(axis=0))
@@ -306,7 +306,7 @@ def transmission_gaps(trace: Trace) -> list[Array]:
 
 def transmissions(trace: Trace) -> tuple[Index, Index]:
     """Per robot: poses sent, by the running numbers, and those of them in the recording."""
-    tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.experiment.rates.pose_hz
+    tables, rate = [trace.sent_by(row) for row in range(len(trace.robots))], trace.plan.experiment.rates.pose_hz
     missing = [count_unrecorded(zip(own.stamp.tolist(), own.seq.tolist(), strict=True), rate) for own in tables]
     recorded = np.array([len(own) for own in tables], dtype=np.intp)
     return recorded + np.array(missing, dtype=np.intp), recorded

@@ -16,7 +16,7 @@ from typing import Final
 
 import msgspec
 
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file.structure import plugin_files
 from experiments.recording.reader import RecordingError, Records
 from experiments.recording.run_folder import METRICS, ORIGIN, SOURCE, RunOrigin, flattened, read_origin
@@ -53,11 +53,11 @@ SHA256SUMS        of all files
 """
 
 
-def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
+def write(folder: Path, target: Path, plans: list[Plan]) -> Path:
     """Write the bundle of a run.
 
     Args:
-        experiments: Its cases, whose plug-ins are added.
+        plans: Its cases, whose plug-ins are added.
 
     Raises:
         RecordingError: If the folder has no `run.json`, or the archive cannot be written.
@@ -76,7 +76,7 @@ def write(folder: Path, target: Path, experiments: list[Experiment]) -> Path:
     )
     requirements = sorted({f"{each.name}=={each.version}\n" for each in distributions()}, key=str.lower)
     members: dict[str, Path | bytes] = dict(_files(folder, target))
-    members |= {f"plugins/{file.name}": file for file in sorted(_plugins(experiments))}
+    members |= {f"plugins/{file.name}": file for file in sorted(_plugins(plans))}
     members |= {"README.txt": text.encode(), "requirements.txt": "".join(requirements).encode()}
     draft = target.with_name(f"{target.name}.new")
     try:
@@ -188,7 +188,7 @@ def _files(folder: Path, target: Path) -> Iterator[tuple[str, Path]]:
             yield name.as_posix(), file
 
 
-def _plugins(experiments: list[Experiment]) -> set[Path]:
+def _plugins(plans: list[Plan]) -> set[Path]:
     """Modules of the plug-ins that the cases choose, but for our own."""
-    files = {file for experiment in experiments for file in plugin_files(experiment)}
+    files = {file for plan in plans for file in plugin_files(plan)}
     return {file for file in files if not any(file.is_relative_to(ROOT / package) for package in PACKAGES)}

@@ -21,7 +21,6 @@ from agents.network.messages import CentreState, Contact, Event, HostClock, Memo
 from agents.network.validation import ABSURD, FUTURE_S, is_count
 from agents.plugins.registry import PluginError
 from experiments.arrays import PoseTable, known_rows
-from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
 from experiments.recording.clocks import Correction
@@ -91,7 +90,7 @@ class AboutRun:
     seed: int
     clock: str  # "real" or "virtual"
     announced: float | None  # [s] UTC
-    experiment: Experiment
+    plan: Plan
 
     @classmethod
     def of(cls, records: Records) -> AboutRun:
@@ -103,9 +102,9 @@ class AboutRun:
             announced = float(about["started"]) if "started" in about else None
             for each in msgspec.json.decode(kinds, type=list[Figures]):
                 KINDS.remember(each)
-            experiment = msgspec.json.decode(attached, type=Experiment)
-            _ = Plan(experiment).one_way_links  # names of robots are not in the types
-            return cls(about["case"], int(about["seed"]), about["clock"], announced, experiment)
+            plan = Plan.decoded(attached)
+            _ = plan.one_way_links  # names of robots are not in the types
+            return cls(about["case"], int(about["seed"]), about["clock"], announced, plan)
         except PluginError as error:
             raise RecordingError(f"{records.path}: {error}") from None
         except (KeyError, ValueError, RecursionError) as error:
@@ -164,8 +163,8 @@ def read(path: Path) -> Playback:
     messages = content.fill()
     records = content.records
     about = AboutRun.of(records)
-    experiment = without_standby(about.experiment, {state.robot for state in content[State]})
-    about = dataclasses.replace(about, experiment=experiment)
+    plan = without_standby(about.plan, {state.robot for state in content[State]})
+    about, experiment = dataclasses.replace(about, plan=plan), plan.experiment
     start = about.start(content[Event], content[Status], path)
     length = content.length(start, experiment.duration_s)
     if length * experiment.rates.state_hz < 1.0 - ROUNDING_S:
@@ -241,8 +240,7 @@ class _Content:
 
 def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trace:
     """The trace of a run by its common start, UTC, and its length [s]."""
-    experiment = about.experiment
-    robots = tuple(experiment.robots)
+    plan, experiment, robots = about.plan, about.plan.experiment, about.plan.names
     rate, (start, duration) = experiment.rates.state_hz, run
     time = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     states = _by_robot(content[State], robots)
@@ -260,11 +258,10 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
     contacts = messages_in_run(content[Contact], start, duration)
     world = messages_in_run(content[WorldState], start, duration)
-    plan = Plan(experiment)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about.case,
-        experiment=experiment,
+        plan=plan,
         seed=about.seed,
         robots=robots,
         clock=about.clock,
@@ -283,11 +280,11 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         ),
         interventions=counted("interventions"),
         avoided=counted("avoided"),
-        contacts=contacts if contacts_watched(contacts, world, plan) else None,
+        contacts=contacts if contacts_watched(contacts, world) else None,
         world=world,
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
-        joined=_joined(states, experiment, start),
+        joined=_joined(states, plan, start),
         memory=_memories(_by_robot(content[Memory], robots), start, time, HOLD_PERIODS / rate, "memory"),
         measures={
             name: values[..., 0]
@@ -308,9 +305,9 @@ def _by_robot(messages: Iterable[M], robots: Sequence[str]) -> list[list[M]]:
     return [sorted(own, key=lambda message: message.stamp) for own in found.values()]
 
 
-def _joined(states: list[list[State]], experiment: Experiment, start: float) -> Array | None:
+def _joined(states: list[list[State]], plan: Plan, start: float) -> Array | None:
     """When each robot took part at first (N,) [s]: 0, but of those on standby; None without such robots."""
-    robots = experiment.robots.values()
+    robots = plan.experiment.robots.values()
     if not any(robot.standby for robot in robots):
         return None
     first = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Final, TypeVar
 
 import msgspec
@@ -13,8 +12,7 @@ import numpy as np
 from agents.network import messages
 from agents.network.messages import Contact, Event, WorldState
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Experiment
-from experiments.definition.plan import Plan
+from experiments.definition.plan import Plan, finds_contacts
 from experiments.recording.clocks import ClockOffset
 from twins.arrays import Array, Index, Mask
 
@@ -35,9 +33,9 @@ def messages_in_run(sent: Iterable[M], start: float, duration: float) -> tuple[M
     return tuple(sorted(kept, key=lambda each: each.stamp))
 
 
-def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState], plan: Plan) -> bool:
-    """Whether contacts were watched for: there are some, or the engine of the world would have found them."""
-    return bool(contacts) or (plan.finds_contacts and any(report.engine == plan.engine_name for report in world))
+def contacts_watched(contacts: Sequence[Contact], world: Iterable[WorldState]) -> bool:
+    """Whether contacts were watched for: there are some, or an engine that would have found them."""
+    return bool(contacts) or any(finds_contacts(engine) for engine in {report.engine for report in world})
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,7 @@ class Trace:
     """Trace of a case. Arrays over samples (T) and robots (N); times since the common start [s]."""
 
     case: str
-    experiment: Experiment  # of this case, overrides applied
+    plan: Plan  # of this case, overrides applied
     seed: int
     robots: tuple[str, ...]  # names, in the order of the rows
     clock: str  # "real" or "virtual"
@@ -160,10 +158,6 @@ class Trace:
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)
     joined: Array | None = None  # (N,) [s] since when each robot takes part; None: all from the start
-
-    @cached_property
-    def plan(self) -> Plan:
-        return Plan(self.experiment)
 
     def sent_by(self, row: int) -> PoseTable:
         return self.sent.take(self.sent.link == row)

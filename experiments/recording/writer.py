@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from agents.body.kinds import KINDS, Figures
 from agents.network.messages import BarePose, Event, Pose, State, Vector
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
 from experiments.recording.ros2 import viewers
@@ -136,7 +136,7 @@ class Recording:
     def __init__(
         self,
         path: Path,
-        experiment: Experiment,
+        plan: Plan,
         document: str = "",
         *,
         case: str,
@@ -194,7 +194,7 @@ class Recording:
         if started is not None:
             about["started"] = repr(started)
         try:
-            self._write_or_fail(self._begin, experiment, document, about)
+            self._write_or_fail(self._begin, plan, document, about)
         except RecordingError:
             self._close_file()
             raise
@@ -269,7 +269,8 @@ class Recording:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _begin(self, experiment: Experiment, document: str, about: dict[str, str]) -> None:
+    def _begin(self, plan: Plan, document: str, about: dict[str, str]) -> None:
+        experiment = plan.experiment
         self._writer.start(profile="ros2", library="zenpark")
         self._writer.add_attachment(0, 0, TOML, "application/toml", document.encode())
         self._writer.add_attachment(0, 0, JSON, "application/json", msgspec.json.encode(experiment))

@@ -162,7 +162,7 @@ def write_video(traces: Mapping[str, Trace], file: Path, speed: float = 4.0) -> 
 
 def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     """A case as what becomes a struct: texts, arrays of doubles, arrays of texts, and structs in it."""
-    net, sent, experiment = trace.plan.links, trace.sent, trace.experiment
+    net, sent, experiment = trace.plan.links, trace.sent, trace.plan.experiment
     arrays = ("time", "position", "yaw", "true_position", "goal", "setpoint")
     columns = [name for name, kind in get_type_hints(RobotMetrics).items() if _is_number(kind)]
     columns += [name for robot in metrics.robots[:1] for name in robot.extra]

@@ -222,7 +222,7 @@ def errors(
     axes = figure.subplots()
     first = {trace.case: trace for trace in first_seed(traces)}
     handles: dict[str, Artist] = {}
-    lowest, highest, tolerance = np.inf, 0.0, traces[0].experiment.tolerance
+    lowest, highest, tolerance = np.inf, 0.0, traces[0].plan.experiment.tolerance
     for k, (name, band) in enumerate((bands or error_bands(traces)).items()):
         line: Line = {"color": CASES[k % len(CASES)], "linestyle": ("-", (0, (5, 1.5)), "-.", ":")[k % 4]}
         if band.seeds > 1:

@@ -111,7 +111,7 @@ def write(
         raise ValueError("there is no case to report: no robot had started")
     cases = [measure(trace) for trace in traces] if measured is None else measured
     first = figures.first_seed(traces)
-    experiment = traces[0].experiment
+    experiment = traces[0].plan.experiment
     seeds = sorted({case.seed for case in cases})
     folder.mkdir(parents=True, exist_ok=True)
     made = read_origin(folder if run is None else run)
@@ -287,7 +287,7 @@ def _pictures(
     of_cases = "all cases, the first one's robots named" if len({trace.case for trace in traces}) > 1 else "by robot"
     drawn_seeds = max((band.seeds for band in bands.values()), default=1)
     curves = f"median and range of {drawn_seeds} seeds" if drawn_seeds > 1 else "single robots thin"
-    pushed = any(each.mass is not None for trace in traces for each in trace.experiment.arena.obstacles.values())
+    pushed = any(each.mass is not None for trace in traces for each in trace.plan.experiment.arena.obstacles.values())
     standing = " Obstacles that can be pushed are where they stood at the start." if pushed else ""
     recorded = f"{seed} Recordings of the others are not kept." if seeds > 1 and drawn_seeds == 1 else ""
     captions = {

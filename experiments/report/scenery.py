@@ -19,8 +19,7 @@ from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.report.style import INK, PAPER
 from experiments.scene.models import circle
 from twins import scene as outlines
@@ -46,16 +45,16 @@ _WALL: Final[dict[str, Any]] = {"color": EDGE, "linewidth": 1.6, "solid_capstyle
 _BOX: Final[dict[str, Any]] = {"facecolor": FLOOR, "edgecolor": "#8a8a8a", "linewidth": 0.5, "linestyle": (0, (4, 2))}
 
 
-def from_above(axes: Axes, experiment: Experiment) -> None:
+def from_above(axes: Axes, plan: Plan) -> None:
     """Draws an arena into a plan view, below everything else."""
-    arena, scene = experiment.arena, bodies.scene(experiment)
+    arena, scene = plan.experiment.arena, plan.scene
     for box in arena.starts.values():
         corner = box.at[0] - box.size[0] / 2, box.at[1] - box.size[1] / 2
         axes.add_patch(Rectangle(corner, *box.size, zorder=0.1, **_BOX))
     x, y, _ = arena.size
     border: dict[str, Any] = {"linewidth": 1.0} if arena.walls else {"linewidth": 0.6, "linestyle": (0, (6, 3))}
     axes.add_patch(Rectangle((-x / 2, -y / 2), x, y, fill=False, edgecolor=INK, zorder=0.6, **border))
-    way = _obstacle_paths(experiment, scene)
+    way = _obstacle_paths(plan, scene)
     for k, name in enumerate(scene.names):
         outline = scene.outline[k]
         if outline is not None and not scene.closed[k]:
@@ -71,19 +70,19 @@ def from_above(axes: Axes, experiment: Experiment) -> None:
             axes.text(x, y, name, fontsize=5, color=EDGE, ha="center", va="center", zorder=0.7, path_effects=halo)
 
 
-def in_space(axes: Axes3D, experiment: Experiment, low: Array, high: Array) -> None:
+def in_space(axes: Axes3D, plan: Plan, low: Array, high: Array) -> None:
     """Draws an arena into a picture of space that shows what is from `low` to `high` (3,) [m], below everything else.
 
     Nothing is cut off at the edges of such a picture, so the border is left out where it does not lie inside.
     """
-    arena, scene = experiment.arena, bodies.scene(experiment)
+    arena, scene = plan.experiment.arena, plan.scene
     for box in arena.starts.values():
         half = 0.5 * np.array(box.size)
         _loop(axes, np.array(box.at) + half * _SQUARE, color="#8a8a8a", linewidth=0.5, linestyle=(0, (4, 2)))
     style: dict[str, Any] = {"linewidth": 0.8} if arena.walls else {"linewidth": 0.5, "linestyle": (0, (6, 3))}
     if (scene.low[:2] >= low[:2]).all() and (scene.high[:2] <= high[:2]).all():
         _loop(axes, 0.5 * np.array(arena.size[:2]) * _SQUARE, color=EDGE, **style)
-    way = _obstacle_paths(experiment, scene)
+    way = _obstacle_paths(plan, scene)
     for k in range(len(scene.names)):
         bottom, top = float(scene.bottom[k]), float(min(scene.top[k], high[2]))
         if bottom >= top:
@@ -100,14 +99,14 @@ def in_space(axes: Axes3D, experiment: Experiment, low: Array, high: Array) -> N
             _loop(axes, _ring(scene, k, way[-1, k]), bottom, color=EDGE, linewidth=0.5, linestyle=(0, (3, 2)))
 
 
-def around(experiment: Experiment, low: Array, high: Array) -> tuple[Array, Array]:
+def around(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
     """Limits of a picture along x and y, with robots from `low` to `high` (2,) [m].
 
     All obstacles as far as they stand in the arena, all start boxes, and the arena itself if it is not much larger.
     """
-    arena, scene = experiment.arena, bodies.scene(experiment)
+    arena, scene = plan.experiment.arena, plan.scene
     rings = [_ring(scene, k, scene.pose[k]) for k in range(len(scene.names))]
-    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _obstacle_paths(experiment, scene)[[-1], k]]
+    rings += [_ring(scene, k, pose) for k in scene.moving for pose in _obstacle_paths(plan, scene)[[-1], k]]
     rings += [np.array(box.at) + 0.5 * np.array(box.size) * _SQUARE for box in arena.starts.values()]
     if rings:
         points = np.clip(np.concatenate(rings), scene.low[:2], scene.high[:2])
@@ -117,16 +116,16 @@ def around(experiment: Experiment, low: Array, high: Array) -> tuple[Array, Arra
     return low, high
 
 
-def tall(experiment: Experiment, most: float) -> float:
+def tall(plan: Plan, most: float) -> float:
     """Height of the tallest obstacle [m], at most `most`; 0 without any."""
-    return min(float(bodies.scene(experiment).top.max(initial=0.0)), most)
+    return min(float(plan.scene.top.max(initial=0.0)), most)
 
 
-def legend(experiments: Sequence[Experiment], *, space: bool = False) -> tuple[list[Artist], list[str]]:
+def legend(plans: Sequence[Plan], *, space: bool = False) -> tuple[list[Artist], list[str]]:
     """Handles and labels of what stands in the arenas, from above or in space; nothing for empty ones."""
     found: dict[str, Artist] = {}
-    for experiment in experiments:
-        for obstacle in experiment.arena.obstacles.values():
+    for arena in (plan.experiment.arena for plan in plans):
+        for obstacle in arena.obstacles.values():
             if obstacle.wall is not None:
                 found["wall"] = Line2D([], [], **_WALL)
             elif obstacle.mass is not None:
@@ -137,7 +136,7 @@ def legend(experiments: Sequence[Experiment], *, space: bool = False) -> tuple[l
                 found["obstacle"] = Patch(**_STANDS)
             if obstacle.plan is not None:
                 found["obstacle's path"] = Line2D([], [], **_PATH)
-        if experiment.arena.starts:
+        if arena.starts:
             found["start box"] = Patch(**_BOX)
     return list(found.values()), list(found)
 
@@ -151,9 +150,9 @@ def _style(scene: Scene, k: int) -> dict[str, Any]:
     return _HANGS if scene.bottom[k] > 0.0 else _STANDS
 
 
-def _obstacle_paths(experiment: Experiment, scene: Scene) -> Array:
+def _obstacle_paths(plan: Plan, scene: Scene) -> Array:
     """Poses (T, M, 3) of obstacles over the run, as finely as a picture shows them."""
-    return scene.along(np.linspace(0.0, experiment.duration_s, 400))
+    return scene.along(np.linspace(0.0, plan.experiment.duration_s, 400))
 
 
 def _ring(scene: Scene, k: int, pose: Array) -> Array:

@@ -161,7 +161,7 @@ def robot_lines(trace: Trace) -> list[Line]:
     if len(trace.robots) <= MANY:
         styles = ["-"] * len(ROBOTS) + ["--"] * len(ROBOTS)
         return [{"color": ROBOTS[i % len(ROBOTS)], "linestyle": styles[i]} for i in range(len(trace.robots))]
-    kinds = [trace.experiment.robots[name].kind for name in trace.robots]
+    kinds = [trace.plan.experiment.robots[name].kind for name in trace.robots]
     return [{"color": KINDS[kind].colour, "linewidth": 0.6, "alpha": 0.7} for kind in kinds]
 
 
@@ -183,7 +183,7 @@ def robot_legend(
     trace = max(traces, key=lambda each: len(each.robots))
     label = trace.robots
     if len(label) > MANY:
-        label = tuple(trace.experiment.robots[name].kind for name in trace.robots)
+        label = tuple(trace.plan.experiment.robots[name].kind for name in trace.robots)
     shown = {name: Line2D([], [], **line) for name, line in zip(label, robot_lines(trace), strict=True)}
     entries = [*shown.values(), *more[0]], [*shown, *more[1]]
     legend_above(figure, entries, columns={4: 4, 6: 3, 7: 4, 8: 4}.get(len(entries[1]), 5))

@@ -63,21 +63,21 @@ def plan_view(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     A few cases in the same arena are laid upon each other, with a colour each; their robots are named, and few of them
     have a marker each. More cases are side by side, and their robots have a colour each.
     """
-    arenas = {msgspec.json.encode(trace.experiment.arena) for trace in traces}
+    arenas = {msgspec.json.encode(trace.plan.experiment.arena) for trace in traces}
     overlaid = 1 < len(traces) <= OVERLAID and len(arenas) == 1
     panels = [list(traces)] if overlaid else [[trace] for trace in traces]
     place = np.concatenate([trace.true_position.reshape(-1, 3)[:, :2] for trace in traces])
     place = place[np.isfinite(place).all(axis=1)]
     low, high = (place.min(axis=0), place.max(axis=0)) if len(place) else (np.zeros(2), np.zeros(2))
     for trace in traces:
-        low, high = scenery.around(trace.experiment, low, high)
+        low, high = scenery.around(trace.plan, low, high)
     size = np.maximum(high - low, 0.4)
     low, high = 0.5 * (low + high) - 0.56 * size, 0.5 * (low + high) + 0.56 * size
-    things = scenery.legend([trace.experiment for trace in traces])
+    things = scenery.legend([trace.plan for trace in traces])
     tallest = min(0.62 * width, 3.6) if overlaid else 3.2
     figure, grid = _plane(len(panels), width, (low, high), tallest, 0.7 + 0.17 * bool(things[1]))
     for axes, shown in zip(grid, panels, strict=True):
-        scenery.from_above(axes, shown[0].experiment)
+        scenery.from_above(axes, shown[0].plan)
         for k, trace in enumerate(shown):
             _draw_from_above(axes, trace, thinned(trace, len(traces)), case_line(k) if overlaid else None)
         axes.set_title("" if overlaid else plain(shown[0].case), pad=3.0)
@@ -161,12 +161,12 @@ def expected_motion(analyses: Mapping[str, Analysis]) -> Figure:
     its links (dashed where the shape misses their targets by more than the tolerance), laid where the leaders are.
     """
     cases = list(analyses.items())
-    half = 0.53 * np.array(cases[0][1].experiment.arena.size[:2])
+    half = 0.53 * np.array(cases[0][1].plan.experiment.arena.size[:2])
     figure, grid = _plane(len(cases), WIDTH, (-half, half), 3.2, 0.6)
     halo = [withStroke(linewidth=1.5, foreground=PAPER)]
     for axes, (name, known) in zip(grid, cases, strict=True):
-        experiment, motion = known.experiment, known.prediction.position
-        scenery.from_above(axes, experiment)
+        experiment, motion = known.plan.experiment, known.prediction.position
+        scenery.from_above(axes, known.plan)
         target = motion[-1] if known.shape is None else _laid_upon(known, known.shape.position, motion[-1])
         error = np.zeros(len(known.asked)) if known.shape is None else known.shape.error
         for link, (i, j) in enumerate(zip(known.asked.receiver, known.asked.sender, strict=True)):
@@ -227,7 +227,7 @@ def formation(traces: Sequence[Trace], width: float = WIDTH) -> Figure:
     Cases have a colour each; the robots of a single case do (paper, figures 13 and 14).
     """
     shown = [trace for trace in traces if has_positions(trace)]
-    things = scenery.legend([trace.experiment for trace in traces], space=True)
+    things = scenery.legend([trace.plan for trace in traces], space=True)
     entries = (_case_entries(traces) if len(traces) > 1 else {}) | _end_entries()
     labels = [*entries, *things[1]]
     fits = fitting(width, labels, 6)
@@ -348,17 +348,17 @@ def _frame(axes: Axes3D, traces: Sequence[Trace]) -> None:
     """Limits, arena and labels of the picture of some cases."""
     place = np.concatenate([trace.true_position.reshape(-1, 3) for trace in traces])
     known = np.isfinite(place).all(axis=1)
-    experiment = traces[0].experiment
+    plan = traces[0].plan
     low, high = place[known].min(axis=0), place[known].max(axis=0)
-    low[:2], high[:2] = scenery.around(experiment, low[:2], high[:2])
+    low[:2], high[:2] = scenery.around(plan, low[:2], high[:2])
     low[2] = min(0.0, low[2])
     size = np.maximum(high - low, 0.4)
     middle = 0.5 * (low + high)
     ground = bool(low[2] > -0.1)
     low, high = middle - 0.54 * size, middle + 0.54 * size
     if ground:
-        low[2], high[2] = 0.0, max(high[2], scenery.tall(experiment, FLAT * float((high - low)[:2].max())))
-    scenery.in_space(axes, experiment, low, high)
+        low[2], high[2] = 0.0, max(high[2], scenery.tall(plan, FLAT * float((high - low)[:2].max())))
+    scenery.in_space(axes, plan, low, high)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     x, y, z = (high - low) / math.dist(high, low)
     wide, tall = 0.87 * x + 0.5 * y, 0.44 * (0.5 * x + 0.87 * y) + 0.9 * z  # from 26° above and 60° aside

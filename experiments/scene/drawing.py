@@ -144,8 +144,7 @@ class SceneDrawing:
         else:
             ring = np.stack([corner, np.roll(corner, -1, 0)], axis=1)
             self._lines("border", np.concatenate([ring, np.zeros((4, 2, 1))], axis=2), look.edge, thickness=2.0)
-        experiment = stage.experiment
-        for name, start in ({} if experiment is None else experiment.arena.starts).items():
+        for name, start in ({} if stage.plan is None else stage.plan.experiment.arena.starts).items():
             half = 0.5 * np.array(start.size)
             ring = np.array(start.at) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
             ends = np.stack([ring, np.roll(ring, -1, 0)], axis=1)

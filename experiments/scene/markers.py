@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from agents.network.messages import Vector
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.ros2.viewers import CYLINDER, LINE_LIST, LINE_STRIP, TEXT, Draw, Marker
 from experiments.scene.stage import NOWHERE, UNKNOWN, LinkTracker, Stage, link_colours, segments
 from twins.scene import corners
@@ -18,9 +18,9 @@ OBSTACLE: Final = (168, 172, 180)
 LINE_M: Final = 0.01
 
 
-def drawing(experiment: Experiment) -> Draw:
+def drawing(plan: Plan) -> Draw:
     """The function that draws a case: of a time [s, UTC] and the places [m] of the robots known then."""
-    stage = Stage.of_experiment(experiment)
+    stage = Stage.of_plan(plan)
     tracker, begun = LinkTracker(stage), [float("nan")]
     still = [*_arena(stage), *_robots(stage)]
 

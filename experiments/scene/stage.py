@@ -23,9 +23,7 @@ from agents.kinds.khepera4 import KHEPERA4
 from agents.network.messages import EMERGENCY, Ranges, Status, WorldState
 from agents.plugins import registry
 from agents.plugins.laws import Gradient
-from experiments.definition import bodies
-from experiments.definition.bodies import WORLD
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import WORLD
 from experiments.definition.graph import Links, links
 from experiments.definition.plan import Plan
 from twins.arrays import Array, Index, Mask, norm
@@ -146,12 +144,11 @@ class Stage:
     links: Links
     leaders: tuple[str, ...]
     margin: float  # [m] between surfaces, kept by avoidance; 0 without any
-    experiment: Experiment | None = None  # None: only the robots are known
-    plan: Plan | None = field(default=None, repr=False)
+    plan: Plan | None = field(default=None, repr=False)  # None: only the robots are known
 
     @classmethod
-    def of_experiment(cls, experiment: Experiment) -> Stage:
-        plan = Plan(experiment)
+    def of_plan(cls, plan: Plan) -> Stage:
+        experiment = plan.experiment
         avoidance = _if_installed(lambda: plan.avoidance)
         formation = _if_installed(lambda: plan.formation)
         return cls(
@@ -160,11 +157,10 @@ class Stage:
             kinds=plan.kinds,
             places=tuple(place_of(robot.body) for robot in experiment.robots.values()),
             shadowed=np.array([robot.shadow is not None for robot in experiment.robots.values()], dtype=bool),
-            scene=bodies.scene(experiment),
+            scene=plan.scene,
             links=links([]) if formation is None else formation.links,
             leaders=() if formation is None else plan.leaders,
             margin=0.0 if avoidance is None else avoidance.kept_gap(),
-            experiment=experiment,
             plan=plan,
         )
 
@@ -216,7 +212,7 @@ class Stage:
     @cached_property
     def size(self) -> Array:
         """Size of what a picture shows (3,) [m]: the arena, up to the highest robot or obstacle."""
-        robots = () if self.experiment is None else self.experiment.robots.values()
+        robots = () if self.plan is None else self.plan.experiment.robots.values()
         high = max([NAME_M, *(robot.hover or 0.0 for robot in robots), *self.tops.tolist()]) + NAME_M
         return np.array([*(self.scene.high - self.scene.low)[:2], high])
 

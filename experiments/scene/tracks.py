@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from agents.decision.lifecycle import Phase
 from agents.network.messages import Event, HostClock, Memory, State, Status, WorldState
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.clocks import Correction
 from experiments.recording.playback import AboutRun, topic_of
 from experiments.recording.reader import HEAD, RecordingError, Records
@@ -78,7 +78,7 @@ class Tracks:
     """A recording as tracks."""
 
     case: str
-    experiment: Experiment
+    plan: Plan
     clock: str  # "real" or "virtual"
     robots: tuple[str, ...]
     tracks: tuple[Track, ...]  # in the order of `robots`
@@ -119,11 +119,11 @@ def read(path: Path) -> Tracks:
             except Undecodable as error:
                 raise RecordingError(f"{path}: a message of {name} is damaged: {error}") from None
     run = AboutRun.of(records)
-    experiment = run.experiment
+    plan = run.plan
     events, statuses = sorted(rare[Event], key=lambda event: event.stamp), rare[Status]
     start = run.start(events, statuses, path)
     right = Correction(rare[HostClock])
-    robots = tuple(experiment.robots)
+    robots = plan.names
 
     def since(robot: str, stamps: Array) -> Array:
         return right.stamps(robot, stamps) - start
@@ -153,7 +153,7 @@ def read(path: Path) -> Tracks:
     reports = tuple(msgspec.structs.replace(each, stamp=each.stamp - start) for each in rare[WorldState])
     there = [track.time for track in tracks if len(track.time)]
     return Tracks(
-        run.case, experiment, run.clock, robots, tracks, tuple(sorted(said, key=lambda event: event.stamp)), reports,
+        run.case, plan, run.clock, robots, tracks, tuple(sorted(said, key=lambda event: event.stamp)), reports,
         begin=min([0.0, *(float(time[0]) for time in there)]),
         end=max([0.0, *(float(time[-1]) for time in there)]),
     )  # fmt: skip

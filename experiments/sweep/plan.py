@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from agents.plugins.registry import TRIGGERS
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document, chosen
 from experiments.file.overrides import Override, parse
@@ -84,7 +84,7 @@ class Cell:
 
     case: str  # name of the case
     parameters: Mapping[str, Any]  # values of the axes, by path
-    experiment: Experiment  # what is run
+    plan: Plan  # what is run
     # digest of what the ratios are taken over: the first case of the file with the same values, but for those of its
     # trigger
     reference: str
@@ -168,17 +168,17 @@ def combination(
     compared_with = changed if others == values else _changed(file, settings, others)
     reference = digest(compared_with[first])
     shared = [axis for axis in others if _has(first, compared_with[first], paths[axis])]
-    for name, experiment, given in (
+    for name, plan, given in (
         (first, compared_with[first], others),
         *((name, changed[name], values) for name in names),
     ):
-        own = [axis for axis in given if _has(name, experiment, paths[axis])]
+        own = [axis for axis in given if _has(name, plan, paths[axis])]
         mine = {axis.path: paths[axis].value for axis in own}
         met = {axis.path: paths[axis].value for axis in own if axis in shared or paths[axis].path[0] in ENVIRONMENT}
-        yield Cell(name, mine, experiment, reference, digest(experiment), met)
+        yield Cell(name, mine, plan, reference, digest(plan), met)
 
 
-def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> dict[str, Experiment]:
+def _changed(file: str, settings: Sequence[str], values: Mapping[Axis, str]) -> dict[str, Plan]:
     try:
         return document.read(file, [*settings, *(f"{axis.path}={value}" for axis, value in values.items())]).cases()
     except DocumentError as error:
@@ -255,14 +255,14 @@ def _parsed(axis: Axis, value: str, read: Document) -> Override:
         raise refusal(axis.argument, problem.message, problem.hint.replace("--set ", "")) from None
 
 
-def _has(case: str, experiment: Experiment, parsed: Override) -> bool:
+def _has(case: str, plan: Plan, parsed: Override) -> bool:
     """Whether a case has what is changed: a parameter of a plug-in if it has chosen that plug-in."""
     path = parsed.path
     if parsed.case not in (None, case):
         return False
     for end in range(1, len(path)):
         if group_of(path[:end]) is not None:
-            choice: Any = experiment
+            choice: Any = plan.experiment
             for step in path[:end]:
                 choice = (
                     getattr(choice, step)

@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.body.interface import BodyError
 from agents.plugins import registry
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.definition.standby import without_standby
 from experiments.file.structure import plugin_files
 from experiments.metrics.measure import ended_early, failures
@@ -31,7 +31,7 @@ PACKAGES: Final = ("agents", "twins", "experiments")  # whose code decides what 
 # fields of a trace that a lean log of `experiments.virtual_time.simulation.simulate` keeps
 LEAN: Final = frozenset(
     {
-        *("case", "experiment", "seed", "robots", "clock", "time", "true_position", "events", "dropped"),
+        *("case", "plan", "seed", "robots", "clock", "time", "true_position", "events", "dropped"),
         *("ticks", "decisions", "interventions", "avoided", "lost", "missed_deadlines"),
     }
 )
@@ -71,36 +71,35 @@ def fly(case: bytes, seeds: Sequence[int], code: str) -> bytes:
         A `WorkResult` as JSON, runs in the order of the seeds.
     """
     try:
-        experiment = msgspec.json.decode(case, type=Experiment)
-        mine = code_of(experiment)
+        plan = Plan.decoded(case)
+        mine = code_of(plan)
     except (msgspec.ValidationError, registry.PluginError) as error:  # on a machine with another version, or no plug-in
         return msgspec.json.encode(WorkResult([], stranger=str(error)))
     if mine != code:
         return msgspec.json.encode(WorkResult([], stranger=f"{mine}, not {code}"))
-    runs, failed = _flown(without_standby(experiment), tuple(seeds))
+    runs, failed = _flown(without_standby(plan), tuple(seeds))
     failed |= {run.seed: run.failure for run in runs if run.failure}
     whole = sorted((run for run in runs if not run.failure), key=lambda run: seeds.index(run.seed))
     return msgspec.json.encode(WorkResult(whole, failed))
 
 
-def digest(experiment: Experiment) -> str:
+def digest(plan: Plan) -> str:
     """The same for experiments that run in the same way: title, source, cases, criteria and the seed are left out.
 
     Robots and links count in the order of the file, by which starts are drawn and sums are formed.
     """
-    bare = msgspec.structs.replace(experiment, title="", source="", cases={}, criteria=[], seed=0)
-    return hashlib.sha256(msgspec.json.encode(bare)).hexdigest()[:20]
+    bare = plan.changed(title="", source="", cases={}, criteria=[], seed=0)
+    return hashlib.sha256(msgspec.json.encode(bare.experiment)).hexdigest()[:20]
 
 
-def code_of(experiment: Experiment) -> str:
+def code_of(plan: Plan) -> str:
     """Digest of all that decides on results: our code, that of its plug-ins and of metrics, and the versions of numpy
     and of the libraries of the engine, which has its name, and of the law.
 
     Of a plug-in the module counts in which it stands; another module that it imports does not.
     """
-    files = plugin_files(experiment)
-    engine = registry.split(experiment.world.engine)[0]
-    library = registry.build(registry.LAWS, experiment.formation.law).LIBRARY
+    files, library = plugin_files(plan), plan.law.LIBRARY
+    engine = plan.engine_name
     libraries = [engine, *engine_versions(engine), *(engine_versions(library) if library else [])]
     others = sorted(_file_digest(file) for file in files if file.parent.parent != ROOT)
     others += [f"{name} {_file_digest(Path(getfile(type(each))))}" for name, each in foreign_metrics().items()]
@@ -114,16 +113,16 @@ def lean_enough() -> bool:
     return all(LEAN.issuperset(metric.needs) for metric in swept_metrics().values())
 
 
-def _flown(experiment: Experiment, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[int, str]]:
+def _flown(plan: Plan, seeds: tuple[int, ...]) -> tuple[list[RunMetrics], dict[int, str]]:
     """Metrics of the runs of these seeds, and why others failed."""
     runs, failed = [], {}
     for seed in seeds:
         try:
-            log = simulate(experiment, seed, lean=lean_enough())
+            log = simulate(plan, seed, lean=lean_enough())
         except FAILED as error:
             failed[seed] = str(error)
         else:
-            runs.append(run_metrics(Logbook(log, experiment, "").trace()))
+            runs.append(run_metrics(Logbook(log, plan, "").trace()))
     return runs, failed
 
 
@@ -143,7 +142,7 @@ def run_metrics(trace: Trace) -> RunMetrics:
 
 def _early_end(trace: Trace) -> str:
     """How much of its time a run took, if it ended early."""
-    return f"ended at {trace.time[-1]:.1f} s of {trace.experiment.duration_s:g} s" if ended_early(trace) else ""
+    return f"ended at {trace.time[-1]:.1f} s of {trace.plan.experiment.duration_s:g} s" if ended_early(trace) else ""
 
 
 @cache

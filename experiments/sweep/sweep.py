@@ -22,7 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document, load
 from experiments.file.problems import refusal
@@ -109,7 +109,7 @@ def sweep(
     plan = cells(read, str(file), settings, axes, cases)
     folder = Path(out) if out is not None else folder_of(read, axes, "sweep")
     with Store(folder) as store:
-        notes = store.changed_since(origin(read, [cell.experiment for cell in plan]))
+        notes = store.changed_since(origin(read, [cell.plan for cell in plan]))
         with workers(scheduler, processes) as crew:
             runner = SweepRunner(store, crew)
             with suppress(KeyboardInterrupt):  # what is done is kept
@@ -140,12 +140,12 @@ class SweepRunner:
         works = [
             Work(
                 cell.digest,
-                document.write_json(cell.experiment),
+                document.write_json(cell.plan),
                 tuple(missing[k : k + size]),
-                code_of(cell.experiment),
+                code_of(cell.plan),
             )
             for cell, missing in lacking
-            for size in [min(piece, side_by_side(cell.experiment))]
+            for size in [min(piece, side_by_side(cell.plan))]
             for k in range(0, len(missing), size)
         ]
         done = 0
@@ -157,7 +157,7 @@ class SweepRunner:
 
     def missing(self, cell: Cell, seeds: Sequence[int]) -> list[int]:
         """Seeds of a cell that are still to be done."""
-        return self.store.missing(cell.digest, code_of(cell.experiment), seeds)
+        return self.store.missing(cell.digest, code_of(cell.plan), seeds)
 
     def rows(self, plan: Sequence[Cell], seeds: Sequence[int]) -> list[CellRow]:
         """The cells of which anything is done."""
@@ -165,7 +165,7 @@ class SweepRunner:
         found = []
         for cell in plan:
             mine = self._runs(cell, seeds)
-            failed = self.store.failed(cell.digest, code_of(cell.experiment))
+            failed = self.store.failed(cell.digest, code_of(cell.plan))
             lost = sum(seed in failed for seed in seeds)
             if mine or lost:
                 found.append(table.row(cell, mine, self._runs(by_digest[cell.reference], seeds), lost))
@@ -176,7 +176,7 @@ class SweepRunner:
         return tuple(
             f"{cell.case} {' '.join(f'{path}={value}' for path, value in cell.parameters.items())}, seed {seed}: {why}"
             for cell in _distinct(plan)
-            for seed, why in self.store.failed(cell.digest, code_of(cell.experiment)).items()
+            for seed, why in self.store.failed(cell.digest, code_of(cell.plan)).items()
             if seed in seeds
         )
 
@@ -186,12 +186,13 @@ class SweepRunner:
         return [*unusable_metrics(), *dict.fromkeys(text for run in runs for text in run.metric_faults)]
 
     def _runs(self, cell: Cell, seeds: Sequence[int]) -> dict[int, RunMetrics]:
-        done = self.store.runs(cell.digest, code_of(cell.experiment))
+        done = self.store.runs(cell.digest, code_of(cell.plan))
         return {seed: done[seed] for seed in seeds if seed in done}
 
 
-def side_by_side(experiment: Experiment) -> int:
+def side_by_side(plan: Plan) -> int:
     """Seeds of an experiment that one process simulates side by side."""
+    experiment = plan.experiment
     samples = (experiment.duration_s + AROUND_S) * experiment.rates.state_hz
     size = LEAN_BYTES if lean_enough() else WHOLE_BYTES
     return max(1, min(MOST_SEEDS, int(MOST_BYTES / (size * samples * len(experiment.robots)))))
@@ -203,10 +204,10 @@ def folder_of(read: Document, axes: Sequence[Axis], what: str) -> Path:
     return RUNS / (name if len(name) <= LONGEST else f"{name[: LONGEST - 9]}-{_digest(name)[:8]}")
 
 
-def origin(read: Document, experiments: Iterable[Experiment]) -> StoreOrigin:
+def origin(read: Document, plans: Iterable[Plan]) -> StoreOrigin:
     """Origin of runs of this process."""
-    codes = sorted({code_of(experiment) for experiment in experiments})
-    text = read.listing + document.write_json(read.experiment).decode()
+    codes = sorted({code_of(plan) for plan in plans})
+    text = read.listing + document.write_json(read.plan).decode()
     return StoreOrigin(version("zenpark"), _digest("".join(codes)), _digest(text))
 
 

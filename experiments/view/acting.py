@@ -273,9 +273,9 @@ class Parameter:
 def parameters(stage: Stage) -> list[Parameter]:
     """Parameters that robots change in flight: the numbers of the trigger, and two of the formation."""
     assert stage.plan is not None
-    assert stage.experiment is not None
+    assert stage.plan is not None
     trigger: Any = stage.plan.trigger
-    formation = stage.experiment.formation
+    formation = stage.plan.experiment.formation
     found = [Parameter(f"trigger.{name}", value, _unit(trigger, name))
              for name, value in msgspec.structs.asdict(trigger).items()]  # fmt: skip
     found += [Parameter(name, getattr(formation, name), _unit(formation, name)) for name in ("clamp", "tracking_gain")]

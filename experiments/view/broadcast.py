@@ -51,10 +51,10 @@ class Broadcast:
                 self._sent.append((message.logged, message.channel, message.data))
         self._sent.sort(key=lambda each: each[0])
         about = AboutRun.of(records)
-        self.experiment, self.case = about.experiment, about.case
+        self.plan, self.case = about.plan, about.case
         if not self._sent:
             raise RecordingError(f"{path}: holds no message; there is nothing to replay")
-        self._session, self.keys = session, Keys(realm or self.experiment.network.realm)
+        self._session, self.keys = session, Keys(realm or self.plan.experiment.network.realm)
         self.begin, self.end = self._sent[0][0] * 1e-9, self._sent[-1][0] * 1e-9  # [s, UTC]
         self._publishers: dict[str, Any] = {}
         self._declared: list[object] = []
@@ -64,7 +64,7 @@ class Broadcast:
 
         Raises ExplainedError if a run or a robot is up in the realm, before or while it plays.
         """
-        keys, names = self.keys, [self.keys.alive(name) for name in self.experiment.robots]
+        keys, names = self.keys, [self.keys.alive(name) for name in self.plan.names]
         began, mine = Utc().utc(), str(self._session.zid())
         owners = Keys.life(keys.alive("*"), "*")
         watched = (keys.conductor, keys.alive("*"), owners, keys.world_alive)
@@ -86,7 +86,7 @@ class Broadcast:
         try:
             self._declared.append(claim(self._session, names, began=began, endpoints=endpoints, stop=ended))
             announced = pubsub.pose_publisher(self._session, keys.experiment, messages.JSON)
-            announced.put(document.case_document(self.experiment, self.case))
+            announced.put(document.case_document(self.plan, self.case))
             self._declared += [announced, *(pubsub.alive_token(self._session, token) for token in names)]
             last, now = clock.t, time.monotonic()
             while not ended.wait(STEP_S):
@@ -119,7 +119,7 @@ class Broadcast:
             entry = topic.message(
                 **{name: getattr(entry, name) for name in topic.message.__struct_fields__ if hasattr(entry, name)}
             )
-        encoding: messages.Encoding = self.experiment.network.encoding if topic.message in ENCODED else "json"
+        encoding: messages.Encoding = self.plan.experiment.network.encoding if topic.message in ENCODED else "json"
         key = topic.key(self.keys).replace("*", getattr(entry, "robot", ""))
         publisher = self._publishers.get(key)
         if publisher is None:

@@ -232,7 +232,7 @@ class LiveView:
             phase = "no router answers"
         elif not phase:
             phase = "waiting for robots" if not stage.names else "not started"
-        duration = stage.experiment.duration_s if stage.experiment is not None else 0.0
+        duration = stage.plan.experiment.duration_s if stage.plan is not None else 0.0
         panel.show_head(observer.case, phase, elapsed, duration, self._watched.words)
         panel.show_robots(rows)
         net, names = stage.links, stage.names

@@ -108,7 +108,7 @@ class Observer:
             for report in self.robots.values():
                 report.rate, report.sent = report.sent / (now - self._rated), 0
             self._rated = now
-        if not changed and self.stage.experiment is None and now - self._opened > UNKNOWN_S:
+        if not changed and self.stage.plan is None and now - self._opened > UNKNOWN_S:
             names = tuple(sorted(name for name, report in self.robots.items() if report.known))
             if names != self.stage.names:
                 self._begin(Stage.of_robots(names))
@@ -122,9 +122,9 @@ class Observer:
                 read = document.received(sample.payload.to_bytes().decode(), str(sample.key_expr))
             except (DocumentError, UnicodeDecodeError):
                 continue  # of another version: robots are drawn without it
-            case, experiment = next(iter(read.cases().items()))
-            if (case, experiment) != (self.case, self.stage.experiment):
-                self._begin(Stage.of_experiment(experiment), case)
+            case, plan = next(iter(read.cases().items()))
+            if (case, plan) != (self.case, self.stage.plan):
+                self._begin(Stage.of_plan(plan), case)
                 self.events.clear()
                 changed = True
         return changed
@@ -190,10 +190,10 @@ class Observer:
     def phase(self) -> str:
         """Phase of the case by the conductor's last words, else by the clock; empty before the start."""
         told = next((event.text for event in reversed(self.events) if event.kind == "phase"), "")
-        elapsed, experiment = self.elapsed, self.stage.experiment
-        if told or elapsed is None or experiment is None:
+        elapsed, plan = self.elapsed, self.stage.plan
+        if told or elapsed is None or plan is None:
             return told
-        return next((name for at, name in reversed(experiment.phases) if elapsed >= at), "")
+        return next((name for at, name in reversed(plan.experiment.phases) if elapsed >= at), "")
 
     def now(self) -> float:
         """Time [s, UTC] by the stamps of the statuses: that of a recording, where one is played."""

@@ -14,7 +14,7 @@ import numpy as np
 from agents.body.interface import BodyState
 from agents.decision.lifecycle import RUNNING
 from agents.network.messages import Event
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.scene.stage import Condition, LinkTracker, Moment, Stage, Trail
 from experiments.view.live import FRAME_S, Page
 from experiments.view.panel import PLOT_S, Row, known
@@ -42,10 +42,10 @@ class PacedView:
         self._page = Page(server, dark=dark)
         self._opened = time.monotonic()
 
-    def begin(self, case: str, experiment: Experiment) -> Callable[[Instant], object]:
+    def begin(self, case: str, plan: Plan) -> Callable[[Instant], object]:
         """Another case begins; returns what its simulation calls."""
-        stage = self._stage = Stage.of_experiment(experiment)
-        self._case, self._experiment = case, experiment
+        stage = self._stage = Stage.of_plan(plan)
+        self._case, self._plan = case, plan
         rows = len(stage.names)
         self._tracker, self._trail = LinkTracker(stage), Trail(rows)
         self._sent, self._sent_at = [deque[float]() for _ in stage.names], [-inf] * rows
@@ -146,7 +146,7 @@ class PacedView:
         ]  # fmt: skip
         phase = "running" if moment.time is not None and moment.time >= 0.0 else "taking off"
         where = f"virtual time, {self.clock.speed:g} times as fast" + ("" if self.clock.playing else ", paused")
-        panel.show_head(self._case, phase, moment.time, self._experiment.duration_s, where)
+        panel.show_head(self._case, phase, moment.time, self._plan.experiment.duration_s, where)
         panel.show_robots(rows)
         panel.show_links(moment.error, [None] * len(moment.error))
         panel.show_events(self._events, 0.0)

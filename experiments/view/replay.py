@@ -40,7 +40,7 @@ class Film:
     """A recorded case as moments."""
 
     def __init__(self, tracks: Tracks) -> None:
-        self.tracks, self.stage = tracks, Stage.of_experiment(tracks.experiment)
+        self.tracks, self.stage = tracks, Stage.of_plan(tracks.plan)
         self._links = LinkTracker(self.stage)
         self._ages: Array = TRAIL_S * np.arange(TRAIL, dtype=np.float64)
 
@@ -270,7 +270,7 @@ class ReplayView:
             self._slider.value = round(t, 2)
         said = [event for event in tracks.events if event.stamp <= t]
         phase = next((event.text for event in reversed(said) if event.kind == "phase"), "")
-        panel.show_head(tracks.case, phase, t, tracks.experiment.duration_s, self._where)
+        panel.show_head(tracks.case, phase, t, tracks.plan.experiment.duration_s, self._where)
         panel.show_robots(film.rows(min(t, tracks.end)))
         error = film.moment(min(t, tracks.end)).error
         panel.show_links(error, [None] * len(error))

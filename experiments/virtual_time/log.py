@@ -19,8 +19,6 @@ from agents.decision.stepping import Words
 from agents.network import messages
 from agents.safety.hazards import Outcome
 from experiments.arrays import PoseTable
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
 from experiments.definition.graph import Links
 from experiments.definition.plan import Plan
 from experiments.recording.topics import Message
@@ -53,11 +51,10 @@ T = TypeVar("T")
 class Logbook:
     """Virtual run as a trace or a recording."""
 
-    def __init__(self, log: Log, experiment: Experiment, case: str) -> None:
-        self._log, self._experiment, self._case = log, experiment, case
-        self._scene = bodies.scene(experiment)
-        self._plan = Plan(experiment)
-        self._links: Links = self._plan.pose_links
+    def __init__(self, log: Log, plan: Plan, case: str) -> None:
+        self._log, self._plan, self._case = log, plan, case
+        self._experiment, self._scene = plan.experiment, plan.scene
+        self._links: Links = plan.pose_links
 
     @cached_property
     def goals(self) -> Goals | None:
@@ -91,7 +88,7 @@ class Logbook:
         columns = {what: None if each is None else each[run] for what, each in columns.items()}
         return Trace(
             case=self._case,
-            experiment=self._experiment,
+            plan=self._plan,
             seed=self._log.seed,
             robots=log.names,
             clock="virtual",
@@ -107,7 +104,7 @@ class Logbook:
             ),
             interventions=log.interventions,
             avoided=log.avoided,
-            contacts=contacts if contacts_watched(contacts, world, self._plan) else None,
+            contacts=contacts if contacts_watched(contacts, world) else None,
             world=world,
             dropped=self._log.lost,
             foreign=np.zeros(len(log.names), dtype=np.intp),
@@ -121,13 +118,13 @@ class Logbook:
         """Writes a recording of the whole run, take-off and landing included."""
         with Recording(
             path,
-            self._experiment,
+            self._plan,
             document,
             case=self._case,
             seed=self._log.seed,
             clock="virtual",
             started=EPOCH,
-            draw=markers.drawing(self._experiment),
+            draw=markers.drawing(self._plan),
             chunk_bytes=LARGE_CHUNK_BYTES,
         ) as recording:
             for logged, message, size in heapq.merge(*self._messages(), key=itemgetter(0)):

@@ -19,7 +19,6 @@ from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
 from agents.vectors import UNKNOWN, Vector
 from experiments.arrays import PoseTable
-from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.recording.trace import EPOCH
@@ -64,7 +63,7 @@ class VirtualCentre:
     Phases and the common start are the conductor's, and known at once, as they are to the robots.
     """
 
-    def __init__(self, experiment: Experiment, plan: Plan, robots: Sequence[Robot], seed: int) -> None:
+    def __init__(self, plan: Plan, robots: Sequence[Robot], seed: int) -> None:
         names = plan.names
         self.centre = Centre([plan.assignment(name, centrally=True) for name in names])
         self._robots, self._needed = robots, self.centre.needed
@@ -72,7 +71,7 @@ class VirtualCentre:
             self.centre.mark_alive(row)  # all robots are there from the beginning
         self._guided = [row for row, robot in enumerate(robots) if robot.guidance is not None]
         self._poses, self._goals = (
-            Channel(conditions_of(experiment, [(names[row], names[row]) for row in rows], seed, stream=stream))
+            Channel(conditions_of(plan, [(names[row], names[row]) for row in rows], seed, stream=stream))
             for rows, stream in ((self._needed, TO_CENTRE), (self._guided, FROM_CENTRE))
         )
         self._link_of = {row: link for link, row in enumerate(self._needed)}
@@ -81,7 +80,7 @@ class VirtualCentre:
         self._sent: list[Arrived] = []
         self._followed: list[Arrived] = []
         self._received: list[Arrived] = []
-        self._sizes = _Sizes(experiment, names)
+        self._sizes = _Sizes(plan)
 
     def transmit(self, sample: Sample, start: float, size: int) -> None:
         """A robot transmits its pose to the central controller; see `VirtualNetwork.transmit`."""
@@ -139,8 +138,8 @@ class VirtualCentre:
 class _Sizes:
     """Sizes of payloads, as a real network carries them."""
 
-    def __init__(self, experiment: Experiment, names: Sequence[str]) -> None:
-        self._names, self._encoding = names, experiment.network.encoding
+    def __init__(self, plan: Plan) -> None:
+        self._names, self._encoding = plan.names, plan.experiment.network.encoding
 
     def of(self, sample: Sample, start: float) -> int:
         """Bytes of a pose; `start` is the common start [s]."""
@@ -170,12 +169,11 @@ def _table(arrived: Sequence[Arrived], begin: float, *, bare: bool = False, goal
 class VirtualNetwork:
     """Carries poses between robots, and poses and goals between them and their centre, if they have one."""
 
-    def __init__(self, experiment: Experiment, plan: Plan, robots: Sequence[Robot], seed: int, *, lean: bool) -> None:
+    def __init__(self, plan: Plan, robots: Sequence[Robot], seed: int, *, lean: bool) -> None:
         """Network of all robots; `lean` as for `experiments.virtual_time.simulation.simulate`."""
         self._robots, self._lean = robots, lean
-        names = plan.names
         ends = [(sender.name, robot.assignment.name) for robot in robots for sender in robot.neighbours.all]
-        self._channel = Channel(conditions_of(experiment, ends, seed))
+        self._channel = Channel(conditions_of(plan, ends, seed))
         # by link: the robot that receives on it, and the number among its links
         self.receivers = [(robot, k) for robot in robots for k in range(len(robot.neighbours.all))]
         self._links: list[list[int]] = [[] for _ in robots]  # on which each robot is the sender
@@ -183,10 +181,10 @@ class VirtualNetwork:
             self._links[robot.neighbours.all[k].sender].append(link)
             robot.neighbours.mark_alive(k)  # all robots are there from the beginning
         guided = any(robot.guidance is not None for robot in robots)
-        self.centre = VirtualCentre(experiment, plan, robots, seed) if guided else None
+        self.centre = VirtualCentre(plan, robots, seed) if guided else None
         self.seq = [0] * len(robots)  # number of the last pose of each robot
         self.retired: set[int] = set()  # robots that are silent
-        self._sizes = _Sizes(experiment, names)
+        self._sizes = _Sizes(plan)
         self._sent, self._received = _Samples(), _Samples()
         self._words: list[Words] = []  # said with the poses, where they say something
         # names and sizes of the variables that they say

@@ -20,8 +20,7 @@ from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.safety.hazards import Incident
 from experiments.arrays import PoseTable
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.bodies import body_request, shadow_periods, shared_world
 from experiments.definition.plan import Plan
 from experiments.virtual_time.company import AT_END, AT_HAZARDS, LEAN, PLACES, WIDTH, Ledger
 from experiments.virtual_time.conductor import VirtualConductor
@@ -88,7 +87,7 @@ class Instant:
 
 
 def simulate(
-    experiment: Experiment,
+    plan: Plan,
     seed: int,
     *,
     quiet: bool = False,
@@ -97,7 +96,7 @@ def simulate(
     progress: Callable[[float], object] = lambda _: None,
     watch: Callable[[Instant], object] | None = None,
 ) -> Log:
-    """Flies one case of an experiment.
+    """Flies one case, compiled.
 
     Args:
         seed: Of all that is random.
@@ -112,7 +111,7 @@ def simulate(
         Stuck: If robots do not become ready, airborne or done.
         PluginError: If a plug-in fails; the error names it.
     """
-    flight = Flight(experiment, seed, quiet=quiet, lean=lean)
+    flight = Flight(plan, seed, quiet=quiet, lean=lean)
     try:
         flight.fly(landing=landing, progress=progress, watch=watch)
     except FAILURES as error:
@@ -124,20 +123,19 @@ def simulate(
 class Flight:
     """A run in virtual time."""
 
-    def __init__(self, experiment: Experiment, seed: int, *, quiet: bool, lean: bool) -> None:
-        plan = Plan(experiment)
-        self.experiment, self._seed, self.lean = experiment, seed, lean
+    def __init__(self, plan: Plan, seed: int, *, quiet: bool, lean: bool) -> None:
+        self.plan, self._seed, self.lean = plan, seed, lean
         self.names = names = plan.names
         self.robots = [Robot(plan.assignment(name)) for name in names]
-        request = bodies.body_request(experiment, names, seed, quiet=quiet)
+        request = body_request(plan, names, seed, quiet=quiet)
         request = replace(request, external=(False,) * len(names))  # no motion capture in virtual time
-        self.twin = TwinBody(request, bodies.shared_world(experiment, names))
-        self._body = shadowed(self.twin, request, bodies.shadow_periods(experiment, names))
-        self.network = VirtualNetwork(experiment, plan, self.robots, seed, lean=lean)
+        self.twin = TwinBody(request, shared_world(plan, names))
+        self._body = shadowed(self.twin, request, shadow_periods(plan, names))
+        self.network = VirtualNetwork(plan, self.robots, seed, lean=lean)
         self._conductor = VirtualConductor(self.robots)
-        rates = experiment.rates
+        rates = plan.experiment.rates
         self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
-        self._duration = experiment.duration_s - 0.5 * self.dt  # [s] robots that land later are not lost
+        self._duration = plan.experiment.duration_s - 0.5 * self.dt  # [s] robots that land later are not lost
         self._tick = 0
         self.stretches: Stretches | None = None  # compiled ones, where they pay
         self._samples: list[dict[str, Any]] = []
@@ -172,7 +170,7 @@ class Flight:
                 if watch is not None:
                     watch(Instant(t - conductor.start_at, t, self.robots, self._states, self.twin.engine))
                 self._sample(t)
-            if not landing and t - conductor.start_at >= self.experiment.duration_s - 0.5 * dt:
+            if not landing and t - conductor.start_at >= self.plan.experiment.duration_s - 0.5 * dt:
                 return
             conductor.give_orders(t, dt)
             self.twin.begun_at = conductor.start_at
@@ -288,7 +286,7 @@ class Flight:
             interventions=np.array([robot.interventions for robot in self.robots], dtype=np.intp),
             avoided=np.array([robot.evasions for robot in self.robots], dtype=np.intp),
             touches=tuple(replace(touch, time=touch.time - begin) for touch in self._touches),
-            ticks=round(self.experiment.duration_s / self.dt),
+            ticks=round(self.plan.experiment.duration_s / self.dt),
             airborne=conductor.airborne_at - begin,
             ended=self._tick * self.dt - begin,
             memory=_columns([[memory for memory, _ in each] for each in self._remembered]),

@@ -28,7 +28,7 @@ from agents.decision.lifecycle import READY
 from agents.plugins.planners import NO_TARGET, Itinerary
 from agents.robot import Robot
 from agents.user_folder import cache_folder
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording.version import digest
 from experiments.virtual_time import company
 from experiments.virtual_time.company import AT_END, Ledger, Member, Planned, Way
@@ -88,7 +88,7 @@ STEADY: Final = frozenset({"numpy", "msgspec"})  # of others, but no plug-ins
 class Flown(Protocol):
     """A run in virtual time, as stretches take it over and leave it."""
 
-    experiment: Experiment
+    plan: Plan
     robots: list[Robot]
     twin: TwinBody
     network: VirtualNetwork
@@ -108,7 +108,8 @@ class Flown(Protocol):
 
 def stretches_of(flight: Flown) -> Stretches | None:
     """Compiled stretches of a flight, where they are possible and pay; else None: then it is flown as it is."""
-    ticks = flight.experiment.duration_s * flight.experiment.rates.body_hz
+    experiment = flight.plan.experiment
+    ticks = experiment.duration_s * experiment.rates.body_hz
     WORK[0] += TICK_S * ticks * len(flight.robots)
     return None if WORK[0] < PAYS_S or not possible(flight) else Stretches(flight)
 
@@ -143,10 +144,10 @@ class Stretches:
     flown: int  # ticks so far
 
     def __init__(self, flight: Flown) -> None:
-        self._flight, self._case = flight, msgspec.json.encode(flight.experiment)
+        self._flight, self._case = flight, msgspec.json.encode(flight.plan.experiment)
         twins = flight.twin.twins
         self._members = [Member(row, *each) for row, each in enumerate(zip(flight.robots, twins, strict=True))]
-        network, rates = flight.network, flight.experiment.rates
+        network, rates = flight.network, flight.plan.experiment.rates
         self._ways: list[Way] = []
         for (robot, k), delay in zip(network.receivers, network.delays, strict=True):
             sender = robot.neighbours.all[k]
@@ -167,7 +168,7 @@ class Stretches:
         waits = any(robot.lifecycle.phase <= READY and not robot.lifecycle.climbing for robot in flight.robots)
         if self._refused or k < max(self._paused_until, 1) or end - k < LEAST or waits:  # the first tick moves nothing
             return k, AT_END
-        ticks, rows, rates = end - k, len(self._members), flight.experiment.rates
+        ticks, rows, rates = end - k, len(self._members), flight.plan.experiment.rates
         questions = ticks // round(rates.body_hz / rates.pose_hz) + ROOM
         ledger = Ledger(rows, questions * rows, ticks // flight.log_every + ROOM, lean=flight.lean)
         for member in self._members:

@@ -30,7 +30,7 @@ class Group:
         self.names = tuple(names)
         health = ProcessHealth()
         self.robots = [Robot(plan.assignment(name), health) for name in names]
-        self.body = TwinBody(bodies.body_request(plan.experiment, self.names, plan.experiment.seed))
+        self.body = TwinBody(bodies.body_request(plan, self.names, plan.experiment.seed))
         self.states: list[BodyState] = []
         self.sending: list[int] = []
         self.spoil: dict[str, Callable[[BodyState], None]] = {}  # changes of measurements, by name

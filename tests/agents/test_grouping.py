@@ -12,7 +12,7 @@ from tests.agents.swarm import LOGGED, Swarm, changed
 
 @pytest.fixture(scope="module")
 def park():
-    return document.read("robotic-park").cases()["event"]
+    return document.read("robotic-park").cases()["event"].experiment
 
 
 def eventful(experiment, groups):

@@ -4,14 +4,12 @@ import math
 import random
 from math import inf, isfinite, nan
 
-import msgspec
 import pytest
 
 from agents.body.interface import BodyState, RangeScan
 from agents.decision.lifecycle import AIRBORNE
 from agents.plugins import registry
 from agents.robot import Robot
-from experiments.definition.plan import Plan
 from experiments.file.document import load
 
 ODD = (nan, inf, -inf, 0.0, -0.0, 1e308, -1e308, 1e-308, 5e-324, 1e154, -1e154, 1e6, -1e6)
@@ -82,7 +80,7 @@ def keeps_limits(robot: Robot) -> bool:
 @pytest.mark.parametrize("trigger", registry.names(registry.TRIGGERS))
 def test_nonsense_raises_nothing(name, trigger):
     for number, given in enumerate(load(name).cases().values()):
-        plan = Plan(msgspec.structs.replace(given, trigger={"kind": trigger}))
+        plan = given.changed(trigger={"kind": trigger})
         for row, robot_name in enumerate(plan.names[:4]):
             some, robot, t = Nonsense(hash((number, row)) & 0xFFFF), Robot(plan.assignment(robot_name)), 0.0
             for tick in range(150):

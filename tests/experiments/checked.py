@@ -10,13 +10,15 @@ import msgspec
 from agents.body.interface import Disturbance
 from experiments.check.check import check
 from experiments.definition.experiment import Arena, Experiment, Formation, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document
 
 
 def of(experiment: Experiment) -> Document:
     """As if it had been read from a file."""
-    return Document(Path("made.json"), document.write_json(experiment).decode(), experiment, {"default": experiment})
+    plan = Plan(experiment)
+    return Document(Path("made.json"), document.write_json(plan).decode(), plan, {"default": plan})
 
 
 def bad(name: str, *changes: str) -> dict[str, tuple[str, str, str, str]]:

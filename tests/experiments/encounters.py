@@ -18,6 +18,7 @@ from agents.body.interface import Disturbance, Jitter
 from agents.body.kinds import KINDS
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Arena, Experiment, Leg, Rates, Robot, Start
+from experiments.definition.plan import Plan
 from experiments.virtual_time.simulation import Log, simulate
 from twins.arrays import Array, Mask, norm
 
@@ -121,7 +122,7 @@ def meet(experiment: Experiment, seeds: Sequence[int]) -> Outcome:
     Raises:
         experiments.virtual_time.conductor.Stuck: If robots do not take off or land.
     """
-    return Outcome.joined(_outcome(experiment, simulate(experiment, seed)) for seed in seeds)
+    return Outcome.joined(_outcome(experiment, simulate(Plan(experiment), seed)) for seed in seeds)
 
 
 def random_pairs(avoidance: str | dict[str, Any] | None, each: int, **settings: Any) -> dict[str, Outcome]:

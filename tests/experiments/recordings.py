@@ -4,6 +4,7 @@ import numpy as np
 
 from agents.network.messages import Contact, Event, ObstaclePose, Pose, PoseReceipt, State, Status, WorldState
 from experiments.definition.experiment import Experiment, Formation, Rates, Robot
+from experiments.definition.plan import Plan
 from experiments.recording.writer import Recording
 
 START = 1_760_000_000.0
@@ -93,7 +94,9 @@ def landed(at=1.0, text="landing"):
 
 def write(path, *messages, experiment=PAIR, **more):
     """Records messages as they come; a pose is received 2 ms after its stamp, with 150 bytes."""
-    with Recording(path, experiment, DOCUMENT, **{"case": "only", "seed": 4, "clock": "real"} | more) as recording:
+    with Recording(
+        path, Plan(experiment), DOCUMENT, **{"case": "only", "seed": 4, "clock": "real"} | more
+    ) as recording:
         put(recording, messages)
         return recording
 

@@ -26,7 +26,7 @@ LINE = {"kind": "line", "move_by": [0.3, 0.0], "speed": 0.15}
 
 @pytest.fixture(scope="module")
 def cases():
-    return document.read("robotic-park").cases()
+    return {name: plan.experiment for name, plan in document.read("robotic-park").cases().items()}
 
 
 def short(experiment, **parts):
@@ -40,8 +40,8 @@ def with_delay(experiment, delay_s, architecture="distributed", **more):
 
 
 def measured(experiment, seed=1):
-    log = simulation.simulate(experiment, seed)
-    return measure.measure(Logbook(log, experiment, str(experiment.architecture)[:11]).trace())
+    log = simulation.simulate(Plan(experiment), seed)
+    return measure.measure(Logbook(log, Plan(experiment), str(experiment.architecture)[:11]).trace())
 
 
 def assert_same_motion(first, second):
@@ -59,9 +59,9 @@ def assert_same_motion(first, second):
 @pytest.mark.parametrize("architecture", ["centralised", HYBRID])
 def test_without_delay_the_reference_experiment_moves_the_same_wherever_it_is_decided(cases, architecture):
     park = cases["periodic"]
-    first = simulation.simulate(with_delay(park, 0.0), 1)
+    first = simulation.simulate(Plan(with_delay(park, 0.0)), 1)
     assert first.time[-1] > park.duration_s
-    assert_same_motion(first, simulation.simulate(with_delay(park, 0.0, architecture), 1))
+    assert_same_motion(first, simulation.simulate(Plan(with_delay(park, 0.0, architecture)), 1))
 
 
 @pytest.mark.parametrize(("update", "seed"), [(None, 1), ("relative-control", 2)])
@@ -69,9 +69,9 @@ def test_motion_is_alike_when_updates_have_events(cases, update, seed):
     formation = msgspec.structs.replace(cases["periodic"].formation, update=update)
     park = short(cases["periodic"], duration_s=4.0, timeline=[Leg(at_s=2.0, robot="TB01", plan=LINE)],
                  formation=formation)  # fmt: skip
-    first = simulation.simulate(with_delay(park, 0.0), seed)
+    first = simulation.simulate(Plan(with_delay(park, 0.0)), seed)
     for architecture in ("centralised", HYBRID):
-        second = simulation.simulate(with_delay(park, 0.0, architecture), seed)
+        second = simulation.simulate(Plan(with_delay(park, 0.0, architecture)), seed)
         assert_same_motion(first, second)
         np.testing.assert_array_equal(second.updates >= first.updates, True)  # goals are said again now and then
 
@@ -79,7 +79,7 @@ def test_motion_is_alike_when_updates_have_events(cases, update, seed):
 def test_what_a_robot_believes_of_itself_is_all_that_differs_with_events(cases):
     """Poses are said on events: the centre knows of a robot what its neighbours know."""
     park = short(cases["event"])
-    first, second = (simulation.simulate(with_delay(park, 0.0, a), 1) for a in ("distributed", "centralised"))
+    first, second = (simulation.simulate(Plan(with_delay(park, 0.0, a)), 1) for a in ("distributed", "centralised"))
     apart = norm(first.true_position - second.true_position).max()
     assert 1e-4 < apart < 0.05
 
@@ -99,8 +99,8 @@ def test_delay_makes_the_centre_worse_and_itself_known(cases):
 
 def test_goals_come_as_late_as_the_network_and_the_grid_of_decisions_make_them(cases):
     park = with_delay(short(cases["periodic"]), 0.031, "centralised")
-    log = simulation.simulate(park, 1)
-    delay = Logbook(log, park, "").trace().goals.delay
+    log = simulation.simulate(Plan(park), 1)
+    delay = Logbook(log, Plan(park), "").trace().goals.delay
     # said at 0, 20, 40, 60 ms before a decision: the newest that is there is 40 ms old; the goal acts on the next tick
     np.testing.assert_allclose(delay, 0.04 + 0.04, atol=1e-9)
 
@@ -116,8 +116,8 @@ def test_the_default_network_is_one_tick(cases):
 def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(cases):
     """Who is guided moves as before where it hears at once; what it says is heard as ever."""
     park = short(cases["periodic"], duration_s=3.0, timeline=[])
-    first = simulation.simulate(with_delay(park, 0.0), 1)
-    second = simulation.simulate(with_delay(park, 0.0, HYBRID), 1)
+    first = simulation.simulate(Plan(with_delay(park, 0.0)), 1)
+    second = simulation.simulate(Plan(with_delay(park, 0.0, HYBRID)), 1)
     np.testing.assert_array_equal(first.sent.link, second.sent.link)
     names = np.array(first.names)
     links = Plan(with_delay(park, 0.0, HYBRID)).pose_links
@@ -141,8 +141,8 @@ def test_lost_poses_and_goals_are_counted(cases):
 
 def test_links_of_avoidance_stay_with_the_robots(cases):
     park = with_delay(short(cases["periodic"], duration_s=2.0, timeline=[], avoidance={"kind": "barrier"}), 0.0)
-    first = simulation.simulate(park, 1)
-    second = simulation.simulate(msgspec.structs.replace(park, architecture="centralised"), 1)
+    first = simulation.simulate(Plan(park), 1)
+    second = simulation.simulate(Plan(msgspec.structs.replace(park, architecture="centralised")), 1)
     assert_same_motion(first, second)
     np.testing.assert_array_equal(first.setpoint, second.setpoint)
 
@@ -152,8 +152,8 @@ def test_links_of_avoidance_stay_with_the_robots(cases):
 
 def test_a_recording_tells_the_same(tmp_path, cases):
     park = with_delay(short(cases["event"], duration_s=4.0, timeline=[]), 0.03, HYBRID, loss=0.05)
-    log = simulation.simulate(park, 3)
-    book = Logbook(log, park, "hybrid")
+    log = simulation.simulate(Plan(park), 3)
+    book = Logbook(log, Plan(park), "hybrid")
     book.record(tmp_path / "hybrid.mcap", "")
     first, second = book.trace().goals, playback.read(tmp_path / "hybrid.mcap").trace.goals
     np.testing.assert_allclose(second.sent.stamp, first.sent.stamp, rtol=0.0, atol=3e-6)
@@ -194,7 +194,7 @@ def test_the_report_compares_them(tmp_path, cases):
     traces = []
     for name, architecture in (("apart", "distributed"), ("together", "centralised")):
         experiment = with_delay(park, 0.05, architecture)
-        traces.append(Logbook(simulation.simulate(experiment, 1), experiment, name).trace())
+        traces.append(Logbook(simulation.simulate(Plan(experiment), 1), Plan(experiment), name).trace())
     found = [measure.measure(trace) for trace in traces]
     table = architecture_table(found)
     cells = {row.cells[0]: row.cells[1:] for row in table.rows}
@@ -284,6 +284,6 @@ def test_robots_without_a_formation_are_guided_too():
     robots = {"A": Robot(kind="khepera4", start=[0.0, 0.0])}
     plan = Leg(at_s=0.0, robot="A", plan={"kind": "waypoints", "points": [[0.3, 0.0]], "speed": 0.1})
     one = Experiment(title="one", duration_s=5.0, robots=robots, timeline=[plan], formation=Formation())
-    first, second = (simulation.simulate(with_delay(one, 0.0, a), 1) for a in ("distributed", "centralised"))
+    first, second = (simulation.simulate(Plan(with_delay(one, 0.0, a)), 1) for a in ("distributed", "centralised"))
     assert_same_motion(first, second)
     assert second.true_position[-1, 0, 0] > 0.25

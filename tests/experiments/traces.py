@@ -69,13 +69,14 @@ def trace(
     who = np.array([i for _, i, _ in sends], dtype=np.intp)
     number = np.array([k for _, _, k in sends], dtype=np.intp)
     place = position[np.clip(np.round(when / step).astype(int), 0, count - 1), who].reshape(-1, 3)
-    speaker = Plan(what).pose_links.sender
+    plan = Plan(what)
+    speaker = plan.pose_links.sender
     pairs = [(k, link) for k, j in enumerate(who) for link in np.flatnonzero(speaker == j)]
     take = np.array([k for k, _ in pairs], dtype=np.intp)
     rows = len(names)
     return Trace(
         case=case,
-        experiment=what,
+        plan=plan,
         seed=seed,
         robots=names,
         clock="virtual",

@@ -25,6 +25,7 @@ from agents.errors import ExplainedError
 from agents.network import messages as wire
 from agents.plugins import registry
 from experiments.catalogue import index
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import DocumentError, write_json
 from experiments.recording.reader import RecordingError
@@ -80,7 +81,7 @@ def toml() -> Iterator[Target]:
 def resolved() -> Iterator[Target]:
     """Cases as the processes are told them."""
     names = ("triangle", "convoy", "obstacle-course")
-    yield from experiment(".json", [write_json(document.read(name).experiment) for name in names])
+    yield from experiment(".json", [write_json(document.read(name).plan) for name in names])
 
 
 def arena() -> Iterator[Target]:
@@ -161,7 +162,7 @@ def recording_bytes(*, plain: bool) -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "good.mcap"
         began = time.time()
-        with recording.Recording(path, what, "x", case="only", seed=1, clock="real", started=began) as writer:
+        with recording.Recording(path, Plan(what), "x", case="only", seed=1, clock="real", started=began) as writer:
             for k in range(12):
                 for name in ("KH01", "CF01"):
                     said = good(name, k + 1)

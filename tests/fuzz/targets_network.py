@@ -62,7 +62,7 @@ def robot() -> Iterator[Target]:
 
     def make():
         net.forget()
-        body = assemble(bodies.body_request(experiment, ["KH01"], 1, ["tcp/127.0.0.1:1"]))
+        body = assemble(bodies.body_request(Plan(experiment), ["KH01"], 1, ["tcp/127.0.0.1:1"]))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True], ranging=["world"])
         runtime = Runtime([Plan(experiment).assignment("KH01")], body, setup)
         body.open()
@@ -120,7 +120,7 @@ def world() -> Iterator[Target]:
     def make():
         net.forget()
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([]))  # type: ignore[arg-type]
-        process = WorldProcess(experiment, Population(experiment), joint, Event())
+        process = WorldProcess(Plan(experiment), Population(Plan(experiment)), joint, Event())
         process.exchange.utc = time.time()
         t = 0.0
 
@@ -155,7 +155,7 @@ def recorder() -> Iterator[Target]:
             recording.close()
             recording.path.unlink()
         path = Path(folder) / f"{time.monotonic_ns()}.mcap"
-        recording = Recording(path, experiment, case="only", seed=1, clock="real")
+        recording = Recording(path, Plan(experiment), case="only", seed=1, clock="real")
         made = Recorder(net.session, KEYS, recording)  # type: ignore[arg-type]
 
         def take(data: bytes) -> None:
@@ -195,7 +195,7 @@ def conductor() -> Iterator[Target]:
     def make():
         net.forget()
         context = CaseContext(
-            experiment, "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
+            Plan(experiment), "only", Path(folder), source=Path(folder) / "only.json", endpoints=["tcp/127.0.0.1:1"],
             launcher=Nobody(), hosts=Hosts(Nobody(), []),  # type: ignore[arg-type]
         )  # fmt: skip
         made = Conductor(context, lambda _: None)

@@ -256,7 +256,7 @@ def gone(processes: Sequence[psutil.Process]) -> bool:
 
 def transmits_at_50_hz(trace: Trace) -> None:
     """Each robot has transmitted 50 times a second, but for ticks that it counted as missed."""
-    wanted = 50.0 * trace.experiment.duration_s
+    wanted = 50.0 * trace.plan.experiment.duration_s
     sent = np.bincount(trace.sent.link, minlength=len(trace.robots))
     assert (sent <= wanted + 1).all()
     assert (sent >= wanted - trace.missed_deadlines - 3).all()
@@ -268,9 +268,9 @@ def assert_held_in_time(flight: Flight, case: str, stopped: float) -> None:
     trace = run.traces[case]
     said = [event.text for event in trace.events if event.source == "conductor"]
     assert sum("no router answers" in text for text in said) == 1
-    for name in trace.experiment.robots:
+    for name in trace.plan.experiment.robots:
         status = typed(flight.folder / f"{case}.mcap", f"/{name}/status")[-1]
         hold, over = [each for each in status.incidents if "no connection to a router" in each.text]
         assert hold.text.startswith("hold: ")
-        assert stopped < hold.stamp < stopped + trace.experiment.safety.link_silence_s + 1.0
+        assert stopped < hold.stamp < stopped + trace.plan.experiment.safety.link_silence_s + 1.0
         assert over.text.startswith("over: ")

@@ -32,7 +32,7 @@ class Laboratory:
     def __init__(self, folder: Path, protocol: str = "tls", *, linked: bool = False) -> None:
         self.folder = folder / "lab"
         cases = load(FILE).cases()
-        robots = dict.fromkeys(next(iter(cases.values())).robots, "robot")
+        robots = dict.fromkeys(next(iter(cases.values())).names, "robot")
         authority.create(self.folder, {**{role: role for role in authority.SERVICES}, **robots})
         self.rights = folder / "rights.json"
         rights = msgspec.structs.replace(access_rights.rights(cases.values()), linked=linked)

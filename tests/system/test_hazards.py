@@ -61,7 +61,7 @@ def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path)
     played = playback.read(folder / "event.mcap")
     trace = played.trace
     said = [pose.position[2] for pose in typed(folder / "event.mcap", "/CF01/pose") if pose.stamp > played.started]
-    hover = trace.experiment.robots["CF01"].hover
+    hover = trace.plan.experiment.robots["CF01"].hover
     assert said, "it has flown"
     assert min(said) > hover - 0.1  # nobody follows it to the floor
     ends = {event.source: event.text for event in trace.events if event.kind == "robot"}

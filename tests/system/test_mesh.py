@@ -47,7 +47,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     children = flight.children()
     assert "router" not in children
 
-    hears = access_rights.senders_by_receiver(load("robotic-park").experiment)
+    hears = access_rights.senders_by_receiver(load("robotic-park").plan)
     robots = list(hears)
     linked: dict[str, set[str]] = {name: set() for name in robots}
     for name in robots:
@@ -146,11 +146,11 @@ def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
     """There is no router that could refuse anything: whoever is told it does."""
     file = tmp_path / "mesh.toml"
     file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')
-    case = load(file).experiment
+    case = load(file).plan
     listening = mesh.listening_hosts(case)
     identities: dict[str, Role] = {role: role for role in authority.SERVICES}
     authority.create(
-        tmp_path / "lab", {**identities, **dict.fromkeys((*case.robots, "KH09"), "robot")}, listening=listening
+        tmp_path / "lab", {**identities, **dict.fromkeys((*case.names, "KH09"), "robot")}, listening=listening
     )
     flight = Flight(tmp_path / "run", str(file), "--case", "periodic", "--no-report", "--set", "duration_s=6")
     flight.until_said("phase conductor: formation")

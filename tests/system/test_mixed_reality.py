@@ -149,7 +149,7 @@ def test_a_real_robot_that_stands_in_the_way_of_a_twin_is_seen_and_avoided(
     played = playback.read(folder / "default.mcap")
     trace = played.trace
     at = {name: row for row, name in enumerate(trace.robots)}
-    radius = {name: KINDS[robot.kind].radius for name, robot in trace.experiment.robots.items()}
+    radius = {name: KINDS[robot.kind].radius for name, robot in trace.plan.experiment.robots.items()}
     truth, measured = trace.true_position[:, :, :2], trace.position[:, :, :2]
     still = (trace.time > 0.2) & (trace.time < 1.4)
     away = np.median(np.linalg.norm(measured[still, at[real]] - truth[still, at[twin]], axis=1))

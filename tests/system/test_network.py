@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.definition.experiment import Experiment
 from experiments.file.document import load
 from experiments.recording import playback
 from experiments.recording.trace import Trace
@@ -34,10 +33,8 @@ def sent_and_heard(trace: Trace, listener: int, speaker: int, end: float) -> tup
 
 def virtual(duration_s: float) -> Trace:
     """The same in virtual time, longer: robots start sooner there, and their numbers must overlap."""
-    experiment: Experiment = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()[
-        "periodic"
-    ]
-    return Logbook(simulate(experiment, experiment.seed), experiment, "periodic").trace()
+    plan = load("triangle", *BAD, "formation.gain=1.4", f"duration_s={duration_s}").cases()["periodic"]
+    return Logbook(simulate(plan, plan.experiment.seed), plan, "periodic").trace()
 
 
 @pytest.mark.mechanism("modelled channel in real time")

@@ -48,7 +48,7 @@ def test_the_reference_experiment_flies_behind_real_bridges(tmp_path: Path) -> N
     assert np.abs(heights - 0.8).max() < 0.1
     last = trace.time > trace.time[-1] - 1.0
     rows = {name: row for row, name in enumerate(trace.robots)}
-    for text, link in trace.experiment.formation.links.items():
+    for text, link in trace.plan.experiment.formation.links.items():
         one, _, other = text.split()
         apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
         distance = link if isinstance(link, float) else link.distance

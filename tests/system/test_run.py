@@ -159,7 +159,7 @@ def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> N
     late = trace.time > 7.0
     p = trace.true_position[late]
     sides = [np.linalg.norm(p[:, i] - p[:, j], axis=1) for i, j in ((0, 1), (0, 2), (1, 2))]
-    wanted = trace.experiment.formation.links.values()
+    wanted = trace.plan.experiment.formation.links.values()
     for side, link in zip(sides, wanted, strict=True):
         target = link if isinstance(link, float) else link.distance
         assert np.abs(side - target).mean() < 0.05

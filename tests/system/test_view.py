@@ -17,6 +17,7 @@ from agents.network import messages, pubsub
 from agents.network.endpoints import free_endpoint
 from agents.runtime.orders import PAUSED
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.run import simulate
 from experiments.scene.stage import Condition, Stage
@@ -69,7 +70,7 @@ def places(page: Page, what: str = "robots/{}/body", root: str = "/case") -> np.
 def announced(watcher: Watcher, park: Experiment, case: str) -> Iterator[None]:
     """A case as a conductor announces it."""
     told = pubsub.pose_publisher(watcher.session, watcher.keys.experiment, messages.JSON)
-    told.put(document.case_document(park, case))
+    told.put(document.case_document(Plan(park), case))
     yield
     told.undeclare()  # type: ignore[no-untyped-call]
 
@@ -79,8 +80,8 @@ def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
     router: RouterProcess, watcher: Watcher, tmp_path: Path
 ) -> None:
     low = (f"robots.{name}.hover=0.2" for name in ("CF01", "CF02", "CF03"))  # soon airborne
-    park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"]
-    (tmp_path / "event.json").write_bytes(document.write_json(park))
+    park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"].experiment
+    (tmp_path / "event.json").write_bytes(document.write_json(Plan(park)))
     names, robots = list(park.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *park.robots)
 
     def taken_off(view: ViewProcess) -> str:
@@ -119,8 +120,8 @@ def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
 def test_orders_of_the_page_reach_the_robots_and_are_events(
     router: RouterProcess, watcher: Watcher, tmp_path: Path
 ) -> None:
-    convoy = document.load("convoy", "timeline=[]").cases()["event"]
-    (tmp_path / "event.json").write_bytes(document.write_json(convoy))
+    convoy = document.load("convoy", "timeline=[]").cases()["event"].experiment
+    (tmp_path / "event.json").write_bytes(document.write_json(Plan(convoy)))
     names, robots = list(convoy.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *convoy.robots)
     heard = pubsub.Inbox(
         pubsub.pose_subscriber(watcher.session, watcher.keys.event, 256, pubsub.EVENTS), messages.Event
@@ -262,7 +263,7 @@ def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
         + "[formation.links]\n"
         + "".join(f'"R{k} > R{k + 1}" = 1.0\n' for k in range(99))
     ).cases()["default"]
-    crowd_stage = Stage.of_experiment(crowd)
+    crowd_stage = Stage.of_plan(crowd)
     serving = ExitStack()
     server = serving.enter_context(served(int(free_endpoint(preferred_port=0).rpartition(":")[2]), dark=False))
     shown = Page(server, dark=False)

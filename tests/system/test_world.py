@@ -160,7 +160,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
     assert np.isfinite(trace.true_position).all(axis=(1, 2)).mean() > 0.98, "the truth is known"
     last = trace.time > trace.time[-1] - 1.0
     rows = {name: row for row, name in enumerate(trace.robots)}
-    for text, link in trace.experiment.formation.links.items():
+    for text, link in trace.plan.experiment.formation.links.items():
         one, _, other = text.split()
         apart = np.linalg.norm(trace.true_position[last, rows[one]] - trace.true_position[last, rows[other]], axis=1)
         assert np.abs(apart - (link if isinstance(link, float) else link.distance)).mean() < 0.03, text

@@ -12,6 +12,7 @@ import pytest
 
 from experiments.check.safety import devices, libraries
 from experiments.definition.experiment import Robot
+from experiments.definition.plan import Plan
 from experiments.file.document import loads
 from tools.main import main
 
@@ -175,7 +176,7 @@ def test_a_command_is_refused(command: str, told: str, remedy: str, refuse: Call
 def test_a_missing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     experiment = loads(TRIANGLE.replace("hover = 0.6", "hover = 0.6\n" + RADIO)).experiment
-    (claim,) = libraries(SimpleNamespace(experiment=experiment))
+    (claim,) = libraries(SimpleNamespace(plan=Plan(experiment)))
     assert claim.message == "the body of CF01 needs cflib, which is not installed here"
     assert claim.remedy == "`./zenpark hardware` adds it"
 
@@ -187,8 +188,8 @@ def test_two_robots_with_the_address_of_one_device_are_a_finding(second: str, sa
         robots[name] = msgspec.structs.replace(robots[name], body=body)
 
     def found(**more: object) -> list[tuple[str, str, object]]:
-        experiment = SimpleNamespace(robots=robots, **{"hosts": {}, **more})
-        return [(each.code, each.message, each.where) for each in devices(SimpleNamespace(experiment=experiment))]
+        plan = SimpleNamespace(experiment=SimpleNamespace(robots=robots, **{"hosts": {}, **more}))
+        return [(each.code, each.message, each.where) for each in devices(SimpleNamespace(plan=plan))]
 
     message = f"RV01 and RV03 have the same body, {second}: one device gets the setpoints of both"
     assert found() == ([("same-device", message, ("robots", "RV03", "body"))] if same else [])

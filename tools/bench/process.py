@@ -16,7 +16,6 @@ from typing import Final
 
 from agents.network import messages
 from agents.network.endpoints import free_endpoint
-from experiments.definition.plan import Plan
 from experiments.file.document import Document, load
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conductor import Conductor
@@ -66,8 +65,8 @@ def process(read: Document | None = None) -> Iterator[Figure]:
             poses at 50 Hz and no plan of the leader.
     """
     read = read or load("robotic-park", f"duration_s={FLIGHT_S}", "timeline=[]", "trigger.period_s=0.02")
-    case, experiment = next(iter(read.cases().items()))
-    plan = Plan(experiment)
+    case, plan = next(iter(read.cases().items()))
+    experiment = plan.experiment
     robots, bare = Meter(), Meter()
     first, last = dict[str, messages.Status](), dict[str, messages.Status]()
     beside: dict[str, int] = {}
@@ -98,7 +97,7 @@ def process(read: Document | None = None) -> Iterator[Figure]:
                 beside[robot] = started.handle.pid
             source, hosts = folder / SOURCE, Hosts(launcher, endpoints)
             source.write_text(read.text, encoding="utf-8")
-            context = CaseContext(experiment, case, folder, source, endpoints, launcher, hosts)
+            context = CaseContext(plan, case, folder, source, endpoints, launcher, hosts)
             result = Conductor(context, look).run()
     assert result.ready_s is not None
     pose_hz, body_hz = experiment.rates.pose_hz, experiment.rates.body_hz

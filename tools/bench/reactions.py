@@ -31,7 +31,8 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
-from experiments.definition.experiment import Arena, Experiment, Formation, Rates, Robot
+from experiments.definition.experiment import Arena, Formation, Rates, Robot
+from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.support import start_router
@@ -101,13 +102,13 @@ def _figures(what: str, taken: Sequence[float], empty: float, wanted: float, of:
     yield Figure("safety", f"{what}, slowest", 1e3 * ordered[-1], "ms", ordered[-1] / wanted, of)
 
 
-def ring(count: int, body: str) -> Experiment:
+def ring(count: int, body: str) -> Plan:
     """Robots on wheels in a ring, each listening to the one before and the one behind, all with such a body."""
     names = [f"R{k:03}" for k in range(count)]
     radius = 0.5 * SPACING / sin(pi / count)
     turns = [2.0 * pi * k / count for k in range(count)]
     size = 2.0 * radius + 2.0
-    return Experiment(
+    return Plan.made(
         title="a ring",
         robots={
             name: Robot(kind="khepera4", start=[radius * cos(turn), radius * sin(turn)], body=body, sensors=[])
@@ -156,8 +157,8 @@ class _Park:
 
     def __init__(self, stack: ExitStack, body: str) -> None:
         """Start the processes; `stack` ends them."""
-        experiment = ring(ROBOTS, body)
-        self._names, self._keys = list(experiment.robots), Keys(experiment.network.realm)
+        plan = ring(ROBOTS, body)
+        self._names, self._keys = list(plan.names), Keys(plan.experiment.network.realm)
         self._ended: set[str] = set()
         self._pong, self._pinged = threading.Event(), 0.0
         # filled by callbacks, all times are monotonic [s]
@@ -169,7 +170,7 @@ class _Park:
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
         stack.callback(lambda: [*map(self._launcher.kill, self._names)])  # a frozen process cannot land
         file = folder / "ring.json"
-        file.write_bytes(write_json(experiment))
+        file.write_bytes(write_json(plan))
         endpoints = [free_endpoint(0)]
         start_router(self._launcher, endpoints)
         self._session = stack.enter_context(network.open_session(endpoints, name="bench"))
@@ -185,7 +186,7 @@ class _Park:
         start = [ROBOT]
         if body == "external":
             # in a process of its own: arriving messages would wait for an interpreter that is busy with this
-            starts = {name: tuple(robot.start) for name, robot in experiment.robots.items()}
+            starts = {name: tuple(robot.start) for name, robot in plan.experiment.robots.items()}
             arguments = (endpoints[0], self._keys.realm, starts)
             far_end = get_context("spawn").Process(target=places, args=arguments, daemon=True)
             far_end.start()

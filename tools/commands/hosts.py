@@ -17,7 +17,8 @@ from tools.commands.lab import SOON_DAYS
 from tools.commands.options import AsJson, File, Lab, Settings, example, group, known_words, print_json
 
 if TYPE_CHECKING:
-    from experiments.definition.experiment import Experiment, Host
+    from experiments.definition.experiment import Host
+    from experiments.definition.plan import Plan
     from experiments.file.document import Document
     from experiments.real_time.hosts.hosts import HostError, Station
     from experiments.real_time.hosts.station import Found
@@ -111,10 +112,10 @@ def check(file: File, settings: Settings = None, on: On = None, lab: Lab = None,
     read = document.read(file, settings or [])
     experiment = read.experiment
     chosen = choose(experiment.hosts, on or [])
-    heading = HEADING if endpoints.lab_folder(experiment, read.path, lab) is None else SECURED
-    rows = [_without_address(name, experiment, heading) for name, host in chosen.items() if host.address is None]
+    heading = HEADING if endpoints.lab_folder(read.plan, read.path, lab) is None else SECURED
+    rows = [_without_address(name, read.plan, heading) for name, host in chosen.items() if host.address is None]
     with stations(read, {name: host for name, host in chosen.items() if host.address is not None}, lab) as found:
-        rows += [_row(each, experiment, heading) for each in found]
+        rows += [_row(each, read.plan, heading) for each in found]
     if as_json:
         shown = [{**dict(zip(heading, row.cells, strict=True)), "ok": row.well, "trouble": row.trouble} for row in rows]
         print_json({"ok": all(row.well for row in rows), "hosts": shown})
@@ -136,7 +137,7 @@ def install(file: File, settings: Settings = None, on: On = None, lab: Lab = Non
 
     read = document.read(file, settings or [])
     experiment = read.experiment
-    folder = endpoints.lab_folder(experiment, read.path, lab)
+    folder = endpoints.lab_folder(read.plan, read.path, lab)
     chosen = {name: host for name, host in choose(experiment.hosts, on or []).items() if host.address is not None}
     shown: list[dict[str, str | bool]] = []
     with stations(read, chosen, lab, routed=False) as found:
@@ -202,15 +203,15 @@ def stations(
     experiment = read.experiment
     with tempfile.TemporaryDirectory() as folder, Launcher(Path(folder)) as launcher:
         network, own = experiment.network, []
-        secure = endpoints.lab_folder(experiment, read.path, lab) is not None
+        secure = endpoints.lab_folder(read.plan, read.path, lab) is not None
         if not routed:
             routers = []
         elif network.connect is None:
             own = network.listen or [free_endpoint(protocol="tls" if secure else "tcp")]
-            routers = endpoints.router_endpoints(experiment, read.path, own, lab)
+            routers = endpoints.router_endpoints(read.plan, read.path, own, lab)
             start_router(launcher, routers, write_rights(read.cases().values(), routers, Path(folder)))
         else:
-            routers = endpoints.router_endpoints(experiment, read.path, network.connect, lab)
+            routers = endpoints.router_endpoints(read.plan, read.path, network.connect, lab)
         begun: list[Station | HostError] = []
         for name, host in hosts.items():
             try:
@@ -228,13 +229,13 @@ def stations(
         yield found
 
 
-def _without_address(name: str, experiment: Experiment, heading: Sequence[str] = HEADING) -> Row:
+def _without_address(name: str, plan: Plan, heading: Sequence[str] = HEADING) -> Row:
     """A host without an address: its robots join by themselves."""
-    robots = ", ".join(experiment.hosts[name].robots) or "no robots"
+    robots = ", ".join(plan.experiment.hosts[name].robots) or "no robots"
     return Row([name, f"{NOTHING} no address: {robots} started there", *[NOTHING] * (len(heading) - 2)])
 
 
-def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[str]) -> Row:
+def _row(there: Station | HostError, plan: Plan, heading: Sequence[str]) -> Row:
     """Everything about one host."""
     from experiments.real_time.hosts.hosts import HostError
 
@@ -243,14 +244,14 @@ def _row(there: Station | HostError, experiment: Experiment, heading: Sequence[s
         return Row([name, NO, *[NOTHING] * (len(heading) - 2)], [str(there)])
     row = Row([there.name])
     try:
-        _fill(row, there, experiment)
+        _fill(row, there, plan)
     except HostError as error:
         row.cells += [NO] * (len(heading) - len(row.cells))
         row.trouble.append(str(error))
     return row
 
 
-def _fill(row: Row, there: Station, experiment: Experiment) -> None:
+def _fill(row: Row, there: Station, plan: Plan) -> None:
     from msgspec.structs import replace
 
     from experiments.real_time.hosts import certificates
@@ -275,14 +276,14 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
             f"{there.name}: the connection is slow, so robots there may start ± {clock.uncertainty * 1e3:.0f} ms apart "
             "from the others; use a cable, or a network with less on it"
         )
-    bodies = [experiment.robots[robot].body for robot in there.host.robots]
+    bodies = [plan.experiment.robots[robot].body for robot in there.host.robots]
     devices = there.ask(Question("devices", bodies=bodies), REACH_S)[0].found
     wrong = [each for each in devices if not each.well]
     words = ", ".join(each.what for each in devices) or "none needed"
     row.cells.append(f"{NO if wrong else YES} {words}")
     row.trouble += [f"{there.name}: {each.what} {each.text}" for each in wrong]
     if there.lab is not None and not _recognised(
-        row, there, there.lab, certificates.of_host(there.name, experiment.hosts)
+        row, there, there.lab, certificates.of_host(there.name, plan.experiment.hosts)
     ):
         row.cells.append(f"{NOTHING} needs its certificates")
         return
@@ -293,20 +294,20 @@ def _fill(row: Row, there: Station, experiment: Experiment) -> None:
     unreached = [each for each in routers if not each.well]
     row.cells.append(f"{NO if unreached else YES} {', '.join(each.text for each in routers if each.well)}".rstrip())
     row.trouble += [
-        f"{there.name}: {each.what} cannot be reached from there; {_router_remedy(there, each, experiment)}"
+        f"{there.name}: {each.what} cannot be reached from there; {_router_remedy(there, each, plan)}"
         for each in unreached
     ]
 
 
-def _router_remedy(there: Station, router: Found, experiment: Experiment) -> str:
+def _router_remedy(there: Station, router: Found, plan: Plan) -> str:
     """Remedy for a router that a host does not reach."""
     from agents.network.endpoints import Endpoint
 
     if "refuses the certificate" in router.text and Endpoint.parse(router.what).is_loopback:
         return f"ssh carries it, so look at the certificates: `./zenpark cert show {there.lab}`"
-    if experiment.network.connect is not None:
+    if plan.experiment.network.connect is not None:
         return "is it on (`./zenpark router` starts one)? Else mend connect in [network]"
-    if experiment.network.listen is not None:
+    if plan.experiment.network.listen is not None:
         return "mend address or listen in [network], or leave both out: then ssh carries it; is there a firewall here?"
     return "ssh carries it: does sshd there allow that (AllowTcpForwarding yes)? Else add listen to [network]"
 

@@ -137,7 +137,7 @@ def _members(given: list[str]) -> tuple[dict[str, None], dict[str, list[str]]]:
     for each in given:
         if each in names or Path(each).suffix or Path(each).exists():
             for case in document.read(each).cases().values():
-                robots |= dict.fromkeys(case.robots)
+                robots |= dict.fromkeys(case.names)
                 listening |= mesh.listening_hosts(case)
         elif meant := get_close_matches(each, names, n=1, cutoff=0.8):
             raise LabError(f"{each} is neither a file nor in the catalogue; did you mean '{meant[0]}'?")

@@ -150,7 +150,7 @@ def _rights(file: str, lab: str | None, bodies: str | None) -> tuple[Rights, Pat
 
     read = document.read(file)
     cases = [choose_bodies(case, bodies) for case in read.cases().values()]
-    return access_rights.rights(cases), reach.lab_folder(read.experiment, read.path, lab)
+    return access_rights.rights(cases), reach.lab_folder(read.plan, read.path, lab)
 
 
 @app.command(epilog=example("centre architectures --case centralised"))

@@ -174,8 +174,6 @@ def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
     """
     from dataclasses import replace
 
-    import msgspec
-
     from experiments.file.problems import refusal
 
     every = [run for seeds in read for run in seeds]
@@ -190,7 +188,7 @@ def _pooled(folders: Sequence[str], read: Sequence[Sequence[Run]]) -> list[Run]:
     for folder, (run, *_) in zip(folders, read, strict=True):
         for case, trace in first.items():
             mine = run.traces[case]
-            if msgspec.structs.replace(mine.experiment, seed=0) != msgspec.structs.replace(trace.experiment, seed=0):
+            if mine.plan.changed(seed=0) != trace.plan.changed(seed=0):
                 hint = f"compare them without --pool: `./zenpark compare {folders[0]} {folder}`"
                 raise refusal(folder, f"differs from {folders[0]} in more than its seed", hint)
             if mine.clock != trace.clock:
@@ -355,7 +353,7 @@ def export(  # noqa: PLR0917 - a command line
     if suffix == ".mat":
         write_mat(found.traces, found.metrics, file)
     elif suffix == ".zip":
-        bundle.write(Path(folder), file, [trace.experiment for trace in found.traces.values()])
+        bundle.write(Path(folder), file, [trace.plan for trace in found.traces.values()])
     elif video is not None:
         write_video(found.traces, file, speed)
     else:

@@ -174,7 +174,7 @@ class _Top:
 
         stage, rows, where = self._observer.stage, self._rows(), self._watched
         title = stage.title or (where.run.title if where.run is not None else f"realm {where.realm}")
-        duration = None if stage.experiment is None else stage.experiment.duration_s
+        duration = None if stage.plan is None else stage.plan.experiment.duration_s
         phase, case = common_phase([row.phase for row in rows]), self._observer.case
         phase = f"{case}: {phase}" if case not in ("", UNNAMED) else phase
         title = heading(phase, self._observer.elapsed, duration, title)

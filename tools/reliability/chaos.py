@@ -12,7 +12,7 @@ import typer
 from tools.commands.options import AsJson, File, Out, Settings, example, known_words, print_result
 
 if TYPE_CHECKING:
-    from experiments.definition.experiment import Experiment
+    from experiments.definition.plan import Plan
     from tools.reliability.chaos_report import FaultResult, RoundResult
 
 app: Final = typer.Typer()
@@ -55,21 +55,21 @@ def chaos(
     from tools.reliability.faults import FAULTS, script
     from tools.reliability.spoilt_run import Setting
 
-    changes = [*defaults(load(file).experiment), *(settings or [])]
+    changes = [*defaults(load(file).plan), *(settings or [])]
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
-    experiment = chosen(read, [name])[name]
-    planned = script(list(experiment.robots), faults, seed, known_words("--kinds", kinds or [], FAULTS) or FAULTS)
+    plan = chosen(read, [name])[name]
+    planned = script(list(plan.names), faults, seed, known_words("--kinds", kinds or [], FAULTS) or FAULTS)
     folder = new_folder(dataclasses.replace(read, path=Path(f"{read.path.stem}-chaos")), out)
     read.keep(folder / SOURCE)
     (folder / SCRIPT).write_bytes(msgspec.json.format(msgspec.json.encode(planned), indent=1))
 
-    print(f"{faults} faults in rounds of {experiment.duration_s:g} s; script: {folder / SCRIPT}", file=sys.stderr)
+    print(f"{faults} faults in rounds of {plan.experiment.duration_s:g} s; script: {folder / SCRIPT}", file=sys.stderr)
     waiting, barren = list(planned), 0
     outcomes: list[FaultResult] = []
     ends: list[RoundResult] = []
     with interrupts() as interrupted:
-        setting = Setting(folder / SOURCE, name, experiment, folder, changes, interrupted)
+        setting = Setting(folder / SOURCE, name, plan, folder, changes, interrupted)
         while waiting and not interrupted() and barren < BARREN:
             flown = ChaosRound(setting, len(ends) + 1, waiting)
             ends.append(flown.run())
@@ -87,12 +87,12 @@ def chaos(
     return int(any(finding.mark == "bad" for finding in findings))
 
 
-def defaults(experiment: Experiment) -> list[str]:
+def defaults(plan: Plan) -> list[str]:
     """Settings of the laboratory, which `--set` overrides."""
     made = list(ALWAYS)
-    if experiment.avoidance is None:
+    if plan.experiment.avoidance is None:
         made.append(AVOIDANCE)
-    rates = experiment.rates
+    rates = plan.experiment.rates
     if rates.body_hz > BODY_HZ and all(
         (BODY_HZ / rate).is_integer() for rate in (rates.pose_hz, rates.coordination_hz, rates.state_hz)
     ):

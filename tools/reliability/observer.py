@@ -9,12 +9,10 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from agents.body.kinds import KINDS
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.messages import Command
-from experiments.definition.experiment import Experiment
 from experiments.definition.formation import errors_over_time
 from experiments.definition.plan import Plan
 from twins.arrays import Array, norm
@@ -30,20 +28,18 @@ STEP_M: Final = 0.6  # [m] outside the arena no goal may be
 class Invariants:
     """Robots as solids, and the links that the formation asks for."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, plan: Plan) -> None:
         """No position is known yet."""
-        self.names = tuple(experiment.robots)
+        self.names, kinds = plan.names, plan.kinds
         self._row = {name: number for number, name in enumerate(self.names)}
-        kinds = [KINDS[robot.kind] for robot in experiment.robots.values()]
         self._kinds = dict(zip(self.names, kinds, strict=True))
         self._radius = np.array([kind.radius for kind in kinds])
         self._height = np.array([kind.height for kind in kinds])
         self.flies = np.array([kind.flies for kind in kinds])
-        x, y, z = experiment.arena.size
+        x, y, z = plan.experiment.arena.size
         self._low = np.array([-0.5 * x - OUT_M, -0.5 * y - OUT_M, -BELOW_M])
         self._high = np.array([0.5 * x + OUT_M, 0.5 * y + OUT_M, z + OUT_M])
         self.position: Array = np.full((len(kinds), 3), np.nan)
-        plan = Plan(experiment)
         self._law, self._formation = plan.law, plan.formation
         self._lasting = np.array([link.reach == np.inf for link in plan.one_way_links], dtype=bool)
         self.nearest = np.inf  # [m] between surfaces of any two robots, so far
@@ -116,10 +112,10 @@ class Invariants:
 class Observer:
     """Receives what robots, bodies and world send, and checks the invariants on it."""
 
-    def __init__(self, session: zenoh.Session, experiment: Experiment) -> None:
+    def __init__(self, session: zenoh.Session, plan: Plan) -> None:
         self.session = session
-        keys = self.keys = Keys(experiment.network.realm)
-        self.invariants = Invariants(experiment)
+        keys = self.keys = Keys(plan.experiment.network.realm)
+        self.invariants = Invariants(plan)
         typed: Any = {"keys": keys, "robots": self.invariants.names}
         statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)
         self._statuses = pubsub.Inbox(statuses, messages.Status, **typed)
@@ -130,7 +126,7 @@ class Observer:
         self._events = pubsub.Inbox(pubsub.pose_subscriber(session, keys.event, 256, pubsub.EVENTS), messages.Event)
         self._watch = pubsub.AliveWatch(session, keys.alive("*"))
         self.receivers: dict[str, set[str]] = {name: set() for name in self.invariants.names}  # by sender
-        for link in Plan(experiment).one_way_links:
+        for link in plan.one_way_links:
             self.receivers[link.sender].add(link.receiver)
         self.events: list[messages.Event] = []  # of the conductor
         # the last of each robot, and when it came; all times are monotonic [s]

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from agents.safety.hazards import failed
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor.run_view import News, Progress, RobotView
 from experiments.real_time.hosts.launcher import RUN, tagged
 from tools.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
@@ -89,9 +89,10 @@ class Soaked:
 class Sampler(ExitStack):
     """Follows a run: writes a row for each of its processes every few seconds, and prints a line a minute."""
 
-    def __init__(self, experiment: Experiment, folder: Path, case: str) -> None:
+    def __init__(self, plan: Plan, folder: Path, case: str) -> None:
         super().__init__()
-        self._experiment, self._recording, self._table = experiment, folder / f"{case}.mcap", folder / TABLE
+        self._experiment = experiment = plan.experiment
+        self._recording, self._table = folder / f"{case}.mcap", folder / TABLE
         self._delays: dict[str, list[float]] = {name: [] for name in experiment.robots}  # since the last sample [s]
         self._failed: dict[str, str] = {}
         self._news = News()

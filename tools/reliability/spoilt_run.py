@@ -35,7 +35,7 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
@@ -61,7 +61,7 @@ class Setting:
 
     file: Path  # the experiment
     case: str  # its case
-    experiment: Experiment  # the same, changes applied
+    plan: Plan  # the same, changes applied
     folder: Path  # where each round gets a folder
     changes: Sequence[str]  # as behind `--set`
     interrupted: Callable[[], bool]  # by the user
@@ -105,7 +105,8 @@ class SpoiltRun:
 
     def __init__(self, stack: ExitStack, setting: Setting, stage: Stage, number: int) -> None:
         """Start it; `stack` ends it."""
-        experiment = self.experiment = setting.experiment
+        self.plan = setting.plan
+        experiment = self.experiment = setting.plan.experiment
         folder = setting.folder / f"round-{number:03}"
         self._switches = folder / "switches"
         self._switches.mkdir(parents=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher, Process
@@ -17,7 +17,7 @@ from experiments.recording.reader import PARTS
 class CaseContext:
     """Case of a run, the place of its files, and the means to run it."""
 
-    experiment: Experiment  # overrides applied
+    plan: Plan  # overrides applied
     case: str  # its name, with which the names of its processes and files begin
     folder: Path  # for the recording, and for the processes' output in logs/
     source: Path  # the experiment file as it was written, for the recording

@@ -14,7 +14,8 @@ from typing import Final
 import msgspec
 
 from experiments.definition import bodies, standby
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
@@ -44,12 +45,12 @@ class CaseProcesses:
         """Start nothing yet."""
         self._context = context
         self._launcher = context.launcher
-        self._groups = context.experiment.processes  # by process, without the case
+        self._groups = context.plan.experiment.processes  # by process, without the case
         self._servants = Servants(context)
         self.adopted: set[str] = set()  # robots that others have started, or will
         # hosts without address, by the robots that are started there
-        self.away = standby.robots_without_address(context.experiment)
-        self._addressed, self._reached = context.file, context.experiment
+        self.away = standby.robots_without_address(context.plan)
+        self._addressed, self._reached = context.file, context.plan
         self._joining = context.variant("joining")
         self._parts: list[Path] = []  # recordings of this case, one of each recorder
         self._abroad: dict[str, Process] = {}  # by host and group
@@ -108,15 +109,15 @@ class CaseProcesses:
 
         `changed` are robots with other settings, this time only.
         """
-        robots, file, experiment = self._context.experiment.robots, self._addressed, self._reached
+        robots, file, plan = self._context.plan.experiment.robots, self._addressed, self._reached
         if changed:
-            experiment = msgspec.structs.replace(experiment, robots={**experiment.robots, **changed})
+            plan = plan.changed(robots={**plan.experiment.robots, **changed})
             file = self._context.variant("changed")
-            file.write_bytes(write_json(experiment))
+            file.write_bytes(write_json(plan))
         for names in self._groups.values():
             wanted = names if only is None else [name for name in names if name in only]
             if missing := [name for name in wanted if not (name in self.adopted or robots[name].standby)]:
-                self._start(missing, file, experiment)
+                self._start(missing, file, plan)
 
     def start_again(self, names: Sequence[str], bodies: Mapping[str, Robot] | None = None) -> None:
         """Start the process of the robots `names` while the run is under way.
@@ -124,40 +125,41 @@ class CaseProcesses:
         They are ready without silent neighbours, which may be out of the run as well. `bodies` are other robots, which
         have these names from now on.
         """
-        robots = {**self._reached.robots, **(bodies or {})}
+        reached = self._reached.experiment
+        robots = {**reached.robots, **(bodies or {})}
         for name in bodies or {}:
             self._groups[self._group(name)].remove(name)
             self._groups[name] = [name]
         self._groups = {group: members for group, members in self._groups.items() if members}
-        self._reached = msgspec.structs.replace(self._reached, robots=robots)
-        begin = msgspec.structs.replace(self._reached.start, missing="go-on", deadline_s=ALONE_S)
-        safety = msgspec.structs.replace(self._reached.safety, start_within=0.0)  # it begins where it came down
-        joining = msgspec.structs.replace(self._reached, start=begin, safety=safety)
+        self._reached = self._reached.changed(robots=robots)
+        begin = msgspec.structs.replace(reached.start, missing="go-on", deadline_s=ALONE_S)
+        safety = msgspec.structs.replace(reached.safety, start_within=0.0)  # it begins where it came down
+        joining = self._reached.changed(start=begin, safety=safety)
         fresh = self._joining.with_suffix(".new")  # a process that is just starting reads the one or the other
         fresh.write_bytes(write_json(joining))
         fresh.replace(self._joining)
         self.adopted -= {*names}
         self._start(names, self._joining, joining)
 
-    def _start(self, names: Sequence[str], file: Path, experiment: Experiment) -> None:
+    def _start(self, names: Sequence[str], file: Path, plan: Plan) -> None:
         group = self._group(names[0])
         station = self._context.hosts.by_robot.get(names[0])
         if station is not None:
-            case = document.case_document(experiment)
+            case = document.case_document(plan)
             self._abroad[f"{station.name}/{group}"] = station.start(self._process(names[0]), names, case)
         else:
             self._context.start(group, "experiments.real_time.processes.robot", str(file), *names)
 
     def robot(self, name: str) -> Robot:
         """The robot of a name now: it may be another one, at an address that the file does not know."""
-        return self._reached.robots[name]
+        return self._reached.experiment.robots[name]
 
     def place(self, name: str, robot: Robot | None = None) -> tuple[float, float]:
         """Start of a robot: x, y [m], or of `robot` under its name."""
-        robots = self._reached.robots if robot is None else {**self._reached.robots, name: robot}
-        positions, _ = bodies.scattered_poses(
-            msgspec.structs.replace(self._reached, robots=robots), [name], self._context.experiment.seed
-        )
+        reached = self._reached
+        if robot is not None:
+            reached = reached.changed(robots={**reached.experiment.robots, name: robot})
+        positions, _ = bodies.scattered_poses(reached, [name], reached.experiment.seed)
         return positions[0][:2]
 
     def companions(self, name: str) -> list[str]:

@@ -22,10 +22,11 @@ from agents.network.lab import options as lab_options
 from agents.network.zenoh_config import check_loopback
 from agents.plugins import registry as plugins
 from agents.runtime import run_registry
-from experiments.definition import access_rights, bodies, mesh
+from experiments.definition import access_rights, mesh
 from experiments.definition import endpoints as reach
 from experiments.definition.bodies import choose_bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import WORLD
+from experiments.definition.plan import Plan
 from experiments.file.document import Document, chosen
 from experiments.file.problems import refusal
 from experiments.real_time.conductor.case_context import CaseContext
@@ -102,14 +103,14 @@ def conduct(read: Document, folder: Path, staging: RunOptions, user: Supervision
     return Conducted(begun, [*stopped, *failures, *stage.left], failures)
 
 
-def embody(read: Document, staging: RunOptions) -> dict[str, Experiment]:
+def embody(read: Document, staging: RunOptions) -> dict[str, Plan]:
     """The chosen cases of an experiment, with the bodies and on the machines that are asked for."""
     if staging.bodies == "protocol" and read.experiment.hosts and not staging.here:
         hint = "add --here, which lets all robots run on this machine"
         raise refusal("--bodies protocol", "protocol twins cannot be seen from hosts", hint)
     embodied = {name: choose_bodies(case, staging.bodies) for name, case in chosen(read, staging.cases).items()}
     if staging.here:
-        embodied = {name: msgspec.structs.replace(case, hosts={}) for name, case in embodied.items()}
+        embodied = {name: case.changed(hosts={}) for name, case in embodied.items()}
     return embodied
 
 
@@ -124,7 +125,7 @@ class Stage:
 @contextmanager
 def staged(
     read: Document,
-    embodied: Mapping[str, Experiment],
+    embodied: Mapping[str, Plan],
     folder: Path,
     staging: RunOptions,
     user: Supervision,
@@ -148,7 +149,7 @@ def staged(
 @contextmanager
 def _staged(
     read: Document,
-    embodied: Mapping[str, Experiment],
+    embodied: Mapping[str, Plan],
     folder: Path,
     staging: RunOptions,
     user: Supervision,
@@ -157,10 +158,10 @@ def _staged(
     network = read.experiment.network
     meshed = network.topology == "mesh"
     own_router = network.connect is None and not meshed
-    of_lab = reach.lab_folder(read.experiment, read.path, staging.lab)
+    of_lab = reach.lab_folder(read.plan, read.path, staging.lab)
     secure = of_lab is not None
     own = network.listen or free_endpoints(network.routers, protocol="tls" if secure else "tcp")
-    listening = reach.router_endpoints(read.experiment, read.path, own if own_router else [], staging.lab)
+    listening = reach.router_endpoints(read.plan, read.path, own if own_router else [], staging.lab)
     if own_router and not secure:
         for endpoint in listening:
             check_loopback(endpoint)
@@ -208,11 +209,11 @@ def _staged(
         stage.left += hosts.sweep()
 
 
-def hardware(cases: Iterable[Experiment]) -> dict[str, str]:
+def hardware(cases: Iterable[Plan]) -> dict[str, str]:
     """Robots of some cases by name, with the address of those that are hardware, and the host on which they run."""
     found: dict[str, str] = {}
-    simulated = {"twin", bodies.WORLD, "external", *plugins.names(plugins.DEVICES)}
-    for case in cases:
+    simulated = {"twin", WORLD, "external", *plugins.names(plugins.DEVICES)}
+    for case in (plan.experiment for plan in cases):
         hosts = {robot: host for host, each in case.hosts.items() for robot in each.robots}
         for name, robot in case.robots.items():
             if plugins.body_name(robot.body) in simulated:
@@ -252,7 +253,7 @@ def _drives_same_device(other: run_registry.Run, name: str, body: str) -> bool:
 
 
 def write_rights(
-    cases: Collection[Experiment], endpoints: Sequence[str], folder: Path, operator: str = "operator"
+    cases: Collection[Plan], endpoints: Sequence[str], folder: Path, operator: str = "operator"
 ) -> Path | None:
     """Rights of all identities, as a file for the router; None without a lab.
 

@@ -17,7 +17,6 @@ from agents.clock import Clock
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.runtime.orders import LAND, STOP
-from experiments.definition.plan import Plan
 from experiments.file.document import write_json
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.case_processes import CaseProcesses
@@ -65,13 +64,13 @@ class CaseRun:
     def __init__(self, context: CaseContext, show: Show) -> None:
         """Write the case as a file for its processes; nothing is started yet."""
         self._context, self._show = context, show
-        self._experiment = experiment = context.experiment
+        self._plan = plan = context.plan
+        self._experiment = experiment = plan.experiment
         context.file.parent.mkdir(parents=True, exist_ok=True)
-        context.file.write_bytes(write_json(experiment))
+        context.file.write_bytes(write_json(plan))
         self._keys = Keys(experiment.network.realm)
         # of each case, for all its processes here, however late they start
         self._clock = context.launcher.clock = Clock()
-        plan = Plan(experiment)
         linked = {plan.names[row] for row in plan.links.receiver.tolist()} - {*plan.guided}
         self._robots = {
             name: RobotView(linked=name in linked, left_because="standby" if robot.standby else "")
@@ -101,7 +100,7 @@ class Conductor(CaseRun):
         """Run the case to its end, or until the user interrupts it; the robots are down in any case."""
         began = time.monotonic()
         self._progress.phase = "connecting the hosts" if self._experiment.hosts else "starting"
-        clocks = self._context.hosts.join(self._experiment)
+        clocks = self._context.hosts.join(self._plan)
         start = ready = None
         self._failures: list[str] = []
         self._landed: set[str] = set()  # robots whose early landing was seen
@@ -139,7 +138,7 @@ class Conductor(CaseRun):
 
     def _join(self, stack: ExitStack) -> None:
         super()._join(stack)
-        self._changes = HotChanges(self._experiment, self._processes, self._view, self._keys)
+        self._changes = HotChanges(self._plan, self._processes, self._view, self._keys)
 
     def _adopt(self) -> None:
         """Adopt robots that were started by hand or at boot."""

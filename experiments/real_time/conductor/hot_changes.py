@@ -16,7 +16,7 @@ import zenoh
 from agents.network import messages
 from agents.network.keys import Keys
 from agents.plugins.registry import did_you_mean
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor import replacement
 from experiments.real_time.conductor.case_processes import CaseProcesses
 from experiments.real_time.conductor.replacement import Refused, in_the_way
@@ -56,9 +56,9 @@ class _Change:
 class HotChanges:
     """Changes of the robots of one case."""
 
-    def __init__(self, experiment: Experiment, processes: CaseProcesses, view: NetworkView, keys: Keys) -> None:
+    def __init__(self, plan: Plan, processes: CaseProcesses, view: NetworkView, keys: Keys) -> None:
         """Refuse everything until `begin`."""
-        self._experiment, self._processes, self._view, self._keys = experiment, processes, view, keys
+        self._experiment, self._processes, self._view, self._keys = plan.experiment, processes, view, keys
         self._robots = view.robots
         self._start: float | None = None
         self._changes: list[_Change] = []
@@ -66,7 +66,7 @@ class HotChanges:
         self._leaving: set[str] = set()
         self._ended: dict[str, str] = {}  # robots whose process has ended while they join, and how
         self._losses: dict[str, int] = {}
-        self._spares = replacement.Spares(experiment)
+        self._spares = replacement.Spares(plan)
 
     @property
     def under_way(self) -> set[str]:

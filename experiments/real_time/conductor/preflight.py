@@ -21,7 +21,8 @@ from agents.body.interface import UNANSWERED
 from agents.kinds.tello import TELLO
 from agents.network import messages
 from agents.protocols import tello
-from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.definition.experiment import Channel, Formation, Leg, Robot
+from experiments.definition.plan import Plan
 from experiments.file.document import Document
 from experiments.real_time.conductor import preflight_checks as checks
 from experiments.real_time.conductor.case_context import CaseContext
@@ -69,12 +70,12 @@ def check_robots(
     Returns:
         The checks of each robot; none if the user ended them before they began.
     """
-    experiment = alone(next(iter(embody(read, options).values())))
-    with staged(read, {PREFLIGHT: experiment}, folder, options, user) as stage, user.show as show:
+    plan = alone(next(iter(embody(read, options).values())))
+    with staged(read, {PREFLIGHT: plan}, folder, options, user) as stage, user.show as show:
         return Inspector(stage.context(PREFLIGHT), show, trials).run()
 
 
-def alone(experiment: Experiment) -> Experiment:
+def alone(plan: Plan) -> Plan:
     """The robots of a case without formation and plans: drones hop to `HOP_M`, robots on wheels drive `DRIVE_M`.
 
     A Tello climbs to a height of its own before it obeys, and is not sent down to `HOP_M` from there.
@@ -86,7 +87,7 @@ def alone(experiment: Experiment) -> Experiment:
             shadow=None,
             standby=False,
         )
-        for name, robot in experiment.robots.items()
+        for name, robot in plan.experiment.robots.items()
     }
     arc = {
         "kind": "circle",
@@ -94,15 +95,14 @@ def alone(experiment: Experiment) -> Experiment:
         "period_s": math.tau * RADIUS_M / DRIVE_M_S,
         "turns": DRIVE_M / (math.tau * RADIUS_M),
     }
-    return msgspec.structs.replace(
-        experiment,
+    return plan.changed(
         robots=robots,
         duration_s=DRIVE_S,
         formation=Formation(),
         timeline=[Leg(at_s=0.0, robot=name, plan=arc) for name, robot in robots.items() if robot.hover is None],
         architecture="distributed",
         avoidance=None,
-        channel=type(experiment.channel)(),
+        channel=Channel(),
         on_loss="none",
         cases={},
     )
@@ -120,7 +120,7 @@ class Inspector(CaseRun):
 
     def run(self) -> list[RobotChecks]:
         """Check all robots; those that have moved are down in any case."""
-        self._context.hosts.join(self._experiment)
+        self._context.hosts.join(self._plan)
         try:
             self._processes.prepare(recorder=False)
             with ExitStack() as stack:

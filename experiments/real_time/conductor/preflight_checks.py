@@ -20,8 +20,8 @@ from agents.network import messages
 from agents.plugins import registry
 from agents.protocols import tello
 from agents.safety.detection import clock_off, clock_text
-from experiments.definition.bodies import WORLD, driven_kind
-from experiments.definition.experiment import Robot
+from experiments.definition.bodies import driven_kind
+from experiments.definition.experiment import WORLD, Robot
 from experiments.real_time.conductor.run_view import AHEAD_S, BEHIND_S
 from twins.arrays import Array
 

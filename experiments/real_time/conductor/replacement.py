@@ -12,8 +12,8 @@ from agents.body.kinds import KINDS
 from agents.network import messages
 from agents.plugins import registry
 from agents.plugins.registry import did_you_mean
-from experiments.definition.bodies import WORLD
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import WORLD, Robot
+from experiments.definition.plan import Plan
 from experiments.real_time.conductor.run_view import RobotView
 
 TWIN: Final = "twin"  # a body that is there as long as its process
@@ -29,8 +29,8 @@ class Spares:
 
     used: dict[str, str]  # names that they have taken over, by spare
 
-    def __init__(self, experiment: Experiment) -> None:
-        self._experiment = experiment
+    def __init__(self, plan: Plan) -> None:
+        self._spares, self._arena = plan.experiment.spares, plan.experiment.arena
         self.used = {}
 
     def successor(self, name: str, robot: Robot, order: messages.RunOrder) -> tuple[Robot, str | None]:
@@ -48,7 +48,7 @@ class Spares:
         return made, spare
 
     def _first_spare(self, name: str, kind: str) -> str:
-        for spare, robot in self._experiment.spares.items():
+        for spare, robot in self._spares.items():
             if robot.kind == kind and spare not in self.used:
                 return spare
         raise Refused(
@@ -56,7 +56,7 @@ class Spares:
         )
 
     def _of_spare(self, spare: str, name: str, robot: Robot) -> Robot:
-        spares = self._experiment.spares
+        spares = self._spares
         if spare not in spares:
             there = did_you_mean(spare[:50], spares) if spares else "the file has none"
             raise Refused(f"no spare '{spare[:50]}'; {there}")
@@ -80,7 +80,7 @@ class Spares:
     def _put(self, robot: Robot, at: tuple[float, float], yaw: float) -> Robot:
         if robot.body != TWIN:
             raise Refused("only a twin can be put somewhere: put the robot there yourself, and leave --at out")
-        half = [size / 2 for size in self._experiment.arena.size[:2]]
+        half = [size / 2 for size in self._arena.size[:2]]
         if not math.isfinite(yaw) or not all(abs(x) <= limit for x, limit in zip(at, half, strict=True)):
             raise Refused(f"--at lies outside of the arena, ±{half[0]:g} by ±{half[1]:g} m")
         return msgspec.structs.replace(robot, start=[*at, yaw])

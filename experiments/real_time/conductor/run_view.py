@@ -119,14 +119,14 @@ class NetworkView:
         """Join the network; `stack` leaves it."""
         self.clock, self.robots, self._progress = progress.clock, progress.robots, progress
         self._launcher, self._begun = context.launcher, time.monotonic()
-        experiment, endpoints = context.experiment, context.endpoints
+        experiment, endpoints = context.plan.experiment, context.endpoints
         self._keys = keys = Keys(experiment.network.realm)
         opened = network.open_session(
             endpoints,
             name="conductor",
             wait_s=ROUTER_S,
             identity=context.identity,
-            rights=mesh.member_rights(experiment, endpoints),
+            rights=mesh.member_rights(context.plan, endpoints),
         )
         self.session, declared = stack.enter_context(held(opened))
         declared.append(self)
@@ -139,7 +139,7 @@ class NetworkView:
             self.report("router", "conductor", f"{where}: look with `./zenpark keys {options}`")
         self._clock = pubsub.publisher(session, keys.clock, messages.JSON)
         self._experiment = pubsub.pose_publisher(session, keys.experiment, messages.JSON)
-        self._experiment.put(document.case_document(experiment, context.case))
+        self._experiment.put(document.case_document(context.plan, context.case))
         self.orders = pubsub.Orders(session, keys.run_order, messages.RunOrder)  # to the conductor
         self._token = pubsub.alive_token(session, keys.conductor)
         statuses = pubsub.pose_subscriber(session, keys.status("*"), 4096)

@@ -15,8 +15,8 @@ import msgspec
 from agents.errors import ExplainedError
 from agents.network import endpoints as topology
 from agents.plugins import registry
-from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.access_rights import has_world
+from experiments.definition.experiment import VICON_TWIN
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.hosts.launcher import ROUTER, Launcher, Process, is_router
@@ -36,7 +36,7 @@ class RouterEnded(StandInError):
 
 def start_world(context: CaseContext) -> Process | None:
     """Start the world of an experiment, for the first time or again; None if no robot asks for one."""
-    if not any(bodies.WORLD in (robot.body, robot.ranges) for robot in context.experiment.robots.values()):
+    if not has_world(context.plan):
         return None
     return context.start("world", "experiments.real_time.processes.world", str(context.file))
 
@@ -94,7 +94,7 @@ class Servants:
         """Start nothing: routers are started by others."""
         self._context = context
         self.standins = []
-        count = context.experiment.network.routers
+        count = context.plan.experiment.network.routers
         self._known = {
             each.name: _Servant(
                 partial(each.start, context.launcher, context.rights),
@@ -108,12 +108,12 @@ class Servants:
         """Start a process of the case, and again when it dies."""
         self._known[start().name] = _Servant(start, meanwhile, given_up)
 
-    def start(self) -> Experiment:
-        """Start what the robots of the case need; return its experiment with the addresses of its robots.
+    def start(self) -> Plan:
+        """Start what the robots of the case need; return the case with the addresses of its robots.
 
         Raises StandInError if a protocol twin or a positioning system does not start in time.
         """
-        context, experiment = self._context, self._context.experiment
+        context, experiment = self._context, self._context.plan.experiment
         world = start_world(context)
         words = registry.names(registry.DEVICES)
         groups: dict[str, list[str]] = {}
@@ -133,27 +133,27 @@ class Servants:
             name: msgspec.structs.replace(robot, body=addresses.get(name, robot.body))
             for name, robot in experiment.robots.items()
         }
-        addressed = msgspec.structs.replace(experiment, robots=robots)
+        addressed = context.plan.changed(robots=robots)
         self._start_positioning(addressed)
-        if Plan(experiment).guided:
+        if context.plan.guided:
             centre = partial(context.start, "centre", "experiments.real_time.processes.centre", str(context.file))
             given_up = ": the robots that it guides hold, and land at the end"
             self._known[centre().name] = _Servant(centre, given_up=given_up)
         return addressed
 
-    def _start_positioning(self, experiment: Experiment) -> None:
+    def _start_positioning(self, plan: Plan) -> None:
         """Start the motion capture of the case, whose robots have addresses."""
-        context, measured = self._context, Plan(experiment).externally_measured
+        context, experiment, measured = self._context, plan.experiment, plan.externally_measured
         if experiment.positioning is None or not measured:
             return
         realm = ["--realm", experiment.network.realm]
         host = experiment.positioning.removeprefix(VICON)
-        if experiment.positioning == bodies.VICON_TWIN:
-            asked = (bodies.disturbance(experiment, name).position_sigma or 0.0 for name in measured)
+        if experiment.positioning == VICON_TWIN:
+            asked = (plan.disturbance(name).position_sigma or 0.0 for name in measured)
             sigma = max(LEAST_SIGMA, *asked)
             noise = ["--sigma", str(sigma), "--seed", str(experiment.seed)]
             arguments = ["--listen", "127.0.0.1:0", *measured, *noise, *realm]
-            twin = context.start(bodies.VICON_TWIN, "twins.devices.vicon", *arguments)
+            twin = context.start(VICON_TWIN, "twins.devices.vicon", *arguments)
             self.standins.append(twin.name)
             host = _announced(twin, r"^vicon (ready on) (\S+)$", 1, context.ended)["ready on"]
         maps = [part for name in measured for part in ("--map", f"{name}={name}")]

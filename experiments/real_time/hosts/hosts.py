@@ -25,7 +25,8 @@ from agents.errors import ExplainedError
 from agents.network import lab
 from agents.network.endpoints import Endpoint
 from agents.network.messages import HostClock
-from experiments.definition.experiment import Experiment, Host
+from experiments.definition.experiment import Host
+from experiments.definition.plan import Plan
 from experiments.real_time.hosts import certificates, ssh
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process
 from experiments.real_time.hosts.station import Answer, Question
@@ -235,9 +236,10 @@ class Hosts:
         self._stations: dict[str, Station] = {}
         self.by_robot: dict[str, Station] = {}  # of the case
 
-    def join(self, experiment: Experiment) -> list[HostClock]:
+    def join(self, plan: Plan) -> list[HostClock]:
         """Connect the hosts of a case with robots and an address; return their clocks. Errors name all obstacles."""
-        wanted = {name: host for name, host in experiment.hosts.items() if host.address is not None and host.robots}
+        hosts = plan.experiment.hosts
+        wanted = {name: host for name, host in hosts.items() if host.address is not None and host.robots}
         fresh = []
         for name, host in wanted.items():
             known = self._stations.get(name)
@@ -249,7 +251,7 @@ class Hosts:
         trouble = []
         for station in fresh:
             try:
-                station.greet(experiment.network.address)
+                station.greet(plan.experiment.network.address)
                 if not station.same_version:
                     trouble.append(_other_version(station))
                 else:

@@ -28,7 +28,6 @@ from agents.runtime import command_line
 from agents.runtime.pose_inbox import ModelledInbox
 from agents.runtime.telemetry import resident_mb
 from agents.ticks import Ticks
-from experiments.definition.experiment import Experiment
 from experiments.definition.link_conditions import TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
@@ -43,11 +42,11 @@ PHASES: Final = {phase.word: int(phase) for phase in Phase}
 class CentreProcess:
     """Clock and network of a central controller."""
 
-    def __init__(self, experiment: Experiment, joint: Network) -> None:
+    def __init__(self, plan: Plan, joint: Network) -> None:
         """Declares all but the token, which tells that orders are received."""
         session, keys = joint.session, joint.keys
-        plan = Plan(experiment)
-        names = self._names = plan.names
+        experiment, names = plan.experiment, plan.names
+        self._names = names
         self.centre = centre = Centre([plan.assignment(name, centrally=True) for name in names])
         common = centre.assignments[0]  # rates, limits and duration are those of the experiment
         self._duration, self._session, self._keys = common.duration, session, keys
@@ -61,7 +60,7 @@ class CentreProcess:
         rows, ends = centre.needed, [(name, name) for name in names]
         self._poses = ModelledInbox(
             session, keys, {names[row]: [row] for row in rows},
-            conditions_of(experiment, ends, experiment.seed, stream=TO_CENTRE, real=True), centre,
+            conditions_of(plan, ends, experiment.seed, stream=TO_CENTRE, real=True), centre,
             reach=reach_of(common.limits.low, common.limits.high), rate=experiment.rates.pose_hz, depth=DEPTH,
             counted=self._within_run,
         )  # fmt: skip
@@ -182,14 +181,14 @@ def _check_status(status: messages.Status) -> None:
 
 def serve(launch: Launch) -> int:
     """Runs the centre of an experiment until it is told to end; returns the exit code."""
-    experiment, endpoints = launch.read()
-    guided = Plan(experiment).guided
+    plan, endpoints = launch.read()
+    experiment, guided = plan.experiment, plan.guided
     if not guided:
         hint = 'write architecture = "centralised" at the top of the file, or choose another case with --case'
         raise refusal(launch.file, "every robot of this experiment decides for itself", hint)
     over = threading.Event()
     with joined(
-        experiment,
+        plan,
         endpoints,
         name="centre",
         stop=over,
@@ -198,9 +197,9 @@ def serve(launch: Launch) -> int:
         token=Keys(experiment.network.realm).centre_alive,
         taken="a centre guides the robots",
     ) as joint:
-        process = CentreProcess(experiment, joint)
+        process = CentreProcess(plan, joint)
         joint.declared.append(process)
-        others = [name for name in experiment.robots if name not in guided]
+        others = [name for name in plan.names if name not in guided]
         print(
             f"centre ready: guides {', '.join(guided)} at {experiment.rates.coordination_hz:g} Hz"
             + (f"; {', '.join(others)} decide for themselves" if others else "")

@@ -27,7 +27,7 @@ from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import SILENCE_S, Lifeline
 from experiments.definition import mesh
 from experiments.definition.endpoints import router_endpoints
-from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.document import Document, chosen_case
 from experiments.file.problems import DocumentError
@@ -44,11 +44,11 @@ class Launch(msgspec.Struct, frozen=True, kw_only=True, rename="kebab"):
     lab: Annotated[str | None, msgspec.Meta(title="FOLDER", description="certificates; the file's if left out")] = None
     lifeline: Annotated[bool, msgspec.Meta(description="end when standard input ends or is silent")] = False
 
-    def read(self) -> tuple[Experiment, list[str]]:
+    def read(self) -> tuple[Plan, list[str]]:
         """The chosen case of the file, and the routers to use."""
         read = document.read(self.file)
-        experiment = chosen_case(read, self.case)
-        return experiment, router_endpoints(experiment, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]
+        plan = chosen_case(read, self.case)
+        return plan, router_endpoints(plan, read.path, self.connect, self.lab) or [DEFAULT_ENDPOINT]
 
 
 class Network(NamedTuple):
@@ -63,7 +63,7 @@ class Network(NamedTuple):
 
 @contextmanager
 def joined(
-    experiment: Experiment,
+    plan: Plan,
     endpoints: list[str],
     *,
     name: str,  # of the session, and of its certificate in a lab
@@ -79,28 +79,26 @@ def joined(
         NameTaken: If another process owns `token`, or took it while this one stood still or was cut off.
         Unreachable: If no router answers.
     """
-    began = Clock().utc()
+    began, realm = Clock().utc(), plan.experiment.network.realm
     if lost is not None:
         Lifeline(lost).start()
     with on_termination(on_signal):
-        session = network.open_session(
-            endpoints, name=name, stop=stop, rights=mesh.member_rights(experiment, endpoints)
-        )
+        session = network.open_session(endpoints, name=name, stop=stop, rights=mesh.member_rights(plan, endpoints))
         with held(session) as (session, declared):
             if token:
                 try:
                     declared.append(claim(session, [token], began=began, endpoints=endpoints, stop=stop))
                 except NameTaken:
                     raise NameTaken(
-                        f"{taken} in the realm '{experiment.network.realm}' already: end it first, choose another "
+                        f"{taken} in the realm '{realm}' already: end it first, choose another "
                         "router with --connect, or another network.realm in the experiment file"
                     ) from None
             ownership = OwnershipCheck([token] if token else [])
             try:
-                yield Network(session, Keys(experiment.network.realm), endpoints, declared, ownership)
+                yield Network(session, Keys(realm), endpoints, declared, ownership)
             except NameTaken:
                 raise NameTaken(
-                    f"another process has taken the name '{name}' in the realm '{experiment.network.realm}' while this "
+                    f"another process has taken the name '{name}' in the realm '{realm}' while this "
                     "one stood still or was cut off; it leaves"
                 ) from None
             finally:

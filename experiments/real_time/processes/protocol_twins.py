@@ -27,7 +27,8 @@ from agents.runtime.command_line import on_termination
 from agents.runtime.lifeline import Lifeline
 from agents.ticks import Ticks
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Robot
+from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch
@@ -42,15 +43,15 @@ class TwinLaunch(Launch, frozen=True, kw_only=True):
 
 def stand_in(launch: TwinLaunch) -> int:
     """Runs the protocol twins of robots whose `body` asks for the same one; returns the exit code."""
-    experiment, endpoints = launch.read()
-    names = launch.names
+    plan, endpoints = launch.read()
+    experiment, names = plan.experiment, launch.names
     words = {experiment.robots[name].body if name in experiment.robots else "" for name in names}
     known = registry.names(registry.DEVICES)
     if len(words) != 1 or not words <= set(known):
         hint = f"their `body` must be one of {', '.join(known)}"
         raise refusal(launch.file, f"{', '.join(names)} cannot share a protocol twin", hint)
-    request = DeviceRequest(bodies.body_request(experiment, names, experiment.seed, endpoints), Faults())
-    return _serve(words.pop(), request, experiment, endpoints, lifeline=launch.lifeline)
+    request = DeviceRequest(bodies.body_request(plan, names, experiment.seed, endpoints), Faults())
+    return _serve(words.pop(), request, plan, endpoints, lifeline=launch.lifeline)
 
 
 def by_hand(
@@ -81,25 +82,25 @@ def by_hand(
         f"{kind[:2].upper()}{k + 1:02}": Robot(kind=kind, start=[0.5 * k, 0.0], body=word, hover=hover, device=settings)
         for k in range(count)
     }
-    experiment = Experiment(title=word, robots=robots, duration_s=1.0)
+    plan = Plan.made(title=word, robots=robots, duration_s=1.0)
     endpoints = list(connect) or [DEFAULT_ENDPOINT]
     injected = msgspec.convert(structure.parse_object("--faults", faults, Faults), Faults)
-    body = bodies.body_request(experiment, list(robots), experiment.seed, endpoints)
+    body = bodies.body_request(plan, plan.names, plan.experiment.seed, endpoints)
     request = DeviceRequest(body, injected, by_hand=True)
-    return _serve(word, request, experiment, connect, identity=identity)
+    return _serve(word, request, plan, connect, identity=identity)
 
 
 def _serve(
     word: str,
     request: DeviceRequest,
-    experiment: Experiment,
+    plan: Plan,
     connect: Sequence[str],
     *,
     lifeline: bool = False,
     identity: str = "twin",
 ) -> int:
     """Runs a device until a signal, or until its lifeline is lost and the robots are gone."""
-    names, keys = request.body.names, Keys(experiment.network.realm)
+    names, keys = request.body.names, Keys(plan.experiment.network.realm)
     over, lost = threading.Event(), threading.Event()
     if lifeline:
         Lifeline(lost).start()
@@ -116,7 +117,7 @@ def _serve(
         stack.callback(device.close)
         for name, address in zip(names, device.addresses, strict=True):
             print(f"address {name} {address}", flush=True)
-        ticks, clock = Ticks(experiment.rates.body_hz, clock=uptime), Clock()
+        ticks, clock = Ticks(plan.experiment.rates.body_hz, clock=uptime), Clock()
         while not (over.is_set() or ended()):
             now = serve_until_next(device, ticks)
             device.advance(now)

@@ -158,20 +158,20 @@ class RecorderLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 def record(launch: RecorderLaunch) -> int:
     """Records one case until its lifeline is lost and the robots are gone, or until SIGTERM; returns the exit code."""
-    experiment, endpoints = launch.read()
+    plan, endpoints = launch.read()
     text = Path(launch.source).read_text("utf-8")
     lost, asked = threading.Event(), threading.Event()
-    target, seed = Path(launch.target), experiment.seed
+    target, seed = Path(launch.target), plan.experiment.seed
     with (
-        joined(experiment, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
+        joined(plan, endpoints, name="recorder", stop=asked, on_signal=asked.set, lost=lost) as joint,
         Recording(
             target,
-            experiment,
+            plan,
             text,
             case=launch.name,
             seed=seed,
             clock="real",
-            draw=markers.drawing(experiment),
+            draw=markers.drawing(plan),
             utc=Clock().utc,
         ) as recording,
     ):

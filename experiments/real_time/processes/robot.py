@@ -37,7 +37,7 @@ from agents.runtime.lifeline import FAR_SILENCE_S, SILENCE_S
 from agents.runtime.loop import Ranging, Runtime, Setup
 from experiments.definition import bodies, mesh
 from experiments.definition.endpoints import router_endpoints
-from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.experiment import Robot
 from experiments.definition.link_conditions import FROM_CENTRE, Ends, conditions_of
 from experiments.definition.plan import Plan
 from experiments.file import document
@@ -82,22 +82,21 @@ def fly(launch: RobotLaunch) -> int:
             read = document.received(read_experiment(), "standard input")
         else:
             read = document.read(file)
-        experiment = chosen_case(read, launch.case)
-        unknown = [name for name in names if name not in experiment.robots]
+        plan = chosen_case(read, launch.case)
+        unknown = [name for name in names if name not in plan.names]
         if unknown:
-            hint = registry.did_you_mean(unknown[0], experiment.robots)
+            hint = registry.did_you_mean(unknown[0], plan.names)
             raise refusal(file, f"no robot '{unknown[0]}' in this experiment", hint)
-        endpoints = router_endpoints(experiment, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
-        return _run(experiment, launch, endpoints)
+        endpoints = router_endpoints(plan, read.path, endpoints, launch.lab) or [DEFAULT_ENDPOINT]
+        return _run(plan, launch, endpoints)
 
 
-def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
+def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
     """Runs robots of a case until they end."""
-    names, clock = launch.names, Clock(launch.clock_correction)
-    endpoints = mesh.neighbour_endpoints(experiment, names, endpoints)
-    request = replace(bodies.body_request(experiment, names, experiment.seed, endpoints), clock=clock)
-    body = shadowed(assemble(request), request, bodies.shadow_periods(experiment, names))
-    plan = Plan(experiment)
+    experiment, names, clock = plan.experiment, launch.names, Clock(launch.clock_correction)
+    endpoints = mesh.neighbour_endpoints(plan, names, endpoints)
+    request = replace(bodies.body_request(plan, names, experiment.seed, endpoints), clock=clock)
+    body = shadowed(assemble(request), request, bodies.shadow_periods(plan, names))
     assignments = [plan.assignment(name) for name in names]
     setup = Setup(
         keys=Keys(experiment.network.realm),
@@ -110,22 +109,22 @@ def _run(experiment: Experiment, launch: RobotLaunch, endpoints: Sequence[str]) 
         exact=[name not in plan.externally_measured for name in names],
         ranging=[_ranging(experiment.robots[name]) for name in names],
         conditions=[
-            _conditions(experiment, [(link.name, name) for link in each.neighbours])
+            _conditions(plan, [(link.name, name) for link in each.neighbours])
             for name, each in zip(names, assignments, strict=True)
         ],
-        goal_conditions=_conditions(experiment, [(name, name) for name in names], FROM_CENTRE),
+        goal_conditions=_conditions(plan, [(name, name) for name in names], FROM_CENTRE),
         clock=clock,
         once=launch.once,
-        rights=mesh.member_rights(experiment, endpoints),
+        rights=mesh.member_rights(plan, endpoints),
         loop_silence_s=experiment.safety.loop_silence_s,
         wake=plan.wakes,
     )
     return Runtime(assignments, body, setup).run()
 
 
-def _conditions(experiment: Experiment, ends: Ends, stream: str = "") -> list[Conditions]:
+def _conditions(plan: Plan, ends: Ends, stream: str = "") -> list[Conditions]:
     """Conditions of links of this process, on a network with a delay of its own."""
-    return conditions_of(experiment, ends, experiment.seed, stream=stream, real=True)
+    return conditions_of(plan, ends, plan.experiment.seed, stream=stream, real=True)
 
 
 def read_experiment() -> str:

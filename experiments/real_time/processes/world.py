@@ -20,11 +20,10 @@ from agents.clock import uptime
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from agents.network.shutdown import Farewell, end
-from agents.plugins import registry
 from agents.runtime import command_line
 from agents.ticks import Ticks
-from experiments.definition.bodies import WORLD
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import WORLD
+from experiments.definition.plan import Plan
 from experiments.file.problems import refusal
 from experiments.real_time.processes.joining import Launch, Network, joined
 from experiments.real_time.processes.world_network import Exchange
@@ -57,15 +56,14 @@ class Pace:
 class WorldProcess:
     """Runs a population in real time, and obeys orders."""
 
-    def __init__(self, experiment: Experiment, population: Population, joint: Network, lost: threading.Event) -> None:
+    def __init__(self, plan: Plan, population: Population, joint: Network, lost: threading.Event) -> None:
         """`lost` is set to end as soon as the robots have landed."""
         session, self._keys = joint.session, joint.keys
         self._ownership, self._over = joint.ownership, threading.Event()
         self._population, self._session, self._lost = population, session, lost
-        self._engine = registry.split(experiment.world.engine)[0]
-        hz = experiment.rates.body_hz
+        self._engine, hz = plan.engine_name, plan.experiment.rates.body_hz
         self._ticks = Ticks(hz, catch_up=round(SLIP_S * hz), clock=uptime)
-        self.exchange = Exchange(experiment, population, joint)
+        self.exchange = Exchange(plan, population, joint)
         self._reports = pubsub.pose_publisher(session, self._keys.world, messages.JSON)
         self._orders = pubsub.Orders(session, self._keys.world_order, messages.WorldOrder)
         self._pace = Pace()
@@ -173,44 +171,44 @@ class WorldLaunch(Launch, frozen=True, kw_only=True, rename="kebab"):
 
 def serve(launch: WorldLaunch) -> int:
     """Runs the world of an experiment until it is told to end and its robots are down; returns the exit code."""
-    experiment, endpoints = launch.read()
-    robots = experiment.robots.values()
+    plan, endpoints = launch.read()
+    robots = plan.experiment.robots.values()
     if not any(WORLD in (robot.body, robot.ranges) for robot in robots):
         hint = 'give robots `body = "world"` (or start it all with `./zenpark run FILE --bodies world`)'
         raise refusal(launch.file, "no robot of this experiment lives in a world", hint)
     if launch.engine is not None:
-        changed = msgspec.structs.replace(experiment.world, engine=launch.engine)
-        experiment = msgspec.structs.replace(experiment, world=changed)
+        plan = plan.changed(world=msgspec.structs.replace(plan.experiment.world, engine=launch.engine))
     over, lost = threading.Event(), threading.Event()
 
     def leave() -> None:
         (over if lost.is_set() else lost).set()  # a second signal does not wait for robots to land
 
-    population = Population(experiment)
+    population = Population(plan)
     with joined(
-        experiment,
+        plan,
         endpoints,
         name="world",
         stop=lost,
         on_signal=leave,
         lost=lost if launch.lifeline else None,
-        token=Keys(experiment.network.realm).world_alive,
+        token=Keys(plan.experiment.network.realm).world_alive,
         taken="a world runs",
     ) as joint:
         # before anything watches those tokens: a session that has begun to watch answers from what it has heard
         there = _alive(joint.session, joint.keys)
-        world = WorldProcess(experiment, population, joint, lost)
+        world = WorldProcess(plan, population, joint, lost)
         joint.declared.append(world)
         back = world.exchange.restore_positions(there)
-        print(_ready(experiment, world.carried, endpoints, back), flush=True)
+        print(_ready(plan, world.carried, endpoints, back), flush=True)
         world.run(over)
     return 0
 
 
-def _ready(experiment: Experiment, carried: Sequence[str], endpoints: Sequence[str], back: Sequence[str]) -> str:
-    mirrored = ", ".join(name for name in experiment.robots if name not in carried) or "none"
+def _ready(plan: Plan, carried: Sequence[str], endpoints: Sequence[str], back: Sequence[str]) -> str:
+    experiment = plan.experiment
+    mirrored = ", ".join(name for name in plan.names if name not in carried) or "none"
     return (
-        f"world ready: {registry.split(experiment.world.engine)[0]} at {experiment.rates.body_hz:g} Hz "
+        f"world ready: {plan.engine_name} at {experiment.rates.body_hz:g} Hz "
         f"carries {', '.join(carried) or 'none'}; mirrors {mirrored}; "
         f"realm {experiment.network.realm} at {', '.join(endpoints)}"
         + (f"; {', '.join(back)} where they were" if back else "")

@@ -22,8 +22,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.runtime import range_inbox
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Vector
-from experiments.definition.bodies import WORLD
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import WORLD
 from experiments.definition.plan import Plan
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world_population import HOLD_S, Population
@@ -50,8 +49,8 @@ class Exchange:
     malformed: int  # refused payloads
     trouble: str  # last refusal; empty if there was none
 
-    def __init__(self, experiment: Experiment, population: Population, joint: Network) -> None:
-        session, keys = joint.session, joint.keys
+    def __init__(self, plan: Plan, population: Population, joint: Network) -> None:
+        session, keys, experiment = joint.session, joint.keys, plan.experiment
         self._population, self._session, self._keys = population, session, keys
         self._encoding = experiment.network.encoding
         self._mime = messages.MIME[self._encoding]
@@ -91,7 +90,7 @@ class Exchange:
         self._quiet = [inf] * len(names)  # begin of the silence of each robot; infinity: it needs no command
         self._carried = carried = [row for row, here in enumerate(population.carried) if here]
         self._row = {keys.setpoint(names[row]): row for row in carried}
-        measured = frozenset(Plan(experiment).externally_measured)
+        measured = frozenset(plan.externally_measured)
 
         def publishers(key: Callable[[str], str], rows: Iterable[int]) -> dict[int, zenoh.Publisher]:
             return {row: pubsub.publisher(session, key(names[row]), self._mime) for row in rows}

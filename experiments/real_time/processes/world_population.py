@@ -13,7 +13,8 @@ from agents.body.interface import BodyState
 from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, Setpoint
 from experiments.definition import bodies
-from experiments.definition.experiment import Experiment
+from experiments.definition.experiment import WORLD
+from experiments.definition.plan import Plan
 from twins import scene
 from twins.body import TwinBody
 
@@ -46,18 +47,17 @@ class Population:
     time: float  # [s] simulated since the start
     states: Sequence[BodyState]  # last reading of the body
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, plan: Plan) -> None:
         """All robots at their starts."""
-        self._experiment = experiment
-        self.names = tuple(experiment.robots)
+        self._plan, self.names, experiment = plan, plan.names, plan.experiment
         robots = list(experiment.robots.values())
-        self._kinds = bodies.kinds(experiment, self.names)
+        self._kinds = plan.kinds
         self.flies = tuple(kind.flies for kind in self._kinds)
         wheels = [robot.device.get("watchdog_s") or experiment.world.wheels_stop_s or math.inf for robot in robots]
         self.hold_s = tuple(HOLD_S if flies else wait for flies, wait in zip(self.flies, wheels, strict=True))
-        self.carried = tuple(robot.body == bodies.WORLD for robot in robots)
-        self.seen = tuple(robot.ranges == "world" or robot.body == bodies.WORLD for robot in robots)
-        position, yaw = bodies.scattered_poses(experiment, self.names, experiment.seed)
+        self.carried = tuple(robot.body == WORLD for robot in robots)
+        self.seen = tuple(robot.ranges == "world" or robot.body == WORLD for robot in robots)
+        position, yaw = bodies.scattered_poses(plan, self.names, experiment.seed)
         self._home = list(zip(position, yaw, strict=True))
         self._dt = 1.0 / experiment.rates.body_hz
         self._begun = math.nan
@@ -131,11 +131,11 @@ class Population:
 
     def _create_body(self) -> None:
         """Makes the body, with robots and obstacles where the file has them."""
-        experiment = self._experiment
-        asked = bodies.body_request(experiment, self.names, experiment.seed)
+        plan = self._plan
+        asked = bodies.body_request(plan, self.names, plan.experiment.seed)
         # published positions are those measured from outside
         request = replace(asked, external=(False,) * len(self.names))
-        world = bodies.shared_world(experiment, self.names, sensing=True)
+        world = bodies.shared_world(plan, self.names, sensing=True)
         sensors = tuple(own if seen else () for own, seen in zip(world.sensors, self.seen, strict=True))
         mirrored = tuple(not carried for carried in self.carried)
         self._scene = world.scene

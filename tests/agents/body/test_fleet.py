@@ -11,6 +11,7 @@ from agents.network.messages import Inspection
 from agents.plugins import registry
 from experiments.definition import bodies
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 from twins.body import TwinBody
 
 
@@ -109,7 +110,7 @@ def request(*addresses):
         f"R{k}": Robot(kind="crazyflie" if k == 1 else "khepera4", start=[0.5 * k, 0.0], body=address, hover=0.5)
         for k, address in enumerate(addresses)
     }
-    return bodies.body_request(Experiment(title="Bodies", robots=robots, duration_s=1.0), tuple(robots), 7)
+    return bodies.body_request(Plan(Experiment(title="Bodies", robots=robots, duration_s=1.0)), tuple(robots), 7)
 
 
 def test_addresses_choose_the_bodies(monkeypatch):
@@ -122,8 +123,9 @@ def test_addresses_choose_the_bodies(monkeypatch):
 
         return opened
 
+    wanted = request("radio://0/80", "twin", "radio://0/81")
     monkeypatch.setattr(fleet.registry, "load", load)
-    assemble(request("radio://0/80", "twin", "radio://0/81"))
+    assemble(wanted)
     assert asked == [
         (registry.BODIES, "radio", ("R0", "R2"), ("radio://0/80", "radio://0/81"), [0.0, 1.0]),
         (registry.BODIES, "twin", ("R1",), ("twin",), [0.5]),

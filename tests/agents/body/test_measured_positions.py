@@ -68,7 +68,7 @@ def flown(
     measured, noise = (0.0, 0.0, 0.0), Random(1)
     net = Net()
     with net.worn():
-        body = assemble(bodies.body_request(few, ("T",), 1))
+        body = assemble(bodies.body_request(Plan(few), ("T",), 1))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[True])
         runtime = Runtime([Plan(few).assignment("T")], body, setup)
         body.open()

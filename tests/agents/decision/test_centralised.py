@@ -20,7 +20,7 @@ ALL = list(range(7))  # TB01, the leader, then KH01 to KH03 and CF01 to CF03
 
 @pytest.fixture(scope="module")
 def park():
-    return document.read("robotic-park").cases()["event"]
+    return document.read("robotic-park").cases()["event"].experiment
 
 
 def replaced(experiment, **parts):

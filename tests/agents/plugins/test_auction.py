@@ -10,7 +10,6 @@ from scipy.optimize import linear_sum_assignment
 from agents.plugins.gallery.auction import Auction
 from experiments.catalogue import index
 from experiments.check.check import check
-from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.plugins.talking import Talking
 
@@ -133,7 +132,7 @@ def test_bids_that_are_too_small_are_found():
 
 def test_bids_that_do_not_come_back_are_found():
     text = index.find_file("auction").read_text("utf-8").replace(" - CF", " > CF")
-    plan = Plan(document.loads(text).cases()["periodic"])
+    plan = document.loads(text).cases()["periodic"]
     ((severity, message, _),) = plan.law.analyse(plan)
     assert severity == "error"
     assert "do not reach" in message

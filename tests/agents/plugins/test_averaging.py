@@ -9,7 +9,6 @@ from agents.plugins.gallery.aggregative import Aggregative
 from agents.plugins.gallery.average import Average
 from experiments.catalogue import index
 from experiments.check.check import check
-from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.agents.plugins.talking import Talking
 
@@ -72,7 +71,7 @@ def test_gains_beyond_the_bound_are_found_with_their_remedy(name):
 @pytest.mark.slow
 def test_a_link_of_one_way_is_no_average():
     text = index.find_file("average").read_text("utf-8").replace("KH06 - KH01", "KH06 > KH01")
-    plan = Plan(document.loads(text).cases()["periodic"])
+    plan = document.loads(text).cases()["periodic"]
     ((severity, message, remedy),) = plan.law.analyse(plan)
     assert severity == "error"
     assert "KH01 hears KH06" in message

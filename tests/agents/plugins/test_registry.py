@@ -182,7 +182,9 @@ def test_incomplete_body_names_missing_methods():
 
 @pytest.mark.usefixtures("foreign")
 def test_unknown_class_variable_is_refused():
-    with pytest.raises(registry.PluginError, match=r"'pairs' .*: NEEDS = 'pairs' is none of \('distance', 'relative'"):
+    with pytest.raises(
+        registry.PluginError, match=r"'pairs' .* says NEEDS = 'pairs', none of \('distance', 'relative'"
+    ):
         registry.struct(LAWS, "pairs")
 
 
@@ -201,7 +203,7 @@ def test_unusable_plug_ins_are_named_with_remedy(foreign, monkeypatch):
     monkeypatch.setattr(registry, "CHOSEN", (foreign,))
     lines = registry.unusable(registry.struct)
     assert [line.partition(" (")[0] for line in lines] == [
-        f"left out: plug-in '{name}'" for name in ("function", "gone", "keeper", "misnamed")
+        f"left out: plug-in '{name}'" for name in ("function", "glider", "gone", "keeper", "misnamed")
     ] + ["left out: 'twice' among the test is ambiguous: plug-in 'twice'"]
     assert all(line.endswith("; mend or uninstall it (docs/plugins.md)") for line in lines)
 

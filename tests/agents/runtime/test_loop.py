@@ -37,7 +37,7 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, 
     monkeypatch.setattr(loop, "uptime", lambda: now[0])  # it alone goes on while the machine sleeps
     experiment = pair()
     with Net().worn() as net:
-        body = assemble(bodies.body_request(experiment, ("A",), 1))
+        body = assemble(bodies.body_request(Plan(experiment), ("A",), 1))
         runtime = Runtime(
             [Plan(experiment).assignment("A")],
             body,
@@ -79,7 +79,7 @@ class Stage:
         monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=self.sleep))
         for module in (loop, name_ownership):
             monkeypatch.setattr(module, "uptime", lambda: self.now)
-        self.body = assemble(bodies.body_request(experiment, ("F",), 1))
+        self.body = assemble(bodies.body_request(Plan(experiment), ("F",), 1))
         self.runtime = Runtime(
             [Plan(experiment).assignment("F")],
             self.body,
@@ -218,7 +218,7 @@ def test_plugins_of_all_robots_are_named():
     assignments = [plan.assignment("A"), replace(plan.assignment("B"), trigger=Faulty())]
     setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False, False])
     with Net().worn() as net:
-        runtime = Runtime(assignments, assemble(bodies.body_request(plan.experiment, ("A", "B"), 1)), setup)
+        runtime = Runtime(assignments, assemble(bodies.body_request(plan, ("A", "B"), 1)), setup)
         runtime._subscribe_to_stops(net.session)
         runtime._join(net.session)
         with pytest.raises(PluginError, match="the trigger Faulty failed: AttributeError"):

@@ -47,7 +47,7 @@ class Robot:
             monkeypatch.setattr(pubsub, name, lambda *_: Taken())
         experiment = pair()
         self.decision = Decision(Plan(experiment).assignment("A"))
-        self.body = TwinBody(bodies.body_request(experiment, ("A",), 1))
+        self.body = TwinBody(bodies.body_request(Plan(experiment), ("A",), 1))
         self.body.open()
         nowhere = None
         self.neighbours = PoseInbox(nowhere, Keys(), [self.decision], reach=(2.0, 2.0, 2.0))  # type: ignore[arg-type]

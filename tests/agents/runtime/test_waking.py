@@ -32,7 +32,7 @@ class Stage:
         for module in (loop, name_ownership):
             monkeypatch.setattr(module, "uptime", lambda: self.now)
         experiment = pair()
-        body = assemble(bodies.body_request(experiment, ("A",), 1))
+        body = assemble(bodies.body_request(Plan(experiment), ("A",), 1))
         setup = Setup(KEYS, [], "json", 50.0, lifeline=False, located=[False], wake=wake)
         self.runtime = Runtime([Plan(experiment).assignment("A")], body, setup)
         self.body = body

@@ -63,18 +63,18 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
     experiment = written(tmp_path, "hemisphere", "40").experiment
     names = tuple(experiment.robots)
     for seed in range(5):
-        scattered, _ = bodies.scattered_poses(experiment, names, seed)
+        scattered, _ = bodies.scattered_poses(Plan(experiment), names, seed)
         place = np.array(scattered)
         apart = np.linalg.norm(place[:, None] - place[None], axis=2)[np.triu_indices(40, 1)]
         assert apart.min() > 2 * 0.065
-        assert np.abs(place - np.array(bodies.start_poses(experiment, names)[0])).max() > 0.1
+        assert np.abs(place - np.array(Plan(experiment).start_poses()[0])).max() > 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
     experiment = written(tmp_path, "hemisphere", "100", LayoutOptions(duration_s=25.0)).experiment
-    log = simulation.simulate(experiment, seed)
+    log = simulation.simulate(Plan(experiment), seed)
     net = Plan(experiment).links
     apart = np.linalg.norm(log.true_position[:, net.receiver] - log.true_position[:, net.sender], axis=2)
     worst = np.abs(apart - net.distance).max(axis=1)
@@ -88,8 +88,8 @@ def test_offsets_are_met_from_anywhere(tmp_path):
     wanted = LayoutOptions(law="displacement", scatter=3.0, duration_s=30.0)
     read = written(tmp_path, "hemisphere", "20", wanted)
     assert [found for found in check(read) if found.severity != "note"] == []
-    log = simulation.simulate(read.experiment, 1)
-    plan = Plan(read.experiment)
+    log = simulation.simulate(read.plan, 1)
+    plan = read.plan
     begin, end = (log.true_position[np.searchsorted(log.time, at)] for at in (0.0, 29.9))
     links = plan.links
     assert law_errors(plan.law, begin, begin[links.sender], links).max() > 3.0

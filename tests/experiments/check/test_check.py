@@ -24,6 +24,7 @@ from experiments.check.findings import Figures
 from experiments.check.ideal_run import Prediction
 from experiments.check.safety import batteries
 from experiments.definition.experiment import Experiment, Formation, Leg, Robot
+from experiments.definition.plan import Plan
 from experiments.file import catalogue, document
 from experiments.file.problems import DocumentError
 from tests.experiments.checked import GROUND, assert_found, bad, ground, of
@@ -236,7 +237,7 @@ def test_a_chain_folds():
 def test_no_links_are_no_formation():
     assert ground({}) == {}
     made = Experiment(title="made", robots=GROUND, duration_s=5.0)
-    assert figures(made).rank is None
+    assert figures(Plan(made)).rank is None
     assert "no-formation" in {each.code for each in check(of(made))}
 
 
@@ -373,13 +374,13 @@ def test_every_error_and_warning_has_a_remedy_and_a_place(made):
 
 
 def test_every_battery_that_ends_before_the_run_is_named():
-    experiment = document.read(PARK).cases()["event"]
+    experiment = document.read(PARK).cases()["event"].experiment
 
     def said(duration_s: float, **safety: float) -> list[str]:
         limits = msgspec.structs.replace(experiment.safety, **safety)
         made = msgspec.structs.replace(experiment, duration_s=duration_s, safety=limits)
         standing = Prediction(np.zeros(1), np.zeros((1, len(made.robots), 3)))
-        return [each.message for each in batteries(analyse(made, standing))]
+        return [each.message for each in batteries(analyse(Plan(made), standing))]
 
     wheels, drones = said(12000.0)
     assert "TB01 stops after about 8095 s of 12000 s" in wheels  # a Khepera lasts five hours

@@ -13,6 +13,7 @@ from experiments.check import ideal_run
 from experiments.check.check import check, figures
 from experiments.check.ideal_run import REPETITIONS, fly, isolated, linear_step, predict, repetitions
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.sweep.runs import run_metrics
 from experiments.virtual_time import conductor, simulation, stretch
@@ -45,10 +46,10 @@ def test_wheels_stop_before_weak_formation_is_acquired():
     found = claims["wheels-stop"]
     assert found.severity == "warning"
     assert "robots on wheels stop 5 mm before their goals: links may stay e = 5 mm/(μ d²) off" in found.message
-    numbers = figures(weak)
+    numbers = figures(Plan(weak))
     assert numbers.acquired_s is None
-    log = simulation.simulate(msgspec.structs.replace(weak, seed=7), 7, lean=True)
-    run = run_metrics(Logbook(log, weak, "").trace())
+    log = simulation.simulate(Plan(msgspec.structs.replace(weak, seed=7)), 7, lean=True)
+    run = run_metrics(Logbook(log, Plan(weak), "").trace())
     assert run.values["acquired_s"] is None
     last = log.true_position[log.time <= weak.duration_s][-1]
     off = max(abs(float(np.hypot(*(last[i] - last[j])[:2])) - 1.0) for i, j in ((0, 1), (1, 2), (0, 2)))
@@ -73,29 +74,29 @@ def test_the_remedy_for_weak_links_names_the_key_that_the_law_goes_by(monkeypatc
 
 
 def test_prediction_is_a_flight_without_noise(monkeypatch):
-    park = document.read(PARK).cases()["event"]
-    assert isolated(park).duration_s == 45.0
-    flown = predict(park)
-    again = predict(msgspec.structs.replace(park, seed=8))
+    park = document.read(PARK).cases()["event"].experiment
+    assert isolated(Plan(park)).experiment.duration_s == 45.0
+    flown = predict(Plan(park))
+    again = predict(Plan(msgspec.structs.replace(park, seed=8)))
     np.testing.assert_array_equal(flown.position, again.position)  # no seed matters
     np.testing.assert_allclose(flown.time, np.arange(451) / 10.0, atol=1e-9)
     assert not flown.incidents
     assert not flown.stuck
     many = msgspec.structs.replace(park, robots={f"R{k}": park.robots["KH01"] for k in range(1000)}, duration_s=600.0)
     monkeypatch.setattr(ideal_run, "SPEED_UP", 1.0)
-    assert isolated(many).duration_s == 2.0  # of many robots the beginning
+    assert isolated(Plan(many)).experiment.duration_s == 2.0  # of many robots the beginning
 
 
 @pytest.mark.parametrize(("compiled", "flown_s"), [(False, 11.0), (True, 165.0)])
 def test_more_is_flown_where_it_is_compiled(monkeypatch, compiled, flown_s):
     """Of two hundred robots."""
     monkeypatch.setattr(stretch, "possible", lambda _: compiled)
-    park = document.read(PARK).cases()["event"]
+    park = document.read(PARK).cases()["event"].experiment
     formation = msgspec.structs.replace(park.formation, links={}, leader=None)
     robots = {f"R{k}": park.robots["KH01"] for k in range(200)}
     many = msgspec.structs.replace(park, robots=robots, formation=formation, timeline=[], duration_s=600.0)
-    assert isolated(many).duration_s == flown_s
-    assert isolated(msgspec.structs.replace(many, duration_s=30.0)).duration_s == 11.0  # to compile takes longer
+    assert isolated(Plan(many)).experiment.duration_s == flown_s
+    assert isolated(Plan(many).changed(duration_s=30.0)).experiment.duration_s == 11.0  # to compile takes longer
 
 
 def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
@@ -115,8 +116,8 @@ def flat_strip(gain: float, jitter: float = 0.01) -> Experiment:
 
 def late(experiment: Experiment, seeds: list[int]) -> int:
     """Number of runs with these seeds that acquire after 15 s, in the mean of the robots, or not at all."""
-    logs = (simulation.simulate(experiment, seed, lean=True) for seed in seeds)
-    runs = [run_metrics(Logbook(log, experiment, "").trace()) for log in logs]
+    logs = (simulation.simulate(Plan(experiment), seed, lean=True) for seed in seeds)
+    runs = [run_metrics(Logbook(log, Plan(experiment), "").trace()) for log in logs]
     return sum(run.values["acquired_s"] is None or run.values["acquired_s"] > 15.0 for run in runs)
 
 
@@ -150,23 +151,23 @@ def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
 
 def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
     monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
-    codes = {each.code for each in check(of(document.read("triangle").cases()["event"]))}
+    codes = {each.code for each in check(of(document.read("triangle").cases()["event"].experiment))}
     assert "acquired" in codes
 
 
 def test_flights_with_noise_are_those_of_their_seeds():
-    bare = isolated(msgspec.structs.replace(flat_strip(0.3), duration_s=5.0, seed=7))
+    bare = isolated(Plan(flat_strip(0.3)).changed(duration_s=5.0, seed=7))
     assert repetitions(bare) == REPETITIONS
     first, second, again = fly(bare, 7), fly(bare, 8), fly(bare, 8)
     np.testing.assert_array_equal(second.position, again.position)
     assert np.abs(first.position - second.position).max() > 1e-3
-    assert repetitions(msgspec.structs.replace(bare, robots={f"R{k}": bare.robots["CF0"] for k in range(1000)})) == 1
+    assert repetitions(bare.changed(robots={f"R{k}": bare.experiment.robots["CF0"] for k in range(1000)})) == 1
 
 
 def test_flight_with_noise_counts_messages_alone(monkeypatch):
-    noisy = msgspec.structs.replace(document.read(PARK).cases()["event"], duration_s=5.0)
+    noisy = msgspec.structs.replace(document.read(PARK).cases()["event"].experiment, duration_s=5.0)
     still = msgspec.structs.replace(noisy, disturbance={})
-    ideal, alone = predict(noisy), predict(still)
+    ideal, alone = predict(Plan(noisy)), predict(Plan(still))
     np.testing.assert_array_equal(ideal.position, alone.position)
     assert ideal.transmissions == alone.transmissions
     assert alone.messages_hz == alone.transmissions / 5.0
@@ -180,8 +181,8 @@ def test_flight_with_noise_counts_messages_alone(monkeypatch):
         return flown(experiment, seed, quiet=quiet, **how)
 
     monkeypatch.setattr(simulation, "simulate", stuck_by_noise)
-    np.testing.assert_array_equal(predict(noisy).position, ideal.position)
-    assert predict(noisy).messages_hz == ideal.transmissions / 5.0
+    np.testing.assert_array_equal(predict(Plan(noisy)).position, ideal.position)
+    assert predict(Plan(noisy)).messages_hz == ideal.transmissions / 5.0
 
 
 def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
@@ -280,7 +281,7 @@ def test_a_plan_for_ever_is_not_cut_off():
 @pytest.mark.nightly
 def test_a_long_run_is_predicted_in_part():
     made = Experiment(title="made", robots=GROUND, duration_s=86400.0)
-    assert figures(made).predicted_s == 550.0
+    assert figures(Plan(made)).predicted_s == 550.0
     assert "predicted-in-part" in {each.code for each in check(of(made))}
 
 
@@ -311,7 +312,7 @@ def test_anchors_without_links_are_checked():
     claims = {each.code: each.message for each in check(of(anchored()))}
     assert "CF01 is 8 mm off at the end" in claims["anchored"]
     assert "the anchors can be met" in claims["realisable"]
-    assert figures(anchored()).end_error_mm is None
+    assert figures(Plan(anchored())).end_error_mm is None
     late = {each.code: each for each in check(of(anchored(formation=Formation(anchors={"CF01": 1.0}, gain=1e-4))))}
     assert late["anchor-missed"].severity == "warning"
     assert "anchored" not in late

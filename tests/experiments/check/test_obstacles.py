@@ -177,4 +177,4 @@ def test_the_summary_names_the_obstacles(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "cart (box 0.2 × 0.3 m, moves), crate (cylinder of radius 0.1 m, 2 kg), fence (wall, 1 m above" in printed
     assert "4 × 4 × 2.5 m" in printed
-    assert list(figures(read(file).experiment).obstacles) == ["cart", "crate", "fence"]
+    assert list(figures(read(file).plan).obstacles) == ["cart", "crate", "fence"]

@@ -25,7 +25,6 @@ from experiments.check.realisation import (
 )
 from experiments.definition.experiment import Experiment, Formation, Robot
 from experiments.definition.graph import Links, links
-from experiments.definition.plan import Plan
 from experiments.file import document
 from tests.experiments.checked import of
 from tests.experiments.traces import link_errors
@@ -46,7 +45,7 @@ PUBLISHED = np.array(
 
 @pytest.fixture(scope="module")
 def reference() -> Links:
-    return Plan(document.read("robotic-park").experiment).links
+    return document.read("robotic-park").plan.links
 
 
 def test_the_published_shape_meets_the_published_distances(reference):

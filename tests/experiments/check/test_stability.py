@@ -14,7 +14,6 @@ from experiments.check.realisation import find_shapes
 from experiments.check.stability import modes
 from experiments.definition.formation import anchor_offsets, law_offsets
 from experiments.definition.graph import Links, links
-from experiments.definition.plan import Plan
 from experiments.file import document
 
 PUBLISHED = np.array(
@@ -51,7 +50,7 @@ def by_hand(law, net, position, share, anchors=()):
 
 
 def test_stiffest_and_slowest_mode_of_the_reference():
-    links, gain = Plan(document.read("robotic-park").experiment).links, 3.0
+    links, gain = document.read("robotic-park").plan.links, 3.0
     reference = msgspec.structs.replace(links, gain=np.full(len(links), gain))
     shape = find_shapes(reference, [PUBLISHED], np.arange(7) > 0)[0]
     hz = 1000.0  # u applied as a velocity: h = 1 / hz

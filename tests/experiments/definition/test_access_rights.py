@@ -15,6 +15,7 @@ from agents.network.lab import ROLES, Identity, LabError, Register
 from experiments.definition import access_rights
 from experiments.definition.bodies import choose_bodies
 from experiments.definition.experiment import Experiment, Formation, Hybrid, Network, Robot
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tests.agents.acl import ACTIONS, held, may, permitted
 
@@ -29,7 +30,7 @@ def register(robots):
 
 
 def control(experiment):
-    return rules(access_rights.rights([experiment]), register(experiment.robots))
+    return rules(access_rights.rights([Plan(experiment)]), register(experiment.robots))
 
 
 def experiment(links, processes=(), architecture="distributed", **more):
@@ -220,7 +221,7 @@ def test_avoidance_gives_ears_and_nothing_else():
     read = load("crowd")
     one = next(iter(read.cases().values()))
     grants = access_rights.rights([one]).robots
-    mates = [name for name, robot in one.robots.items() if robot.process == "squad_E1"]
+    mates = [name for name, robot in one.experiment.robots.items() if robot.process == "squad_E1"]
     assert [key for key in grants[mates[0]].subscribe if key.endswith("/pose")] == ["park/*/pose"], "all forty of them"
     assert grants[mates[0]].publish == [f"park/{mate}/**" for mate in mates]
 
@@ -247,9 +248,9 @@ def test_whoever_carries_bodies_speaks_of_them_and_of_no_others():
 
 
 def test_ros_2_is_reached_on_its_own_keys():
-    reference = load("robotic-park").cases()["event"]
-    behind = choose_bodies(reference, "protocol")
-    made = control(behind)
+    reference = load("robotic-park").cases()["event"].experiment
+    behind = choose_bodies(Plan(reference), "protocol")
+    made = control(behind.experiment)
     for who in ("TB01", "twin"):
         assert may(made, who, "put", "TB01/cmd_vel")
         assert may(made, who, "hear", "TB01/odom")
@@ -270,14 +271,14 @@ def test_a_rmw_robot_has_its_domain():
 
 def test_cases_that_share_a_router_share_their_rights():
     one, other = experiment({(0, 1)}), experiment({(2, 1)})
-    both = access_rights.rights([one, other])
+    both = access_rights.rights([Plan(one), Plan(other)])
     made = rules(both, register(one.robots))
     assert may(made, "R1", "hear", "park/R0/pose")
     assert may(made, "R1", "hear", "park/R2/pose")
     assert not may(made, "R1", "hear", "park/R3/pose")
     elsewhere = msgspec.structs.replace(one, network=Network(realm="yard"))
     with pytest.raises(LabError, match=r"realms park and yard share no router"):
-        access_rights.rights([one, elsewhere])
+        access_rights.rights([Plan(one), Plan(elsewhere)])
 
 
 def test_rights_go_through_a_file():
@@ -289,7 +290,7 @@ def test_a_certificate_on_an_earlier_name_gives_no_right():
     four = experiment({(0, 1)})
     known = register(four.robots)
     moved = msgspec.structs.replace(known.identities["R0"], common_name="R0.2")
-    made = rules(access_rights.rights([four]), Register({**known.identities, "R0": moved}))
+    made = rules(access_rights.rights([Plan(four)]), Register({**known.identities, "R0": moved}))
     assert not may(made, "R0", "put", "park/R0/pose")
     assert may(made, "R0.2", "put", "park/R0/pose")
 
@@ -299,11 +300,11 @@ def test_a_robot_cannot_take_the_name_of_an_office():
     known = register(four.robots)
     clash = Register({**known.identities, "R0": Identity("operator", "R0", "1", "2100-01-01")})
     with pytest.raises(LabError, match=r"'R0' is a robot of the experiment and operator of the lab"):
-        rules(access_rights.rights([four]), clash)
+        rules(access_rights.rights([Plan(four)]), clash)
 
 
 def test_sizes_bound_what_robots_say_and_not_the_experiment():
-    (limit,) = sizes(access_rights.rights([experiment(set())]))
+    (limit,) = sizes(access_rights.rights([Plan(experiment(set()))]))
     assert limit["size_limit"] == 65536
     assert "park/R0/**" in limit["key_exprs"]
     assert "park/R0/**/@adv/**" in limit["key_exprs"]
@@ -311,8 +312,13 @@ def test_sizes_bound_what_robots_say_and_not_the_experiment():
 
 
 def test_needed_identities():
-    reference = load("robotic-park").cases()["event"]
-    assert set(access_rights.needed_identities(reference)) == {"router", "operator", "recorder", *reference.robots}
-    assert {"world"} < set(access_rights.needed_identities(choose_bodies(reference, "world")))
+    reference = load("robotic-park").cases()["event"].experiment
+    assert set(access_rights.needed_identities(Plan(reference))) == {
+        "router",
+        "operator",
+        "recorder",
+        *reference.robots,
+    }
+    assert {"world"} < set(access_rights.needed_identities(choose_bodies(Plan(reference), "world")))
     assert {"centre"} < set(access_rights.needed_identities(load("architectures").cases()["hybrid"]))
-    assert {"twin", "positioning"} < set(access_rights.needed_identities(choose_bodies(reference, "protocol")))
+    assert {"twin", "positioning"} < set(access_rights.needed_identities(choose_bodies(Plan(reference), "protocol")))

@@ -25,7 +25,7 @@ NAMES = ("TB01", "KH01", "KH02", "KH03", "CF01", "CF02", "CF03")
 
 @pytest.fixture(scope="module")
 def park():
-    return document.read("robotic-park").cases()["periodic"]
+    return document.read("robotic-park").cases()["periodic"].experiment
 
 
 def test_the_part_of_the_leader(park):
@@ -79,7 +79,7 @@ def test_a_robot_knows_its_own_links(park, name):
 
 
 def test_bodies_of_other_seeds_are_alike(park):
-    made, other = bodies.body_request(park, NAMES, 5), bodies.body_request(park, NAMES, 6)
+    made, other = bodies.body_request(Plan(park), NAMES, 5), bodies.body_request(Plan(park), NAMES, 6)
     assert made.names == NAMES
     assert (made.seeds, other.seeds) == ((5,) * 7, (6,) * 7)
     assert made.addresses == ("twin",) * 7
@@ -99,9 +99,9 @@ def experiment(**parts):
 
 
 def test_starts_are_on_the_floor_with_a_yaw():
-    positions, yaws = bodies.start_poses(experiment(), ("B", "A"))
-    assert positions == [(0.0, 0.25, 0.0), (0.5, -0.5, 0.0)]
-    assert yaws == [0.0, 1.5]
+    positions, yaws = Plan(experiment()).start_poses()
+    assert positions == [(0.5, -0.5, 0.0), (0.0, 0.25, 0.0), (-0.5, 0.0, 0.0)]
+    assert yaws == [1.5, 0.0, 0.0]
 
 
 def test_limits_are_the_arena_and_the_safety_of_the_file():
@@ -140,10 +140,10 @@ def test_disturbances_merge_field_by_field_the_narrower_wins():
         "crazyflie": Disturbance(hover_jitter=Jitter(0.01), latency_s=0.2),
         "B": Disturbance(position_sigma=0.0),
     }
-    made = experiment(disturbance=given)
-    assert bodies.disturbance(made, "A") == given["all"]
-    assert bodies.disturbance(made, "B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
-    assert bodies.disturbance(experiment(), "A") == Disturbance()
+    made = Plan(experiment(disturbance=given))
+    assert made.disturbance("A") == given["all"]
+    assert made.disturbance("B") == Disturbance(Jitter(0.01), 0.0, 0.01, 0.2)
+    assert Plan(experiment()).disturbance("A") == Disturbance()
 
 
 def test_rates_patience_and_triggers():
@@ -162,7 +162,7 @@ def test_robots_are_not_scattered_into_obstacles():
     given = Experiment(
         title="t", duration_s=1.0, robots=robots, arena=Arena(obstacles={"post": post}), start=Start(scatter=0.6)
     )
-    place = np.array([bodies.scattered_poses(given, ("A", "B"), seed)[0] for seed in range(100)])
+    place = np.array([bodies.scattered_poses(Plan(given), ("A", "B"), seed)[0] for seed in range(100)])
     gap = np.hypot(place[..., 0], place[..., 1]) - 0.3 - 0.07
     assert gap.min() > bodies.CLEAR
     assert gap.min() < 0.1  # it is near enough to be in the way

@@ -81,7 +81,7 @@ def written(tmp_path):
 
 def flown(experiment):
     """The true positions (T, N, 3) from the common start on, their times, and the links' errors (T, E)."""
-    log = simulation.simulate(experiment, 1)
+    log = simulation.simulate(Plan(experiment), 1)
     running = (log.time >= 0.0) & (log.time < experiment.duration_s)
     time, position = log.time[running], log.true_position[running]
     plan = Plan(experiment)
@@ -116,7 +116,7 @@ def test_each_link_has_the_gain_of_what_it_asks_for(written):
 @pytest.mark.usefixtures("unflown")
 def test_a_law_of_distances_takes_offsets_for_distances(written):
     given = written(SQUARE.replace('"displacement"', '"distance"'))
-    links = Plan(given.experiment).formation.links
+    links = given.plan.formation.links
     assert links.distance[:2].tolist() == pytest.approx([0.6, np.hypot(0.6, 0.6)])
     assert "realisable" in codes(given)
 
@@ -216,7 +216,7 @@ def test_a_calm_event_triggered_ring_does_not_turn():
     rates, sent = [], []
     for gain in (0.5, 3.0):
         given["formation"]["gain"] = gain
-        logs = [simulation.simulate(msgspec.convert(given, document.Experiment), seed) for seed in (200, 201)]
+        logs = [simulation.simulate(Plan(msgspec.convert(given, document.Experiment)), seed) for seed in (200, 201)]
         late = (logs[0].time > 30.0) & (logs[0].time < 60.0)
         rates.append(max(abs(net_rotation(log.true_position[late], log.time[late])) for log in logs))
         sent.append(sum(len(log.sent) for log in logs))
@@ -278,7 +278,7 @@ def test_offsets_that_do_not_add_up(written):
     found = codes(given)["offsets-contradict"]
     assert (found.severity, found.where.rsplit(":", 2)[1]) == ("error", "24")
     assert "100.0 mm" in found.message
-    (first, *_) = contradictions(Plan(given.experiment).formation.links)
+    (first, *_) = contradictions(given.plan.formation.links)
     assert sorted(first.rows) == [0, 1, 2, 3]
     assert contradictions(Plan(written(SQUARE).experiment).formation.links) == []
 

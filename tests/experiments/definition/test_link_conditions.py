@@ -28,15 +28,15 @@ ENDS = (("B", "A"), ("A", "B"), ("A", "C"), ("B", "C"))  # sender and receiver o
 
 
 def conditions(channel, seed=1, **how):
-    return link_conditions.conditions_of(experiment(channel), ENDS, seed, **how)
+    return link_conditions.conditions_of(Plan(experiment(channel)), ENDS, seed, **how)
 
 
 def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
     assert [link.delay for link in conditions(Channel())] == [0.001] * 4
     assert [link.delay for link in conditions(Channel(), real=True)] == [0.0] * 4
     assert [link.delay for link in conditions(Channel(delay_s=0.02), real=True)] == [0.02] * 4
-    assert not link_conditions.models_network(experiment())
-    assert link_conditions.models_network(experiment(Channel(loss=0.1)))
+    assert not link_conditions.models_network(Plan(experiment()))
+    assert link_conditions.models_network(Plan(experiment(Channel(loss=0.1))))
 
 
 def test_links_have_their_own():
@@ -135,5 +135,5 @@ def test_links_that_only_avoidance_hears_are_links():
     chosen = experiment(channel, avoidance=everybody)
     links = Plan(chosen).pose_links
     ends = [(NAMES[j], NAMES[i]) for i, j in zip(links.receiver, links.sender, strict=True)]
-    made = link_conditions.conditions_of(chosen, ends, 1)
+    made = link_conditions.conditions_of(Plan(chosen), ends, 1)
     assert [pair for pair, link in zip(ends, made, strict=True) if link.loss] == [("C", "A")]

@@ -57,8 +57,8 @@ def test_a_kind_whose_motion_no_model_has_is_refused_too(monkeypatch):
 def test_a_kind_without_a_protocol_twin_is_refused_by_name(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):
-        choose_bodies(loads(ROVERS).experiment, "protocol")
-    assert choose_bodies(load("triangle").experiment, "protocol")
+        choose_bodies(loads(ROVERS).plan, "protocol")
+    assert choose_bodies(load("triangle").plan, "protocol")
 
 
 def test_many_robots_of_a_kind_without_a_colour_are_drawn(monkeypatch):

@@ -75,20 +75,21 @@ def test_without_those_on_standby_nothing_names_them() -> None:
             outages=[Outage(from_s=1.0, links=["A - C"]), Outage(from_s=2.0, robots=["B", "C"]), Outage(from_s=3.0)],
         ),
     )
-    made = reserves.without_standby(whole)
+    plan = reserves.without_standby(Plan(whole))
+    made = plan.experiment
     assert list(made.robots) == ["A", "B"]
     assert made.formation.links == {"A - B": 0.5}
     assert not made.timeline
     assert list(made.channel.links) == ["A > B"]
     assert [(outage.from_s, outage.robots) for outage in made.channel.outages] == [(2.0, ["B"]), (3.0, [])]
     assert made.architecture == Hybrid("hybrid", ["A"])
-    assert not list(consistency.faults(Plan(made)))
-    assert reserves.without_standby(made) is made
+    assert not list(consistency.faults(plan))
+    assert reserves.without_standby(plan) is plan
 
 
 def test_virtual_time_flies_without_those_on_standby(tmp_path: Path) -> None:
     file = tmp_path / "x.json"
-    file.write_bytes(document.write_json(experiment()))
+    file.write_bytes(document.write_json(Plan(experiment())))
     trace = next(iter(run.simulate(document.read(file)).traces.values()))
     assert trace.robots == ("A", "B")
 
@@ -117,7 +118,7 @@ def order(**more: object) -> messages.RunOrder:
 
 def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
     spare = msgspec.structs.replace(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
-    spares = Spares(experiment(spares={"F": FLY, "S": spare}))
+    spares = Spares(Plan(experiment(spares={"F": FLY, "S": spare})))
     old = msgspec.structs.replace(BOT, ranges="world")
     robot, whose = spares.successor("A", old, order())
     assert whose == "S", "the first of its kind"
@@ -146,4 +147,4 @@ def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
 )
 def test_what_cannot_take_over_a_name(asked: messages.RunOrder, said: str) -> None:
     with pytest.raises(Refused, match=said):
-        Spares(experiment(spares={"F": FLY, "S": BOT})).successor("A", BOT, asked)
+        Spares(Plan(experiment(spares={"F": FLY, "S": BOT}))).successor("A", BOT, asked)

@@ -7,6 +7,7 @@ import pytest
 
 from experiments.catalogue import index
 from experiments.check.check import check
+from experiments.definition.plan import Plan
 from experiments.file import catalogue as entries
 from experiments.file import document
 from experiments.file.document import DocumentError, read
@@ -86,7 +87,7 @@ def test_a_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
     (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
     cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
     given = read(lab(ONE + cases))
-    found = given.cases()
+    found = {name: plan.experiment for name, plan in given.cases().items()}
     assert found["lab"].arena.obstacles["post"].radius == 0.2
     assert list(found["hall"].arena.obstacles) == ["pillar"]
     assert found["hall"].arena.size == (9.0, 9.0, 3.0)
@@ -113,7 +114,7 @@ def test_what_processes_read_needs_no_arena_file(lab, tmp_path):
     found = read(lab()).experiment
     file = tmp_path / "elsewhere" / "case.json"
     file.parent.mkdir()
-    file.write_bytes(document.write_json(found))
+    file.write_bytes(document.write_json(Plan(found)))
     assert read(file).experiment == found
     assert "file" not in msgspec.json.decode(file.read_bytes())["arena"]
 

@@ -3,6 +3,7 @@
 import msgspec
 import pytest
 
+from experiments.definition.plan import Plan
 from experiments.definition.standby import robots_without_address
 from experiments.file import document
 from experiments.file.document import case_document as line
@@ -35,8 +36,8 @@ def test_a_good_one(tmp_path):
     assert problems(tmp_path, text) == []
     (tmp_path / "x.toml").write_text(text)
     experiment = document.read(tmp_path / "x.toml").experiment
-    assert robots_without_address(experiment) == {"B": "board"}
-    sent = line(experiment)
+    assert robots_without_address(Plan(experiment)) == {"B": "board"}
+    sent = line(Plan(experiment))
     assert b"\n" not in sent
     there = document.received(sent.decode(), "standard input").experiment
     assert there == msgspec.structs.replace(experiment, hosts={})

@@ -268,8 +268,12 @@ def test_line_ends_and_byte_order_mark_of_other_systems_are_read(write):
 # Cases
 
 
+def experiments(read):
+    return {name: plan.experiment for name, plan in read.cases().items()}
+
+
 def test_each_case_is_an_experiment_of_its_own_in_the_order_of_the_file():
-    cases = read("robotic-park").cases()
+    cases = experiments(read("robotic-park"))
     assert list(cases) == ["periodic", "event"]
     assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
     assert cases["event"].trigger == {"kind": "send-on-delta", "threshold": 0.01}
@@ -278,7 +282,7 @@ def test_each_case_is_an_experiment_of_its_own_in_the_order_of_the_file():
 
 def test_without_cases_there_is_one_called_default(write):
     found = read(write(MINIMAL))
-    assert found.cases() == {"default": found.experiment}
+    assert found.cases() == {"default": found.plan}
 
 
 def test_a_case_merges_tables_and_replaces_a_choice_of_another_kind(write):
@@ -290,7 +294,7 @@ def test_a_case_merges_tables_and_replaces_a_choice_of_another_kind(write):
         + '[cases.other]\ntrigger = { kind = "periodic", period_s = 0.1 }\n'
         + '[cases.wide]\nrobots.KH02.start = [1.5, 0.0]\nformation.links."KH02-KH01" = { distance = 1.5, gain = 2.0 }\n'
     )
-    cases = read(write(text)).cases()
+    cases = experiments(read(write(text)))
     assert cases["same"].trigger == {"kind": "send-on-delta", "threshold": 0.05, "maximum_silence_s": 2.0}
     assert cases["other"].trigger == {"kind": "periodic", "period_s": 0.1}
     assert cases["wide"].robots["KH02"].start == [1.5, 0.0]
@@ -303,7 +307,7 @@ def test_a_case_merges_tables_and_replaces_a_choice_of_another_kind(write):
 
 
 def set_on_park(*overrides):
-    return read("robotic-park", overrides).cases()
+    return experiments(read("robotic-park", overrides))
 
 
 def test_set_changes_every_case():
@@ -400,11 +404,11 @@ def test_set_does_not_hide_what_is_wrong_in_the_file(write):
 @pytest.mark.parametrize("name", index.names())
 def test_json_says_the_same(name, write):
     found = read(name)
-    again = read(write(document.write_json(found.experiment), "resolved.json"))
+    again = read(write(document.write_json(found.plan), "resolved.json"))
     assert again.experiment == found.experiment
     assert again.cases() == found.cases()
     for case in found.cases().values():
-        assert read(write(document.write_json(case), "case.json")).experiment == case
+        assert read(write(document.write_json(case), "case.json")).plan == case
 
 
 @pytest.mark.parametrize(
@@ -424,7 +428,7 @@ def test_json_that_is_none(write, content, line, column, message):
 
 
 def test_a_fault_in_json_is_located(write):
-    experiment = json.loads(document.write_json(read("triangle").experiment))
+    experiment = json.loads(document.write_json(read("triangle").plan))
     experiment["robots"]["KH02"]["start"][1] = 7.5
     (problem,) = refused(write(json.dumps(experiment, indent=2), "some.json")).problems
     assert problem.source.strip() == "7.5"

@@ -13,7 +13,7 @@ from experiments.file.problems import MOST
 
 PARK = (index.FOLDER / "robotic-park.toml").read_text("utf-8")
 LINES = PARK.split("\n")
-RESOLVED = write_json(read("robotic-park").experiment).decode()
+RESOLVED = write_json(read("robotic-park").plan).decode()
 TOKENS = st.sampled_from([
     "nan", "inf", "-1", "0", "1e400", "true", '""', '"KH01"', "[]", "{}", "[[1]]", "1979-05-27", "07:32:00",
     "'''x'''", '"\\u0000"', "=", ".", "]", "[", "#", "}", ",", "é", "kind", "robots", "9" * 30, "0x" + "f" * 30,

@@ -5,7 +5,6 @@ import pytest
 from agents.formation.link import BY_NOTHING
 from experiments.catalogue import index
 from experiments.check.check import check
-from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.file.problems import DocumentError
 
@@ -31,7 +30,7 @@ def test_what_a_law_that_remembers_does_not_go_with(change, said):
 
 
 def test_links_alone():
-    plan = Plan(document.read(AVERAGE, ['formation.links={ "KH01 > KH04" = { from_s = 2.0 } }']).cases()["event"])
+    plan = document.read(AVERAGE, ['formation.links={ "KH01 > KH04" = { from_s = 2.0 } }']).cases()["event"]
     (link,) = plan.one_way_links
     assert (link.sender, link.receiver, link.since, link.wanted.wants) == ("KH01", "KH04", 2.0, BY_NOTHING)
 

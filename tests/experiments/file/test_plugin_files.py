@@ -8,7 +8,6 @@ import pytest
 
 from agents.plugins import files, registry
 from experiments.check.check import check
-from experiments.definition.plan import Plan
 from experiments.file.document import DocumentError, case_document, load, loads, received, write_json
 from experiments.file.structure import plugin_files
 from experiments.recording import bundle
@@ -79,7 +78,7 @@ def call(monkeypatch, *words):
 
 def test_a_law_beside_the_experiment_moves_robots(task):
     read = load(task)
-    laws = {name: Plan(case).law for name, case in read.cases().items()}
+    laws = {name: plan.law for name, plan in read.cases().items()}
     assert {name: law.gain for name, law in laws.items()} == {"slow": 0.1, "fast": 0.2}
     assert type(laws["slow"]) is type(laws["fast"])
     assert load(task, "formation.law.gain=0.3").experiment.formation.law["gain"] == 0.3
@@ -118,7 +117,7 @@ def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
     [
         ("def pull(", "def pull", "(meet.py, line 12)"),
         ("    gain: Positive = 0.1", "    gain: Positive = gain", "name 'gain' is not defined, line 10"),
-        ("Meet(Gradient, frozen=True)", "Meet", "is no msgspec.Struct"),
+        ("Meet(Gradient, frozen=True)", "Meet", "inherits from agents.plugins.law.Law"),
     ],
 )
 def test_a_broken_file_is_named_with_its_line(task, old, new, message):
@@ -141,7 +140,7 @@ def test_a_changed_file_is_another_plug_in(task):
     (task.parent / "meet.py").write_text(MEET.replace("0.1", "0.4"), "utf-8")
     after = load(task)
     cases = before.cases()["slow"], after.cases()["slow"]
-    assert [Plan(case).law.gain for case in cases] == [0.1, 0.4]
+    assert [case.law.gain for case in cases] == [0.1, 0.4]
     assert len({runs.digest(case) for case in cases}) == 2
     assert len({runs.code_of(case) for case in cases}) == 2
 
@@ -150,9 +149,12 @@ def test_every_process_of_the_machine_loads_it_by_its_digest(task):
     case = load(task).cases()["fast"]
     written = task.parent.parent / "case.json"
     written.write_bytes(write_json(case))
-    again = load(written).experiment
+    again = load(written).plan
     assert again == case
-    assert next(iter(received(case_document(case).decode(), "a pipe").cases().values())).formation == case.formation
+    assert (
+        next(iter(received(case_document(case).decode(), "a pipe").cases().values())).experiment.formation
+        == case.experiment.formation
+    )
     assert {file.name for file in plugin_files(again)} >= {"meet.py"}
     result = msgspec.json.decode(runs.fly(write_json(case), [1], runs.code_of(case)), type=runs.WorkResult)
     assert [run.seed for run in result.runs] == [1]
@@ -165,7 +167,7 @@ def test_another_machine_loads_nothing(task, tmp_path, monkeypatch):
     case = load(task).cases()["fast"]
     monkeypatch.setenv("ZENPARK_CACHE_DIR", str(tmp_path / "elsewhere"))
     with pytest.raises(registry.PluginError, match="has not read it on this machine"):
-        _ = Plan(case).law
+        _ = case.changed().law
     with pytest.raises(DocumentError, match="has not read it"):
         received(case_document(case).decode(), "the network")
     with pytest.raises(RecordingError, match=r"meet\.py.*zenpark check"):

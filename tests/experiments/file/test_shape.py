@@ -34,7 +34,7 @@ CF01 = [1.0, 1.8]
 
 
 def links(text, *changes, case="default"):
-    return document.loads(text, *changes).cases()[case].formation.links
+    return document.loads(text, *changes).cases()[case].experiment.formation.links
 
 
 def test_lengths_are_those_between_the_places_at_the_heights_that_robots_hold():

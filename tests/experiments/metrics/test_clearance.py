@@ -1,5 +1,6 @@
 """Distances between surfaces, and what touched, against geometry by hand."""
 
+import dataclasses
 import math
 
 import msgspec
@@ -130,13 +131,9 @@ def test_what_is_unknown_touches_nothing():
 def with_contacts(known, *contacts, clock="virtual", **bodies):
     robots = {
         name: msgspec.structs.replace(robot, body=bodies.get(name, "twin"))
-        for name, robot in known.experiment.robots.items()
+        for name, robot in known.plan.experiment.robots.items()
     }
-    what = msgspec.structs.replace(known.experiment, robots=robots)
-    return known.__class__(
-        **{**{name: getattr(known, name) for name in known.__dataclass_fields__}, "experiment": what}
-        | {"contacts": contacts, "clock": clock}
-    )
+    return dataclasses.replace(known, plan=known.plan.changed(robots=robots), contacts=contacts, clock=clock)
 
 
 def test_what_an_engine_saw_stands_for_what_overlaps():

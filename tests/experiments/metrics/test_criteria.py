@@ -7,6 +7,7 @@ import msgspec
 import pytest
 
 from experiments.definition.experiment import JUDGED, Criterion
+from experiments.definition.plan import Plan
 from experiments.file.document import loads, write_json
 from experiments.metrics.criteria import document, has_passed, judge
 from experiments.metrics.metric import OURS
@@ -113,9 +114,9 @@ def test_scripts_get_values_by_seed(cases):
 
 
 def test_a_case_keeps_criteria_when_it_is_written():
-    case = loads(FILE + HALF).cases()["event"]
-    assert loads(FILE + HALF).cases()["periodic"].criteria == case.criteria
-    assert b'"relative_to"' in write_json(case)
+    case = loads(FILE + HALF).cases()["event"].experiment
+    assert loads(FILE + HALF).cases()["periodic"].experiment.criteria == case.criteria
+    assert b'"relative_to"' in write_json(Plan(case))
 
 
 @pytest.mark.parametrize(("limits", "code"), [(HALF, 0), (HALF + TIGHT, 1)])

@@ -37,7 +37,7 @@ def test_a_run_is_read_back(path):
     assert playback.complete
     assert playback.messages == 1 + 4 + 22 * 3 + 11
     assert (trace.case, trace.seed, trace.clock, trace.robots) == ("only", 4, "real", ("TB01", "CF01"))
-    assert trace.experiment == PAIR
+    assert trace.plan.experiment == PAIR
     np.testing.assert_allclose(trace.time, np.arange(11) / 10, rtol=0, atol=1e-12)
     along = np.arange(11) / 10
     np.testing.assert_allclose(trace.position[:, 0, 0], along, atol=1e-6)

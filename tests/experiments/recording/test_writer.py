@@ -16,6 +16,7 @@ from rosbags.highlevel import AnyReader
 from agents.network.messages import Event
 from bridges import ros2 as bridge
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.recording import writer
 from experiments.recording.playback import read
 from experiments.recording.reader import RecordingError, recover
@@ -100,7 +101,7 @@ def test_closed_twice_and_used_after(path):
 
 def test_an_error_of_the_caller_leaves_a_finished_file(path):
     def fails():
-        with Recording(path, PAIR, case="only", seed=4, clock="real") as recording:
+        with Recording(path, Plan(PAIR), case="only", seed=4, clock="real") as recording:
             put(recording, whole_run())
             raise KeyboardInterrupt
 
@@ -132,7 +133,7 @@ def test_a_full_disk_keeps_what_was_written(path):
 
 @pytest.mark.usefixtures("small_disk")
 def test_after_a_write_error_nothing_more_is_written(path):
-    recording = Recording(path, PAIR, case="only", seed=4, clock="real")
+    recording = Recording(path, Plan(PAIR), case="only", seed=4, clock="real")
     messages = scattered(2000)
     with pytest.raises(RecordingError):
         put(recording, messages)
@@ -146,7 +147,7 @@ def test_after_an_interrupt_inside_a_write_nothing_more_is_written(path, monkeyp
     def interrupted():
         raise KeyboardInterrupt
 
-    recording = Recording(path, PAIR, case="only", seed=4, clock="real")
+    recording = Recording(path, Plan(PAIR), case="only", seed=4, clock="real")
     monkeypatch.setattr(recording._writer, "flush", interrupted)
     with pytest.raises(KeyboardInterrupt):
         recording.flush()
@@ -181,7 +182,7 @@ def test_a_file_is_the_same_as_the_librarys_own():
 @pytest.mark.usefixtures("small_disk")
 def test_a_disk_too_full_for_the_first_record(path):
     with pytest.raises(RecordingError, match="cannot be written"):
-        Recording(path, PAIR, "#" * 50_000, case="only", seed=4, clock="real")
+        Recording(path, Plan(PAIR), "#" * 50_000, case="only", seed=4, clock="real")
 
 
 @pytest.mark.usefixtures("small_disk")
@@ -200,7 +201,7 @@ def drawn_scene(path):
     """The pair's recording with a scene, states out of order by 0.15 s, and an event from the future."""
     clock = [START]
     recording = Recording(
-        path, PAIR, case="only", seed=4, clock="real", draw=markers.drawing(PAIR), utc=lambda: clock[0]
+        path, Plan(PAIR), case="only", seed=4, clock="real", draw=markers.drawing(Plan(PAIR)), utc=lambda: clock[0]
     )
     with recording:
         recording.write(Event(START + 5.0, "start", "conductor", "common start"))
@@ -244,7 +245,7 @@ def test_size_of_chunks_changes_no_message(tmp_path):
     kept = []
     for size in (1_000, CHUNK_BYTES, 1_000_000):
         file = tmp_path / f"{size}.mcap"
-        with Recording(file, PAIR, case="only", seed=4, clock="real", chunk_bytes=size) as recording:
+        with Recording(file, Plan(PAIR), case="only", seed=4, clock="real", chunk_bytes=size) as recording:
             for k in range(200):
                 recording.write(state("CF01", k, START + 0.02 * k))
         with file.open("rb") as stream:

@@ -5,7 +5,6 @@ import itertools
 import re
 from collections import Counter
 
-import msgspec
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -83,8 +82,8 @@ def test_rates_far_apart_are_on_a_logarithmic_axis():
 
 def test_the_plan_shows_what_is_near_the_robots_with_a_few_cases_upon_each_other():
     traces = [park(f"case {k}", duration=3.0) for k in range(4)]
-    hall = msgspec.structs.replace(traces[0].experiment, arena=Arena(size=(30.0, 30.0, 3.0)))
-    wide = [dataclasses.replace(trace, experiment=hall) for trace in traces]
+    hall = traces[0].plan.changed(arena=Arena(size=(30.0, 30.0, 3.0)))
+    wide = [dataclasses.replace(trace, plan=hall) for trace in traces]
     (axes,) = figures.plan_view(wide[:3]).axes
     for limits, k in ((axes.get_xlim(), 0), (axes.get_ylim(), 1)):
         place = traces[0].true_position[..., k]

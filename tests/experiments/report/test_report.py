@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents.network.messages import Contact, Event, WorldState
-from experiments.definition.experiment import Arena, Experiment, Shadow, Start
+from experiments.definition.experiment import Arena, Shadow, Start
 from experiments.metrics.measure import measure
 from experiments.metrics.statistics import spread
 from experiments.recording.run_folder import RunOrigin
@@ -400,10 +400,11 @@ def test_verdict_on_a_world_that_fell_behind():
 
 def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
     plain = side_by_side()
-    robots = {name: msgspec.structs.replace(robot, shadow=Shadow()) for name, robot in plain.experiment.robots.items()}
+    given = plain.plan.experiment.robots
+    robots = {name: msgspec.structs.replace(robot, shadow=Shadow()) for name, robot in given.items()}
     known = dataclasses.replace(
         plain,
-        experiment=msgspec.structs.replace(plain.experiment, robots=robots),
+        plan=plain.plan.changed(robots=robots),
         contacts=(Contact(1.234, "A", "B", 0.017, 0.0004),),
         interventions=np.array([10, 40]),
         avoided=np.array([0, 25]),
@@ -499,7 +500,6 @@ def test_inline_drawings_have_ids_of_their_own():
 
 def test_experiment_is_shown_even_without_its_file(tmp_path):
     known = crowd(3, duration=2.0)
-    assert isinstance(known.experiment, Experiment)
     page = checked(report.write(tmp_path, [known]).read_text())
     assert '"duration_s": 2.0' in page.words
 
@@ -522,6 +522,6 @@ def test_losses_are_sums_over_all_robots_and_seeds_everywhere():
 def test_seeds_that_begin_alike_are_named(tmp_path):
     runs = [park(seed=seed, duration=2.0) for seed in (1, 2)]
     assert "All seeds begin at the same poses" in report.write(tmp_path / "a", runs).read_text()
-    scattered = msgspec.structs.replace(runs[0].experiment, start=Start(scatter=0.1))
-    apart = [dataclasses.replace(each, experiment=scattered) for each in runs]
+    scattered = runs[0].plan.changed(start=Start(scatter=0.1))
+    apart = [dataclasses.replace(each, plan=scattered) for each in runs]
     assert "begin at the same poses" not in report.write(tmp_path / "b", apart).read_text()

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.definition.experiment import Channel, LinkChannel
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.metrics.measure import measure
 from experiments.recording import playback
@@ -23,9 +24,9 @@ BAD = Channel(delay_s=0.05, loss=0.2, links={"TB01 > KH01": LinkChannel(loss=0.0
 
 @pytest.fixture(scope="module")
 def run():
-    park = load("robotic-park").cases()["periodic"]
+    park = load("robotic-park").cases()["periodic"].experiment
     park = msgspec.structs.replace(park, duration_s=4.0, timeline=[], channel=BAD)
-    return Logbook(simulate(park, 1), park, "bad")
+    return Logbook(simulate(Plan(park), 1), Plan(park), "bad")
 
 
 def test_dropped_differs_from_lost(run):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -31,7 +30,7 @@ EMPTY = Arena(size=(2.2, 2.0, 2.5))
 
 
 def within(trace, arena):
-    return dataclasses.replace(trace, experiment=msgspec.structs.replace(trace.experiment, arena=arena))
+    return dataclasses.replace(trace, plan=trace.plan.changed(arena=arena))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def short():
 
 def from_above(trace, arena):
     axes = Figure().subplots()
-    scenery.from_above(axes, within(trace, arena).experiment)
+    scenery.from_above(axes, within(trace, arena).plan)
     return axes
 
 
@@ -80,8 +79,8 @@ def test_a_border_without_walls_is_dashed(short):
 
 
 def test_the_legend_names_what_there_is(short):
-    assert scenery.legend([short.experiment]) == ([], [])
-    full = within(short, FULL).experiment
+    assert scenery.legend([short.plan]) == ([], [])
+    full = within(short, FULL).plan
     _, said = scenery.legend([full])
     assert said == ["obstacle", "can be pushed", "obstacle's path", "wall", "above the floor", "start box"]
     assert scenery.legend([full, full])[1] == said

@@ -10,6 +10,7 @@ import pytest
 
 from agents.body.kinds import KINDS
 from agents.network import messages
+from experiments.definition.plan import Plan
 from experiments.file.document import load, loads
 from experiments.scene import markers, models, stage
 from experiments.scene.stage import BAD, FAIR, GOOD, UNKNOWN, Condition, LinkTracker, Moment, Place, Stage, Trail
@@ -32,13 +33,13 @@ def status(phase: str = "running", **fields: object) -> messages.Status:
 
 @pytest.fixture(scope="module")
 def park() -> Stage:
-    return Stage.of_experiment(load("robotic-park").cases()["event"])
+    return Stage.of_plan(load("robotic-park").cases()["event"])
 
 
 def at_start(park: Stage) -> Moment:
     moment = moments.unknown(park)
-    assert park.experiment is not None
-    for row, robot in enumerate(park.experiment.robots.values()):
+    assert park.plan is not None
+    for row, robot in enumerate(park.plan.experiment.robots.values()):
         moment.position[row] = (*robot.start[:2], robot.hover or 0.0)
     return moment
 
@@ -93,7 +94,7 @@ def test_links_that_are_not_there_have_no_error():
         robots.B = { kind = "khepera4", start = [0.5, 0.0] }
         formation.links."A > B" = { distance = 0.5, from_s = 3.0 }
     """
-    pair = Stage.of_experiment(loads(text).cases()["default"])
+    pair = Stage.of_plan(loads(text).cases()["default"])
     tracker, place = LinkTracker(pair), np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
     assert np.isnan(tracker.errors(1.0, place)).all()
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
@@ -174,7 +175,7 @@ def test_faces_look_outward(mesh):
 
 
 def test_obstacles_stand_where_the_file_says():
-    course = Stage.of_experiment(next(iter(load("obstacle-course").cases().values())))
+    course = Stage.of_plan(next(iter(load("obstacle-course").cases().values())))
     scene = course.scene
     for k in range(len(scene.names)):
         mesh = models.obstacle(scene, k)
@@ -184,19 +185,19 @@ def test_obstacles_stand_where_the_file_says():
 
 
 def test_an_obstacle_that_hangs_has_a_height_in_recordings():
-    triangle = next(iter(load("triangle").cases().values()))
+    triangle = next(iter(load("triangle").cases().values())).experiment
     lamp = Obstacle(radius=0.2, at=(0.5, 0.0), bottom=1.4, height=0.3)
     arena = msgspec.structs.replace(triangle.arena, obstacles={"lamp": lamp})
-    drawn = markers.drawing(msgspec.structs.replace(triangle, arena=arena))(0.0, {})
+    drawn = markers.drawing(Plan(msgspec.structs.replace(triangle, arena=arena)))(0.0, {})
     (marker,) = [each for each in drawn if each.group == "obstacles"]
     assert marker.scale[2] == pytest.approx(0.3)
     assert marker.position[2] == pytest.approx(1.55)
 
 
 def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
-    assert park.experiment is not None
-    formation = msgspec.structs.replace(park.experiment.formation, law="not-here")
-    other = Stage.of_experiment(msgspec.structs.replace(park.experiment, formation=formation, avoidance="not-here"))
+    assert park.plan is not None
+    formation = msgspec.structs.replace(park.plan.experiment.formation, law="not-here")
+    other = Stage.of_plan(park.plan.changed(formation=formation, avoidance="not-here"))
     assert np.isnan(LinkTracker(other).errors(0.0, at_start(park).position)).all()
 
 

@@ -4,6 +4,7 @@ import msgspec
 import pytest
 
 from experiments.definition.experiment import World
+from experiments.definition.plan import Plan
 from experiments.file import reference
 from experiments.file.document import load
 from experiments.metrics.metric import swept_metrics
@@ -35,8 +36,8 @@ def _row(messages, iae, *, failed=0, **environment):
 
 
 def test_run_in_which_robots_landed_has_failed():
-    case = load("triangle", "duration_s=2.0", "safety.battery_low=0.999").cases()["periodic"]
-    found = msgspec.json.decode(fly(msgspec.json.encode(case), [1, 2], code_of(case)), type=WorkResult)
+    case = load("triangle", "duration_s=2.0", "safety.battery_low=0.999").cases()["periodic"].experiment
+    found = msgspec.json.decode(fly(msgspec.json.encode(case), [1, 2], code_of(Plan(case))), type=WorkResult)
     assert found.runs == []
     assert all("battery" in found.failed[seed] for seed in (1, 2))
 
@@ -72,17 +73,17 @@ def test_loss_is_environment_and_threshold_is_chosen():
 
 
 def test_digest_knows_the_order_of_robots():
-    case = load("triangle").cases()["periodic"]
+    case = load("triangle").cases()["periodic"].experiment
     turned = msgspec.structs.replace(case, robots=dict(reversed(case.robots.items())))
-    assert digest(turned) != digest(case)
+    assert digest(Plan(turned)) != digest(Plan(case))
 
 
 def test_code_knows_the_engines_library(monkeypatch):
-    case = msgspec.structs.replace(load("triangle").cases()["periodic"], world=World(engine="mujoco"))
+    case = msgspec.structs.replace(load("triangle").cases()["periodic"].experiment, world=World(engine="mujoco"))
     found = set()
     for number in ("4.0", "4.1"):
         monkeypatch.setattr(version, "installed", lambda name, number=number: number if name == "mujoco-core" else None)
         assert version.engine_versions("mujoco") == [f"mujoco-core {number}"]
-        found.add(code_of(case))
+        found.add(code_of(Plan(case)))
     assert len(found) == 2
     assert "mujoco-core" in version.LIBRARIES

@@ -59,7 +59,7 @@ def test_a_case_without_the_parameter_is_one_cell(triangle):
         ("event", {"trigger.threshold": 0.04}),
     ]
     assert {cell.reference for cell in plan} == {plan[0].digest}
-    assert plan[2].experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
+    assert plan[2].plan.experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
 
 
 def test_the_reference_has_the_same_values_as_what_is_compared_with_it(triangle):
@@ -80,7 +80,7 @@ def test_the_trigger_of_the_reference_stays_as_the_file_has_it(triangle):
     plan = planned(triangle, "trigger.minimum_interval_s=0.05,0.1", "formation.gain=2,3")
     references = [cell for cell in plan if cell.digest == cell.reference]
     assert [dict(cell.parameters) for cell in references] == [{"formation.gain": 2}, {"formation.gain": 3}]
-    assert all(cell.experiment.trigger == triangle.cases()["periodic"].trigger for cell in references)
+    assert all(cell.plan.experiment.trigger == triangle.cases()["periodic"].experiment.trigger for cell in references)
     swept = [dict(cell.parameters) for cell in plan if cell.case == "periodic" and cell not in references]
     assert swept == [
         {"trigger.minimum_interval_s": interval, "formation.gain": gain} for interval in (0.05, 0.1) for gain in (2, 3)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.definition.experiment import Channel, Start, World
+from experiments.definition.plan import Plan
 from experiments.file import structure
 from experiments.file.document import load
 from experiments.metrics import measure
@@ -16,13 +17,15 @@ from experiments.virtual_time.simulation import simulate
 
 @pytest.fixture(scope="module")
 def park():
-    return msgspec.structs.replace(load("robotic-park").cases()["event"], duration_s=6.0, timeline=[])
+    return msgspec.structs.replace(load("robotic-park").cases()["event"].experiment, duration_s=6.0, timeline=[])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
 def test_lean_figures_are_those_of_the_report(park, seed):
-    lean, whole = (Logbook(simulate(park, seed, lean=lean), park, "event").trace() for lean in (True, False))
+    lean, whole = (
+        Logbook(simulate(Plan(park), seed, lean=lean), Plan(park), "event").trace() for lean in (True, False)
+    )
     figures, measured = run_metrics(lean), measure.measure(whole)
     assert figures == run_metrics(whole)
     assert figures.seed == seed
@@ -36,7 +39,7 @@ def test_lean_figures_are_those_of_the_report(park, seed):
 
 @pytest.mark.slow
 def test_lean_log_is_small(park):
-    lean = simulate(park, 1, lean=True)
+    lean = simulate(Plan(park), 1, lean=True)
     assert lean.true_position.shape == (len(lean.time), 7, 3)
     for column in (lean.position, lean.velocity, lean.goal, lean.setpoint, lean.error, lean.phase):
         assert column.size == 0
@@ -45,7 +48,7 @@ def test_lean_log_is_small(park):
 
 
 def flown(experiment, seeds):
-    return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(experiment)), type=WorkResult)
+    return msgspec.json.decode(fly(msgspec.json.encode(experiment), seeds, code_of(Plan(experiment))), type=WorkResult)
 
 
 @pytest.mark.slow
@@ -84,21 +87,21 @@ def test_work_for_other_code_is_refused(park):
 
 def test_what_does_not_change_a_run_does_not_change_its_digest(park):
     same = msgspec.structs.replace(park, title="Another", source="", seed=99, cases={"a": {}})
-    assert digest(same) == digest(park)
+    assert digest(Plan(same)) == digest(Plan(park))
     other = msgspec.structs.replace(park, duration_s=6.02)
-    assert digest(other) != digest(park)
+    assert digest(Plan(other)) != digest(Plan(park))
 
 
 def test_a_plug_in_that_changes_changes_the_code(park, tmp_path, monkeypatch):
     file = tmp_path / "my_triggers.py"
     file.write_text("one")
-    before = code_of(park)
+    before = code_of(Plan(park))
     real = structure.getfile
     monkeypatch.setattr(structure, "getfile", lambda of: str(file) if of.__name__ == "SendOnDelta" else real(of))
-    foreign = code_of(park)
+    foreign = code_of(Plan(park))
     runs._file_digest.cache_clear()
     file.write_text("two")
-    assert len({before, foreign, code_of(park)}) == 3
+    assert len({before, foreign, code_of(Plan(park))}) == 3
     runs._file_digest.cache_clear()
 
 
@@ -106,16 +109,16 @@ def test_the_version_of_the_engines_library_counts(park, monkeypatch):
     """Runs of another pymunk or mujoco are other runs; of one that is not used they are the same."""
     real = runs.engine_versions
     pymunk = msgspec.structs.replace(park, world=World(engine="pymunk"))
-    before = code_of(park), code_of(pymunk)
+    before = code_of(Plan(park)), code_of(Plan(pymunk))
     monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "pymunk" else real(name))
-    assert code_of(park) == before[0]
-    assert code_of(pymunk) != before[1]
+    assert code_of(Plan(park)) == before[0]
+    assert code_of(Plan(pymunk)) != before[1]
 
 
 def test_the_version_of_the_laws_library_counts(park, monkeypatch):
     formation = msgspec.structs.replace(park.formation, law="mpc")
     planned = msgspec.structs.replace(park, formation=formation)
-    before = code_of(park), code_of(planned)
+    before = code_of(Plan(park)), code_of(Plan(planned))
     monkeypatch.setattr(runs, "engine_versions", lambda name: ["0.0"] if name == "daqp" else [])
-    assert code_of(park) == before[0]
-    assert code_of(planned) != before[1]
+    assert code_of(Plan(park)) == before[0]
+    assert code_of(Plan(planned)) != before[1]

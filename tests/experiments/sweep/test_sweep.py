@@ -8,6 +8,7 @@ import pytest
 
 from agents.errors import ExplainedError
 from experiments.definition.experiment import Experiment
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from experiments.file.problems import DocumentError
 from experiments.metrics.measure import measure
@@ -168,9 +169,9 @@ def test_a_tuning_word_and_a_range_without_a_number_are_for_the_search(tmp_path)
 
 def test_how_many_fly_side_by_side_depends_on_their_number():
     triangle = load("triangle").experiment
-    assert side_by_side(triangle) == 100
+    assert side_by_side(Plan(triangle)) == 100
     many = {f"R{k}": triangle.robots["KH01"] for k in range(1000)}
-    assert side_by_side(Experiment(title="t", robots=many, duration_s=45.0)) == 1
+    assert side_by_side(Plan(Experiment(title="t", robots=many, duration_s=45.0))) == 1
 
 
 def test_workers_with_other_code_are_refused():

@@ -31,7 +31,7 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
 
 
 def test_numbers_of_the_trigger_and_the_law_have_sliders():
-    park = Stage.of_experiment(load("robotic-park").cases()["event"])
+    park = Stage.of_plan(load("robotic-park").cases()["event"])
     assert [(each.label, each.value) for each in parameters(park)] == [
         ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
     ]  # fmt: skip

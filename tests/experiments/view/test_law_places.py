@@ -36,7 +36,7 @@ def test_said_places_are_those_of_the_memory(flown):
 
 
 def test_places_with_z_and_unknown_ones():
-    stage = Stage.of_experiment(load("aggregative", *SHORT).cases()["event"])
+    stage = Stage.of_plan(load("aggregative", *SHORT).cases()["event"])
     position = np.full((len(stage.names), 3), 0.7)
     memories = [{"s": (1.0, 2.0, 3.0)}, {"s": (1.0, 2.0)}, {"s": (1.0, 2.0, 3.0, 4.0)}, {"s": (1.0,)}, {}]
     places = stage.said_places(memories, position)[:, 0]

@@ -6,6 +6,7 @@ from math import isnan
 import msgspec
 import numpy as np
 
+from experiments.definition.plan import Plan
 from experiments.virtual_time import stretch
 from experiments.virtual_time.simulation import Flight
 
@@ -14,7 +15,7 @@ def flown(experiment, *, compiled, seed=1, lean=False):
     """Log of a run, and the ticks of it that were compiled."""
     stretch.WORK[0] = 1e6 if compiled else -1e6  # compilation pays, or nothing does
     try:
-        flight = Flight(experiment, seed, quiet=False, lean=lean)
+        flight = Flight(Plan(experiment), seed, quiet=False, lean=lean)
         flight.fly(landing=True, progress=lambda _: None, watch=None)
     finally:
         stretch.WORK[0] = 0.0

@@ -6,6 +6,7 @@ import pytest
 
 from agents.decision.lifecycle import RUNNING
 from experiments.definition.experiment import Channel, Start
+from experiments.definition.plan import Plan
 from experiments.virtual_time.simulation import simulate
 from tests.experiments.encounters import ANGLES, Outcome, encounter, meet, random_pairs
 
@@ -39,7 +40,7 @@ def test_barrier_keeps_robots_apart_until_arrival():
 
 def test_gap_is_between_true_surfaces():
     experiment = encounter(("khepera4", "tello"), None, duration_s=10.0)
-    log = simulate(experiment, 3)
+    log = simulate(Plan(experiment), 3)
     place = log.true_position[(log.phase == RUNNING).all(axis=1)]
     expected = np.hypot(*(place[:, 0] - place[:, 1])[:, :2].T).min() - 0.07 - 0.1
     assert meet(experiment, [3]).gap[0] == pytest.approx(expected, abs=1e-12)

@@ -30,9 +30,9 @@ CASES = ("periodic", "event", "event-loss")
 @cache
 def flown(name, case, *changes):
     """Log and logbook of a catalogue entry."""
-    experiment = document.read(index.find_file(name), changes).cases()[case]
-    log = simulate(experiment, experiment.seed)
-    return log, Logbook(log, experiment, case)
+    plan = document.read(index.find_file(name), changes).cases()[case]
+    log = simulate(plan, plan.experiment.seed)
+    return log, Logbook(log, plan, case)
 
 
 def trace(name, case, *changes):
@@ -67,7 +67,10 @@ def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
     A lost message lets the two ends believe different values, of some thresholds of 1 cm, until the next one.
     """
     known = trace("aggregative", case)
-    law, names = Aggregative(**{k: v for k, v in known.experiment.formation.law.items() if k != "kind"}), known.robots
+    law, names = (
+        Aggregative(**{k: v for k, v in known.plan.experiment.formation.law.items() if k != "kind"}),
+        known.robots,
+    )
     targets, places = np.array([law.targets[name] for name in names]), np.array([*law.places.values()])
     share = law.team * len(places) / len(names)
     centre = (law.own * targets.mean(axis=0) + share * places.mean(axis=0)) / (law.own + share)
@@ -84,7 +87,7 @@ def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
 @pytest.mark.parametrize("case", CASES)
 def test_robots_fly_to_the_tasks_that_they_won(case):
     known = trace("auction", case)
-    law, place = known.experiment.formation.law, known.true_position[..., :2]
+    law, place = known.plan.experiment.formation.law, known.true_position[..., :2]
     tasks = np.array([*law["tasks"], *(each[:2] for each in law["later"])])
     chosen = np.where(known.measures["calm"] >= law.get("calm_s", 1.0), known.measures["task"], -1.0)
     for here, there in combinations(range(6), 2):  # never are two on the way to the same task
@@ -104,7 +107,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
 @pytest.mark.parametrize("case", CASES)
 def test_consensus_meets_at_the_mean_at_the_rate_of_the_graph(case):
     known = trace("consensus", case)
-    offset = np.array([*known.experiment.formation.law["offset"].values()])
+    offset = np.array([*known.plan.experiment.formation.law["offset"].values()])
     place = known.true_position[..., :2] - offset
     mean = place.mean(axis=1)
     assert np.abs(mean - mean[0]).max() < 0.01
@@ -166,8 +169,8 @@ def test_consensus_by_a_share_of_the_error_keeps_its_rate_and_has_no_floor(loss,
     )
     trigger = f'cases.event.trigger={{ kind = "relative", share = {share}{silence} }}'
     given = document.loads(text, NOISELESS, f"channel.loss={loss}", 'formation.law="displacement"', trigger)
-    experiment = given.cases()["event"]
-    known = Logbook(simulate(experiment, 1), experiment, "event").trace()
+    plan = given.cases()["event"]
+    known = Logbook(simulate(plan, 1), plan, "event").trace()
     apart, spectrum, gain = apart_from_mean(known), np.linalg.eigvalsh(RING), 2.0 * 0.15  # of a Crazyflie [1/s]
     most = np.sqrt(spectrum[1]) / (2.0 * np.sqrt(2.0 * 2.0))  # share with which ‖A‖ ‖ε‖ outweighs the consensus
     window = (known.time > 2.0) & (known.time < 15.0)
@@ -184,8 +187,8 @@ def test_followers_go_into_the_hull_of_their_leaders():
     words = ", ".join(f'"{name}" = "{kind}"' for name, kind in links.items())
     bare = "\n".join(line for line in index.find_file("consensus").read_text().splitlines() if " - CF0" not in line)
     given = document.loads(bare, f"formation.links={{ {words} }}", 'formation.law={ kind = "consensus" }')
-    experiment = given.cases()["periodic"]
-    end = Logbook(simulate(experiment, 1), experiment, "periodic").trace().true_position[-1, :, :2]
+    plan = given.cases()["periodic"]
+    end = Logbook(simulate(plan, 1), plan, "periodic").trace().true_position[-1, :, :2]
     first, second = end[:2]
     for share, place in zip((0.25, 0.5, 0.75), end[2:], strict=True):
         assert place == pytest.approx((1.0 - share) * first + share * second, abs=0.02)
@@ -344,8 +347,8 @@ def test_a_flock_keeps_spacing_and_velocity_and_its_mean_obeys_the_rendezvous(ca
 
 
 def test_the_same_twice_and_another_seed_elsewhere():
-    experiment = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
-    first, again, other = (simulate(experiment, seed) for seed in (1, 1, 2))
+    plan = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
+    first, again, other = (simulate(plan, seed) for seed in (1, 1, 2))
     assert all(np.array_equal(first.memory[name], again.memory[name]) for name in first.memory)
     assert any(not np.array_equal(first.memory[name], other.memory[name]) for name in first.memory)
 
@@ -402,7 +405,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
 def test_displacement_keeps_an_error_in_a_wind(case):
     known = trace("integral", case, 'formation.law={ kind = "displacement" }')
     links = np.array([[2, 0, -1, 0], [0, 2, 0, -1], [-1, 0, 3, -1], [0, -1, -1, 2]])
-    expected = np.linalg.solve(known.experiment.formation.stiffness * links, SHELTER * np.array([*WIND.values()]))
+    expected = np.linalg.solve(known.plan.experiment.formation.stiffness * links, SHELTER * np.array([*WIND.values()]))
     assert np.linalg.norm(expected, axis=1).min() > 0.15
     late = known.time > 37.0
     assert out_of_place(known)[late].mean(axis=0) == pytest.approx(expected, abs=0.01)

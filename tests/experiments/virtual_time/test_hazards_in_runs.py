@@ -7,6 +7,7 @@ from agents.body.limits import Safety
 from agents.decision.lifecycle import DONE
 from experiments.check.check import check
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.recording import playback
 from experiments.virtual_time.log import Logbook
@@ -16,24 +17,24 @@ from tests.agents.swarm import changed
 
 
 def events(log, experiment):
-    trace = Logbook(log, experiment, "case").trace()
+    trace = Logbook(log, Plan(experiment), "case").trace()
     return [(event.source, event.text) for event in trace.events if event.kind == "hazard"]
 
 
 def test_a_run_without_trouble_has_no_incidents():
-    experiment = changed(document.read("robotic-park").cases()["event"], duration_s=3.0, timeline=[])
-    assert simulate(experiment, 1).incidents == ()
+    experiment = changed(document.read("robotic-park").cases()["event"].experiment, duration_s=3.0, timeline=[])
+    assert simulate(Plan(experiment), 1).incidents == ()
 
 
 def test_robots_that_come_too_near_hold(tmp_path):
     experiment = pair(formation=Formation(links={"A - B": 0.3}), safety=Safety(separation=0.6), duration_s=8.0)
-    log = simulate(experiment, 1)
+    log = simulate(Plan(experiment), 1)
     first, second = log.true_position[-1]
     assert np.linalg.norm(first - second) > 0.55
     found = events(log, experiment)
     assert {source for source, _ in found} == {"A", "B"}
     assert ("A", "hold: minimum separation: 0.60 m from B (limit 0.6 m)") in found
-    book = Logbook(log, experiment, "case")
+    book = Logbook(log, Plan(experiment), "case")
     book.record(tmp_path / "case.mcap", 'title = "A pair"')
     read = [event for event in playback.read(tmp_path / "case.mcap").trace.events if event.kind == "hazard"]
     assert {(event.source, event.text) for event in read} == set(found)
@@ -48,14 +49,14 @@ def test_a_drone_lands_when_its_battery_is_low_and_says_so():
     experiment = pair(
         robots=robots, formation=Formation(links={"F > G": 0.8}), safety=Safety(battery_low=0.985), duration_s=12.0
     )
-    log = simulate(experiment, 1)
+    log = simulate(Plan(experiment), 1)
     during = np.flatnonzero((log.time > 10.0) & (log.time < 12.0))
     assert (log.phase[during, 0] == DONE).all()
     assert (log.phase[during, 1] < DONE).all()
     found = events(log, experiment)
     assert found[0] == ("F", "land: its battery is low: 98% (limit 98%)")
     assert found[1:3] == [("G", "warn: a neighbour is lost: F"), ("G", "hold: all its neighbours are lost: F")]
-    reasons = [status.reason for status in Logbook(log, experiment, "case")._statuses()]
+    reasons = [status.reason for status in Logbook(log, Plan(experiment), "case")._statuses()]
     assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from agents.body.interface import Disturbance
 from experiments.definition.experiment import Arena, Experiment, Formation, Leg, Rates, Robot, Shadow, World
+from experiments.definition.plan import Plan
 from experiments.recording import playback
 from experiments.virtual_time.log import Logbook
 from experiments.virtual_time.simulation import simulate
@@ -40,7 +41,7 @@ def experiment(engine="point-mass", **parts):
 @pytest.fixture(scope="module")
 def log():
     """What the engine does not know is made up."""
-    plain = simulate(experiment(), 3)
+    plain = simulate(Plan(experiment()), 3)
     half = np.linspace(0.0, 2.0, len(plain.time))[:, None] * [1.0, 0.5]
     attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=-1)
     touches = (
@@ -73,7 +74,7 @@ def equal(one, other, name):
 
 
 def test_what_is_logged_and_what_is_played_back_are_the_same(log, tmp_path):
-    book = Logbook(log, experiment(), "only")
+    book = Logbook(log, Plan(experiment()), "only")
     book.record(tmp_path / "run.mcap", "")
     played = playback.read(tmp_path / "run.mcap")
     assert played.complete
@@ -86,7 +87,7 @@ def test_what_is_logged_and_what_is_played_back_are_the_same(log, tmp_path):
 
 
 def test_a_trace_has_the_contacts_of_the_run(log):
-    trace = Logbook(log, experiment(), "only").trace()
+    trace = Logbook(log, Plan(experiment()), "only").trace()
     assert [(c.stamp, c.first, c.second, c.impulse, c.overlap) for c in trace.contacts] == [
         (pytest.approx(0.503), "KH", "CF", 0.2, 0.002),
         (pytest.approx(1.25), "KH", "cart", 0.3, 0.003),
@@ -96,7 +97,7 @@ def test_a_trace_has_the_contacts_of_the_run(log):
 
 
 def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
-    world = Logbook(log, experiment(), "only").trace().world
+    world = Logbook(log, Plan(experiment()), "only").trace().world
     assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
     assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
     assert [said.obstacles[1].pose[0] for said in world] == pytest.approx([-0.8, -0.7, -0.6, -0.5])
@@ -108,10 +109,10 @@ def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
 @pytest.mark.parametrize(("engine", "contacts"), [("point-mass", None), ("pymunk", ())])
 def test_no_contacts_of_an_engine_that_looks_for_them_are_none(log, engine, contacts):
     quiet = replace(log, touches=())
-    assert Logbook(quiet, experiment(engine), "only").trace().contacts == contacts
+    assert Logbook(quiet, Plan(experiment(engine)), "only").trace().contacts == contacts
 
 
 def test_nothing_is_said_of_an_empty_place(log):
     quiet = replace(log, touches=(), obstacles=log.obstacles[:, :, :0])
-    trace = Logbook(quiet, experiment(arena=Arena()), "only").trace()
+    trace = Logbook(quiet, Plan(experiment(arena=Arena())), "only").trace()
     assert (trace.world, trace.contacts) == ((), None)

@@ -55,8 +55,8 @@ def flown(starts, goals, *changes, case="periodic"):
     words = [f"robots.{name}.start=[{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, starts, strict=True)]
     table = ", ".join(f"{name} = [{x:.4f}, {y:.4f}]" for name, (x, y) in zip(NAMES, goals, strict=True))
     given = document.read(index.find_file("mpc"), [*words, f"formation.law.goal={{ {table} }}", *changes])
-    experiment = given.cases()[case]
-    return Logbook(simulate(experiment, experiment.seed), experiment, case).trace()
+    plan = given.cases()[case]
+    return Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
 
 
 def nearest(trace):
@@ -101,8 +101,8 @@ law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
 @pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
     text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")
-    experiment = document.loads(text).cases()["periodic"]
-    trace = Logbook(simulate(experiment, 1), experiment, "periodic").trace()
+    plan = document.loads(text).cases()["periodic"]
+    trace = Logbook(simulate(plan, 1), plan, "periodic").trace()
     assert trace.true_position[-1, 0, :2] == pytest.approx([1.0, 0.6], abs=0.02)
     state = trace.memory["state"][:, 0]
     known = state[np.isfinite(state).all(axis=1)]

@@ -39,7 +39,7 @@ class Talk:
         )
         plan = Plan(experiment)
         self.robots = [Robot(plan.assignment(name)) for name in plan.names]
-        self.network = VirtualNetwork(experiment, plan, self.robots, self.seed, lean=False)
+        self.network = VirtualNetwork(plan, self.robots, self.seed, lean=False)
 
     def run(self, ticks, rows=()):
         """Some ticks: what arrived first, then these rows transmit."""

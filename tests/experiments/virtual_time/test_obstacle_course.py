@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from agents.body.kinds import KINDS
-from experiments.definition import bodies
-from experiments.definition.plan import Plan
 from experiments.file.document import read
 from experiments.virtual_time import simulation
 from tests.experiments.traces import link_errors
@@ -29,17 +27,18 @@ def test_the_gap_is_narrower_than_the_formation():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param("periodic", marks=pytest.mark.nightly), "event"])
 def test_it_passes_without_contact_and_recovers(case):
-    experiment = read("obstacle-course").cases()[case]
-    log = simulation.simulate(experiment, experiment.seed)
+    plan = read("obstacle-course").cases()[case]
+    experiment = plan.experiment
+    log = simulation.simulate(plan, experiment.seed)
     run = (log.time >= 0.0) & (log.time <= experiment.duration_s)
     time, place = log.time[run], log.true_position[run]
-    scene = bodies.scene(experiment)
+    scene = plan.scene
     assert log.touches == ()
     for k in range(len(scene.names)):
         assert (outlines.distance(scene, k, scene.pose[k], place[..., :2]) > RADIUS + 0.04).all()
     i, j = np.triu_indices(place.shape[1], 1)
     assert (norm(place[:, i, :2] - place[:, j, :2]) > 2.0 * RADIUS + 0.04).all()
     assert (place[-1, :, 0] > 0.5).all()  # all are through
-    error = link_errors(Plan(experiment).links, place).max(axis=1)
+    error = link_errors(plan.links, place).max(axis=1)
     assert error.max() > 0.3  # it had to fold
     assert error[time > 75.0].max() < 0.025

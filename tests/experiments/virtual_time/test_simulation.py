@@ -10,6 +10,7 @@ from agents.body.interface import Disturbance
 from agents.decision.lifecycle import AIRBORNE, DONE, IDLE, LANDING, READY, RUNNING
 from experiments.arrays import PoseTable
 from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, Start
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.virtual_time.conductor import LEAD_S, Stuck
 from experiments.virtual_time.simulation import Log, simulate
@@ -22,7 +23,7 @@ def changed(experiment, **parts):
 @pytest.fixture(scope="module")
 def park():
     """The reference experiment with everything that is random, cut short."""
-    experiment = document.read("robotic-park").cases()["event"]
+    experiment = document.read("robotic-park").cases()["event"].experiment
     nature = {
         **experiment.disturbance,
         "KH02": Disturbance(odometry_drift=0.002, latency_s=0.02),
@@ -53,14 +54,14 @@ def same(a: Log, b: Log):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
-    first = simulate(park, 7)
-    same(first, simulate(park, 7))
-    other = simulate(park, 8)
+    first = simulate(Plan(park), 7)
+    same(first, simulate(Plan(park), 7))
+    other = simulate(Plan(park), 8)
     assert not np.array_equal(first.position[-1], other.position[-1])
 
 
 def test_the_common_start_is_time_zero():
-    log = simulate(ground(), 1)
+    log = simulate(Plan(ground()), 1)
     k = int(np.argmin(np.abs(log.time)))
     assert log.time[k] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(np.diff(log.time), 0.02, atol=1e-9)  # state_hz
@@ -76,7 +77,7 @@ def test_the_common_start_is_time_zero():
 
 
 def test_phases_never_go_back(park):
-    log = simulate(park, 1)
+    log = simulate(Plan(park), 1)
     assert (np.diff(log.phase, axis=0) >= 0).all()
     assert {IDLE, READY, AIRBORNE, RUNNING, LANDING, DONE} >= set(log.phase.ravel().tolist())
     assert (log.true_position[-1, 4:, 2] < 0.03).all()  # down, or about to touch down
@@ -84,7 +85,7 @@ def test_phases_never_go_back(park):
 
 
 def test_periodic_poses_are_all_sent_and_all_heard():
-    log = simulate(ground(trigger={"kind": "periodic", "period_s": 0.1}), 1)
+    log = simulate(Plan(ground(trigger={"kind": "periodic", "period_s": 0.1})), 1)
     time, row, seq, position = log.sent.stamp, log.sent.link, log.sent.seq, log.sent.position
     run = (time >= -1e-9) & (time < 2.0 - 1e-9)
     assert np.bincount(row[run]).tolist() == [20, 20]
@@ -105,7 +106,7 @@ def test_periodic_poses_are_all_sent_and_all_heard():
 
 def test_losses_are_counted_from_the_start_to_the_landing():
     experiment = ground(channel=Channel(loss=0.25), duration_s=10.0)
-    log = simulate(experiment, 1)
+    log = simulate(Plan(experiment), 1)
     time, row = log.sent.stamp, log.sent.link
     run = (time >= -1e-9) & (time < 10.0 - 1e-9)
     heard = log.received
@@ -120,7 +121,7 @@ def test_one_robot_alone():
     robots = {"F": Robot(kind="crazyflie", start=[0.2, -0.1], hover=0.6)}
     plan = {"kind": "circle", "radius": 0.2, "period_s": 8.0}
     leg = Leg(at_s=0.0, robot="F", plan=plan)
-    log = simulate(Experiment(title="Alone", duration_s=8.0, robots=robots, timeline=[leg]), 1)
+    log = simulate(Plan(Experiment(title="Alone", duration_s=8.0, robots=robots, timeline=[leg])), 1)
     run = (log.time >= 0.0) & (log.time <= 8.0)
     path = log.true_position[run, 0]
     assert len(log.received) == 0
@@ -144,7 +145,7 @@ def test_three_robots_find_their_triangle():
     experiment = Experiment(
         title="Triangle", duration_s=25.0, robots=robots, formation=Formation(links=links), disturbance=nature
     )
-    log = simulate(experiment, 1)
+    log = simulate(Plan(experiment), 1)
     a, b, f = log.true_position[np.flatnonzero(log.time <= 25.0)[-1]]
     for one, other, distance in ((a, b, 0.6), (a, f, 0.8), (b, f, 0.8)):
         assert np.linalg.norm(one - other) == pytest.approx(distance, abs=0.012)
@@ -152,8 +153,8 @@ def test_three_robots_find_their_triangle():
 
 
 def test_the_reference_formation_is_acquired():
-    experiment = changed(document.read("robotic-park").cases()["event"], duration_s=18.0, timeline=[])
-    log = simulate(experiment, 1)
+    experiment = changed(document.read("robotic-park").cases()["event"].experiment, duration_s=18.0, timeline=[])
+    log = simulate(Plan(experiment), 1)
     last = log.error[np.flatnonzero(log.time <= 18.0)[-1]]
     links_each = np.array([0, 4, 3, 4, 4, 4, 2])
     assert (last <= 0.03 * links_each + 1e-9).all()
@@ -168,7 +169,7 @@ def test_the_reference_formation_is_acquired():
 def test_who_hears_nobody_is_named(monkeypatch):
     monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
     with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never heard B\)"):
-        simulate(ground(channel=Channel(delay_s=100.0)), 1)
+        simulate(Plan(ground(channel=Channel(delay_s=100.0))), 1)
 
 
 def test_who_cannot_get_up_is_named(monkeypatch):
@@ -180,11 +181,11 @@ def test_who_cannot_get_up_is_named(monkeypatch):
         "G": Robot(kind="crazyflie", start=[-0.5, 0.0], hover=0.5),
     }
     with pytest.raises(Stuck, match=r"not airborne after 5 s: F, G"):
-        simulate(Experiment(title="Stuck", duration_s=1.0, robots=robots), 1)
+        simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1)
 
 
 def test_going_on_without_a_neighbour_that_is_never_heard():
-    log = simulate(ground(channel=Channel(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on")), 1)
+    log = simulate(Plan(ground(channel=Channel(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))), 1)
     run = (log.time >= 0.0) & (log.time <= 2.0)
     np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
     assert not log.error.any()
@@ -192,7 +193,7 @@ def test_going_on_without_a_neighbour_that_is_never_heard():
 
 
 def test_nothing_is_lost_before_the_start_and_after_the_end_and_everything_between():
-    log = simulate(ground(channel=Channel(loss=1.0)), 1)
+    log = simulate(Plan(ground(channel=Channel(loss=1.0))), 1)
     stamp = log.received.stamp
     assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()
     assert stamp.max() >= 2.0 - 1e-9

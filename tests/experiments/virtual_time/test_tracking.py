@@ -12,7 +12,7 @@ from experiments.virtual_time.simulation import simulate
 
 def track_centrally(known, steps, seeing):
     """Estimates (K, 4) of one Kalman filter that has all readings of a run at once."""
-    law, step = known.experiment.formation.law, 0.1
+    law, step = known.plan.experiment.formation.law, 0.1
     onward, per_axis = np.eye(4) + step * np.eye(4, k=2), [[step**3 / 3.0, step**2 / 2.0], [step**2 / 2.0, step]]
     growth = law["agility"] * np.kron(per_axis, np.eye(2))
     x, covariance = np.array([*law["guess"], 0.0, 0.0]), np.diag(np.repeat(law["doubt"], 2)) ** 2
@@ -39,8 +39,8 @@ def track_centrally(known, steps, seeing):
 
 def track(case, seed, *changes):
     """Mean squared errors of a place [m²], of the robots and of a central filter, and normalised ones of the robots."""
-    experiment = document.read(index.find_file("tracking"), changes).cases()[case]
-    known = Logbook(simulate(experiment, seed), experiment, case).trace()
+    plan = document.read(index.find_file("tracking"), changes).cases()[case]
+    known = Logbook(simulate(plan, seed), plan, case).trace()
     seeing, steps = slice(1, None), np.arange(5, len(known.time), 5)
     place = known.true_position[:, 0, :2]
     truth = np.hstack([place, np.gradient(place, known.time, axis=0)])[steps]
@@ -48,7 +48,7 @@ def track(case, seed, *changes):
     late = known.time[steps] > 5.0
     apart = (known.memory["x"][steps][:, seeing] - truth[:, None])[late]
     information = known.memory["all"][steps][:, seeing].reshape(len(steps), -1, 4, 4)[late]
-    normalised = np.einsum("tni,tnij,tnj->tn", apart, information / experiment.formation.law["sigma"] ** 2, apart)
+    normalised = np.einsum("tni,tnij,tnj->tn", apart, information / plan.experiment.formation.law["sigma"] ** 2, apart)
     squares = (apart[..., :2] ** 2).sum(axis=2).mean(), ((states - truth)[late, :2] ** 2).sum(axis=1).mean()
     return *squares, normalised.mean(axis=1)[::20]  # every two seconds, since errors last that long
 

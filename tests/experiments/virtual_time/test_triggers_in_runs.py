@@ -23,12 +23,12 @@ CHOSEN = {"kind": "predictive", "threshold": 0.011, "smoothing_s": 0.4}
 
 @pytest.fixture(scope="module")
 def park():
-    return document.read("robotic-park").cases()["periodic"]
+    return document.read("robotic-park").cases()["periodic"].experiment
 
 
 def measured(experiment, seeds):
-    logs = (simulation.simulate(experiment, seed) for seed in seeds)
-    return [measure.measure(Logbook(log, experiment, "").trace()) for log in logs]
+    logs = (simulation.simulate(Plan(experiment), seed) for seed in seeds)
+    return [measure.measure(Logbook(log, Plan(experiment), "").trace()) for log in logs]
 
 
 def mean(cases, index):
@@ -97,8 +97,8 @@ def test_triggers_where_they_make_sense_are_not(park, change):
 def flown(park):
     """A short run with the chosen trigger on a network with a delay, as a log and as a trace."""
     experiment = changed(park, trigger=CHOSEN, duration_s=8.0, timeline=[], channel=Channel(delay_s=0.05))
-    log = simulation.simulate(experiment, 4)
-    return log, Logbook(log, experiment, "predictive").trace()
+    log = simulation.simulate(Plan(experiment), 4)
+    return log, Logbook(log, Plan(experiment), "predictive").trace()
 
 
 def test_what_is_heard_is_what_was_said_velocity_and_all(flown):
@@ -142,15 +142,15 @@ def test_belief_error_is_that_of_the_prediction(flown):
             ahead = heard.position[last] + heard.velocity[last] * (trace.time[k] - heard.stamp[last])
             wanted = math.dist(ahead, trace.true_position[k, speaker[link]])
             assert found[k, link] == pytest.approx(wanted, abs=1e-12)
-    held = dataclasses.replace(trace, experiment=changed(trace.experiment, trigger="send-on-delta"))
+    held = dataclasses.replace(trace, plan=trace.plan.changed(trigger="send-on-delta"))
     assert np.nanmean(signals.belief_errors(held, net) ** 2) > 4.0 * np.nanmean(found**2)
 
 
 def test_updates_are_counted_for_each_robot(park):
     experiment = changed(updating(park, {"kind": "send-on-delta", "threshold": 0.02}), duration_s=12.0, timeline=[])
-    log = simulation.simulate(experiment, 1)
+    log = simulation.simulate(Plan(experiment), 1)
     assert log.updates[0] == log.decisions == 120
-    trace = Logbook(log, experiment, "").trace()
+    trace = Logbook(log, Plan(experiment), "").trace()
     np.testing.assert_array_equal(trace.decisions, log.updates)
     assert (trace.decisions[1:] < 120).all()
     assert (trace.decisions[1:] > 10).all()
@@ -193,4 +193,4 @@ def test_a_formation_without_links_has_no_law_to_gate(park):
         timeline=[],
         duration_s=2.0,
     )
-    assert simulation.simulate(alone, 1).updates.tolist() == [20]
+    assert simulation.simulate(Plan(alone), 1).updates.tolist() == [20]

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from agents.network.messages import Event, Incident
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tools.reliability.faults import ActiveFault, Fault
 from tools.reliability.observer import Invariants
@@ -17,9 +18,9 @@ def status(phase="running", *, missing=(), incidents=()):
 
 @pytest.fixture
 def it():
-    experiment = load("triangle").cases()["event"]
+    experiment = load("triangle").cases()["event"].experiment
     observer = SimpleNamespace(
-        invariants=Invariants(experiment), events=[], orders=[], alive=set(), connected=True,
+        invariants=Invariants(Plan(experiment)), events=[], orders=[], alive=set(), connected=True,
         status={name: status() for name in experiment.robots}, status_at=dict.fromkeys(experiment.robots, 1e12),
         receivers={"CF01": {"KH01", "KH02"}}, is_down=lambda name: observer.status[name].phase in ("landing", "done"),
     )  # fmt: skip

@@ -2,6 +2,7 @@ from collections import Counter
 
 import pytest
 
+from experiments.definition.plan import Plan
 from experiments.file.document import load
 from tools.reliability.chaos import ALWAYS, AVOIDANCE, defaults
 from tools.reliability.faults import FAULT_KINDS, FAULTS, next_fault, script
@@ -81,7 +82,7 @@ def test_every_kind_is_defined_in_a_sentence():
 
 
 def test_defaults_keep_robots_apart_and_fit_the_rates_of_the_file():
-    assert AVOIDANCE in defaults(load("robotic-park").experiment)
-    assert "rates.body_hz=50" in defaults(load("robotic-park").experiment)
+    assert AVOIDANCE in defaults(load("robotic-park").plan)
+    assert "rates.body_hz=50" in defaults(load("robotic-park").plan)
     avoiding = load("robotic-park", 'avoidance.kind="potential"', "rates.pose_hz=100").experiment
-    assert defaults(avoiding) == list(ALWAYS)
+    assert defaults(Plan(avoiding)) == list(ALWAYS)

@@ -78,7 +78,7 @@ def test_the_dead_are_named():
 
 
 def test_a_robot_that_landed_early_fails_a_soak_although_its_process_lives(tmp_path):
-    with Sampler(load("triangle").experiment, tmp_path, "event") as sampler:
+    with Sampler(load("triangle").plan, tmp_path, "event") as sampler:
         events = [
             ("hazard", "CF01", "hold: silent neighbour KH01"),
             ("hazard", "CF01", "land: battery low: 9 % (limit 10 %)"),

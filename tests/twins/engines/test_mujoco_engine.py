@@ -375,7 +375,7 @@ def test_drones_hunt_with_the_gain_of_wheels():
     from experiments.file import document  # noqa: PLC0415
     from experiments.virtual_time.simulation import simulate  # noqa: PLC0415
 
-    park = document.read("robotic-park").cases()["periodic"]
+    park = document.read("robotic-park").cases()["periodic"].experiment
     links = Plan(park).links
     error = {}
     for gain in (1.0, 3.0):
@@ -385,7 +385,7 @@ def test_drones_hunt_with_the_gain_of_wheels():
         }
         formation = msgspec.structs.replace(park.formation, links=formed)
         parts = {"formation": formation, "world": World(engine="mujoco"), "duration_s": 20.0, "timeline": []}
-        log = simulate(msgspec.structs.replace(park, **parts), (1,))
+        log = simulate(Plan(msgspec.structs.replace(park, **parts)), (1,))
         place = log.true_position[(log.time > 15.0) & (log.time < 20.0)]
         apart = np.linalg.norm(place[:, links.receiver] - place[:, links.sender], axis=2)
         error[gain] = np.abs(apart - links.distance).mean()

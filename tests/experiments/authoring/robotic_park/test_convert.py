@@ -39,7 +39,7 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
     if read.experiment.formation.update is not None:
         expected.add("not-acquired")  # what a chain of thresholds leaves
     assert {found.code for found in check(read) if found.severity != "note"} <= expected
-    assert figures(read.experiment).residual_mm < 1.0
+    assert figures(read.plan).residual_mm < 1.0
     for note in notes:  # each stands in the file as well
         assert note.split()[0] in read.text
 
@@ -48,7 +48,7 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
 @pytest.mark.parametrize("count", FILES)
 def test_converted_formations_settle(tmp_path, count):
     experiment = converted(tmp_path, FILES[count]())[0].experiment
-    log = simulation.simulate(experiment, 1)
+    log = simulation.simulate(Plan(experiment), 1)
     plan = Plan(experiment)
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
@@ -174,7 +174,7 @@ def test_the_origin_of_real_crazyflies_is_that_of_their_driver(tmp_path, archite
     assert anchors == [[0.0, 0.0, 0.8 if theirs else anchors[0][2]]] * 3
     hover = [each.hover for each in read.experiment.robots.values()]
     assert (hover == [0.7] * 3) == theirs
-    assert figures(read.experiment).residual_mm < 0.1
+    assert figures(read.plan).residual_mm < 0.1
     assert any("the origin: lifted" in note for note in notes) != theirs  # the central controller's is at 0
 
 
@@ -311,7 +311,7 @@ def test_pyramid_is_not_folded(tmp_path):
     experiment = converted(tmp_path, pyramid())[0].experiment
     hover = [each.hover for each in experiment.robots.values()]
     assert hover[4] > max(hover[:4]) + 0.7
-    predicted = figures(experiment)
+    predicted = figures(Plan(experiment))
     assert predicted.acquired_s is not None
     place = np.array(list(predicted.end.values()))
     apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)[np.triu_indices(5, 1)]
@@ -331,7 +331,7 @@ def test_a_flat_formation_stays_flat_whatever_the_origin_says(tmp_path):
     read, notes = converted(tmp_path, text)
     assert [each.hover for each in read.experiment.robots.values()] == [0.7] * 5
     assert not read.experiment.formation.anchors
-    assert figures(read.experiment).residual_mm < 0.2
+    assert figures(read.plan).residual_mm < 0.2
     assert not any("climb" in note for note in notes)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from agents.runtime import run_registry
 from experiments.definition.experiment import Formation, Host, Robot
+from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import check_other_runs, hardware
 from tests.agents.few import pair
@@ -31,7 +32,7 @@ def run(robots: dict[str, str], title: str = "here", born: str | None = None) ->
 
 def test_hardware_is_known_by_its_address_its_settings_and_its_host() -> None:
     away = msgspec.structs.replace(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
-    assert hardware([REAL, away]) == {
+    assert hardware([Plan(REAL), Plan(away)]) == {
         "CF01": RADIO,
         "TE01": "tello on lab2",
         "KH01": 'khepera4://10.0.0.7 {"port": 344}',

@@ -15,6 +15,7 @@ from agents.decision.lifecycle import Phase
 from agents.network import messages, pubsub
 from agents.network.keys import Keys
 from experiments.definition.experiment import Experiment, Robot
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import hot_changes
 from experiments.real_time.conductor.hot_changes import HotChanges
@@ -156,7 +157,7 @@ class Stage:
         for name in self.robots:
             self.appear(name)
             self.told(name, "start")
-        self.changes = HotChanges(experiment, self.crew, self.view, KEYS)  # type: ignore[arg-type]
+        self.changes = HotChanges(Plan(experiment), self.crew, self.view, KEYS)  # type: ignore[arg-type]
         self.changes.begin(START)
 
     def appear(self, name: str) -> None:

@@ -228,8 +228,8 @@ def test_a_battery_that_sags_under_load():
 
 def test_robots_are_checked_without_formation_and_low():
     read = document.load("robotic-park")
-    case = alone(next(iter(read.cases().values())))
-    plan = Plan(case)
+    plan = alone(next(iter(read.cases().values())))
+    case = plan.experiment
     assert len(plan.links) == 0
     assert {case.robots[leg.robot].kind for leg in case.timeline} == {"khepera4", "turtlebot3"}
     assert {robot.hover for robot in case.robots.values()} == {None, checks.HOP_M}
@@ -237,8 +237,8 @@ def test_robots_are_checked_without_formation_and_low():
 
 def test_a_tello_takes_off_to_its_own_height():
     robots = {"T1": Robot(kind="tello", start=[0.0, 0.0], hover=0.8), "CF01": OTHER}
-    case = alone(Experiment(title="", duration_s=1.0, robots=robots))
-    assert {name: robot.hover for name, robot in case.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
+    case = alone(Plan(Experiment(title="", duration_s=1.0, robots=robots)))
+    assert {name: robot.hover for name, robot in case.experiment.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
 
 
 def test_what_a_bridge_says_of_a_robot_that_answers_is_a_warning():

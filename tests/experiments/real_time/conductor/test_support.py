@@ -10,6 +10,7 @@ import pytest
 
 from agents.network.endpoints import Endpoint, free_endpoint
 from agents.runtime import run_registry
+from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import conduct
 from experiments.real_time.conductor.case_context import CaseContext
@@ -34,7 +35,9 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
     here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
     experiment = document.read("triangle").experiment
     hosts = Hosts(launcher, [everywhere])
-    servants = Servants(CaseContext(experiment, "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts))
+    servants = Servants(
+        CaseContext(Plan(experiment), "only", tmp_path, tmp_path / "case.toml", [here], launcher, hosts)
+    )
     dead = SimpleNamespace(name=ROUTER, exit="killed by SIGKILL")
     said = [servants.again(dead) for _ in range(STARTS)]
     assert [words[:2] for words in launcher.told] == [(ROUTER, "agents.runtime.router")] * (STARTS - 1)
@@ -77,7 +80,7 @@ def test_no_name_of_a_case_shares_a_file(tmp_path, word):
     hosts, experiment = Hosts(Starts(), []), document.read("triangle").experiment
     names = ["rights", "run", "metrics", "x", "x-joining", "x-changed", "cases"]
     files = [
-        CaseContext(experiment, name, tmp_path, tmp_path / "a.toml", [], Starts(), hosts).variant(word)
+        CaseContext(Plan(experiment), name, tmp_path, tmp_path / "a.toml", [], Starts(), hosts).variant(word)
         for name in names
     ]
     assert len(set(files)) == len(names)

@@ -5,6 +5,7 @@ import pytest
 from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
 from agents.ticks import Ticks
+from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
 from tests.agents.few import pair
@@ -33,7 +34,9 @@ def test_decisions_follow_start_and_skip_standstill(monkeypatch):
     over, decided = Over(12), []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
-        process = CentreProcess(experiment, Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive])))
+        process = CentreProcess(
+            Plan(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
+        )
         hz = experiment.rates.coordination_hz
         process._ticks = ticks = Ticks(hz, clock=lambda: over.now)
 
@@ -60,7 +63,9 @@ def test_long_wait_decides_for_no_past_instant(monkeypatch):
     over, decided, late = Over(12, more=0.73), [], []
     with Net().worn() as net:
         experiment = pair(architecture="centralised")
-        process = CentreProcess(experiment, Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive])))
+        process = CentreProcess(
+            Plan(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.centre_alive]))
+        )
         hz = experiment.rates.coordination_hz
         process._ticks = Ticks(hz, clock=lambda: over.now)
 

@@ -15,6 +15,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.network.name_ownership import NameTaken, OwnershipCheck
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from experiments.real_time.processes.centre import CentreProcess
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import WorldProcess
@@ -59,9 +60,9 @@ def test_replaced_process_sends_nothing(what, way, monkeypatch):
             drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
             experiment = pair(robots={"F": drone}, formation=Formation())
             lost = threading.Event()
-            process = WorldProcess(experiment, Population(experiment), joint, lost)
+            process = WorldProcess(Plan(experiment), Population(Plan(experiment)), joint, lost)
         else:
-            process = CentreProcess(pair(architecture="centralised"), joint)
+            process = CentreProcess(Plan(pair(architecture="centralised")), joint)
             goals = [CentreGoal(0, (0.0, 0.0, 0.0), 0.0, 0.0)]
             monkeypatch.setattr(process.centre, "decide", lambda *_: goals)
             process._goals[0] = Counted()

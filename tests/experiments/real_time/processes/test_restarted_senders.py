@@ -29,7 +29,9 @@ def test_world_obeys_sender_with_clock_behind():
     drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
+        world = Exchange(
+            Plan(experiment), Population(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
+        )
 
         def order(seq: int, action: str, **more: object) -> bool:
             """Whether it is carried out."""
@@ -53,7 +55,9 @@ def test_world_of_many_robots_knows_name_owners():
     drone = definition.Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F000": drone}, formation=Formation())
     with Net().worn() as net:
-        world = Exchange(experiment, Population(experiment), Network(net.session, KEYS, [], [], OwnershipCheck([])))
+        world = Exchange(
+            Plan(experiment), Population(Plan(experiment)), Network(net.session, KEYS, [], [], OwnershipCheck([]))
+        )
         for name in names:
             alive = KEYS.alive(name)
             for token in (alive, Keys.life(alive, "one"), Keys.claim(alive, Keys.rank(1.0, "one"))):

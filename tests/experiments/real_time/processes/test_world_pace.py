@@ -9,6 +9,7 @@ from agents.network.keys import Keys
 from agents.network.name_ownership import OwnershipCheck
 from agents.ticks import Ticks
 from experiments.definition.experiment import Formation, Robot
+from experiments.definition.plan import Plan
 from experiments.real_time.processes import world, world_network
 from experiments.real_time.processes.joining import Network
 from experiments.real_time.processes.world import SLIP_S, WorldProcess
@@ -33,9 +34,9 @@ def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven
     drone = Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5, body="world")
     experiment = pair(robots={"F": drone}, formation=Formation())
     with Net().worn() as net:
-        population = Population(experiment)
+        population = Population(Plan(experiment))
         joint = Network(net.session, KEYS, [], [], OwnershipCheck([KEYS.world_alive]))
-        process = WorldProcess(experiment, population, joint, threading.Event())
+        process = WorldProcess(Plan(experiment), population, joint, threading.Event())
         process._ticks = Ticks(HZ, catch_up=round(SLIP_S * HZ), clock=lambda: now[0])
         monkeypatch.setattr(process.exchange, "slept", lambda seconds, t: slept.append((seconds, t)))
         advance = population.advance

@@ -10,6 +10,7 @@ import pytest
 
 from agents.vectors import NO_SETPOINT
 from experiments.definition.experiment import Arena, Experiment, Robot, World
+from experiments.definition.plan import Plan
 from experiments.real_time.processes.world_population import Population, Refused
 from twins.scene import Obstacle
 
@@ -35,7 +36,7 @@ def experiment(**robots: Robot) -> Experiment:
 
 @pytest.fixture
 def world() -> Population:
-    return Population(experiment())
+    return Population(Plan(experiment()))
 
 
 def row(world: Population, name: str) -> int:
@@ -65,9 +66,11 @@ def test_world_carries_its_robots_and_mirrors_others(world: Population) -> None:
 
 def test_mirrored_robot_may_ask_for_ranges() -> None:
     world = Population(
-        experiment(
-            TB01=Robot(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
-            KH01=Robot(kind="khepera4", start=[0.0, 0.0]),
+        Plan(
+            experiment(
+                TB01=Robot(kind="turtlebot3", start=[1.0, 0.0], ranges="world"),
+                KH01=Robot(kind="khepera4", start=[0.0, 0.0]),
+            )
         )
     )
     assert world.carried == (False, False)
@@ -101,7 +104,7 @@ def test_reset_puts_back_and_leaves_in_the_air(world: Population) -> None:
 def test_reset_puts_back_pushed_obstacles() -> None:
     given = experiment(KH01=Robot(kind="khepera4", start=[-1.0, -1.0, math.pi], body="world"))
     arena = msgspec.structs.replace(given.arena, obstacles={"crate": msgspec.structs.replace(CRATE, mass=0.2)})
-    world = Population(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk")))
+    world = Population(Plan(msgspec.structs.replace(given, arena=arena, world=World(engine="pymunk"))))
     go(world, 400, KH01=(0.2, 0.0, 0.0, 0.0))
     assert world.obstacles()["crate"][0] < -1.55
     world.reset(None)
@@ -114,7 +117,7 @@ def test_nothing_is_put_back_into_an_obstacle() -> None:
     cart = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [0.0, 1.0], "speed": 0.5})
     given = experiment()
     world = Population(
-        msgspec.structs.replace(given, arena=msgspec.structs.replace(given.arena, obstacles={"cart": cart}))
+        Plan(msgspec.structs.replace(given, arena=msgspec.structs.replace(given.arena, obstacles={"cart": cart})))
     )
     world.begin(0.0)
     go(world, 300)
@@ -126,7 +129,7 @@ def test_planned_obstacles_move_from_the_start() -> None:
     belt = Obstacle(box=(0.2, 0.2), at=(0.0, -1.0), plan={"kind": "line", "move_by": [1.0, 0.0], "speed": 0.5})
     given = experiment()
     arena = msgspec.structs.replace(given.arena, obstacles={"belt": belt})
-    world = Population(msgspec.structs.replace(given, arena=arena))
+    world = Population(Plan(msgspec.structs.replace(given, arena=arena)))
     go(world, 100)
     assert world.obstacles()["belt"] == (0.0, -1.0, 0.0)
     world.begin(world.time + 0.5)
@@ -145,7 +148,7 @@ def test_contacts_have_names() -> None:
         KH03=Robot(kind="khepera4", start=[1.8, 0.0], body="world"),
         KH04=Robot(kind="khepera4", start=[1.5, 1.2, math.pi / 2], body="world"),
     )
-    world = Population(msgspec.structs.replace(given, world=World(engine="pymunk")))
+    world = Population(Plan(msgspec.structs.replace(given, world=World(engine="pymunk"))))
     found = []
     for _ in range(200):
         go(world, 1, **dict.fromkeys(world.names, (0.2, 0.0, 0.0, 0.0)))
@@ -159,10 +162,9 @@ def test_wheels_stop_with_a_watchdog_alone(world: Population) -> None:
     flying = row(world, "CF01")
     assert world.hold_s[flying] == 0.5
     assert world.hold_s[row(world, "KH01")] == np.inf
-    watched = msgspec.structs.replace(
-        world._experiment, world=msgspec.structs.replace(world._experiment.world, wheels_stop_s=0.7)
-    )
-    assert Population(watched).hold_s[row(world, "KH01")] == 0.7
+    watched = experiment()
+    watched = msgspec.structs.replace(watched, world=msgspec.structs.replace(watched.world, wheels_stop_s=0.7))
+    assert Population(Plan(watched)).hold_s[row(world, "KH01")] == 0.7
     go(world, 10, KH01=(0.2, 0.0, 0.0, 0.0))
     go(world, 300)
     assert at(world, "KH01")[0] > 0.5, "it drives on, as the real one"
