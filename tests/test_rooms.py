@@ -55,7 +55,8 @@ tools.bench
 tools.main
 tools.guard
 """
-EXTRAS = ("agents.plugins.gallery.mpc",)  # laws whose solvers take arrays: they import numpy with them, at first use
+# laws whose libraries take arrays: they import numpy with them, at first use
+EXTRAS = ("agents.plugins.gallery.mpc", "agents.plugins.extras.policy")
 FLOORS = [line.split() for line in ORDER.strip().splitlines()]
 
 

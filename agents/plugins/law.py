@@ -136,6 +136,7 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ALONE: ClassVar[bool] = False  # moves a robot without neighbours, which else stays in place
     PREDICTION: ClassVar[str] = "hold"  # default of an experiment that names none
     LIBRARY: ClassVar[str] = ""  # distribution that it needs beside zenpark: its version decides on results, too
+    FILES: ClassVar[Mapping[str, str]] = {}  # parameters that name a file, and those that get its content, in base64
 
     def begin(self, robot: RobotFacts) -> Memory:
         """Variables at the start, each with as many numbers as it ever has."""

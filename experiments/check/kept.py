@@ -91,10 +91,16 @@ class KeptVerdict:
             return None
 
     def _read_texts(self) -> list[tuple[str, str]] | None:
-        """Name and digest of the experiment file and of all that may be its arena file; None if one cannot be read."""
+        """Name and digest of the experiment file, of what may be its arena file, and of what it names beside it.
+
+        None if one cannot be read.
+        """
         try:
-            beside = [each for each in self._file.parent.iterdir() if each.suffix.lower() == ".toml"]
-            files = [self._file, *sorted(beside), *sorted(index.FOLDER.glob("*.toml"))]
+            named = self._file.read_bytes() + repr(self._asked).encode()
+            files = [self._file]
+            for folder in (self._file.parent, index.FOLDER):
+                inside = sorted(folder.iterdir())
+                files += [each for each in inside if each.suffix.lower() == ".toml" or each.name.encode() in named]
             if len(files) > MOST or any(each.stat().st_size > LARGEST for each in files):
                 return None
             return [(str(each), _digest(each)) for each in files if each == self._file or each.is_file()]

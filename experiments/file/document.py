@@ -6,6 +6,7 @@ for name, plan in document.cases().items(): ...
 
 from __future__ import annotations
 
+from base64 import b64decode
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file import arena_file, catalogue, consistency, structure
 from experiments.file.arena_file import ArenaFile
-from experiments.file.overrides import Override, assign, fill_from_shape, merged, parse
+from experiments.file.overrides import Override, assign, fill_from_files, fill_from_shape, law_files, merged, parse
 from experiments.file.problems import DocumentError, Fault, Problem, Text, nearest, refusal
 from experiments.file.problems import Path as Keys
 from experiments.file.text import content, decoded, parsed
@@ -64,7 +65,12 @@ class Document:
         return dict(self.resolved)
 
     def keep(self, file: Path) -> None:
-        """Writes the text to a file, and the arena files and files of plug-ins that it names beside it."""
+        """Writes the text to a file, and beside it the arena files and files of plug-ins and laws that it names."""
+        for plan in self.resolved.values():
+            law = plan.experiment.formation.law
+            for parameter, model in law_files(law).items():
+                if isinstance(law, dict) and law.get(parameter):
+                    (file.parent / law[parameter]).write_bytes(b64decode(law[model]))
         file.write_text(self.text, encoding="utf-8")
         for each in self.arenas.values():
             (file.parent / each.name).write_text(each.text, encoding="utf-8")
@@ -133,7 +139,10 @@ def _document(file: Path, label: str, text: str, flags: Sequence[str], *, is_jso
             for key in _OF_THE_FILE
             if key in table
         ]
-        shapes = {name: [*fill_from_shape(each), *structure.faults(each)] for name, each in documents.items()}
+        shapes = {
+            name: [*fill_from_shape(each), *fill_from_files(each, file.parent), *structure.faults(each)]
+            for name, each in documents.items()
+        }
         source.refuse([*nested, *_each_once(shapes, tables)])
         plans = {name: Plan(msgspec.convert(each, Experiment)) for name, each in documents.items()}
         found = {name: list(consistency.faults(plan)) for name, plan in plans.items()}
@@ -338,7 +347,12 @@ def case_document(plan: Plan, case: str = UNNAMED) -> bytes:
     """
     arena = msgspec.structs.replace(plan.experiment.arena, file=None)  # what stood there is in it
     cases: dict[str, dict[str, Any]] = {} if case == UNNAMED else {case: {}}
-    return msgspec.json.encode(plan.changed(arena=arena, hosts={}, criteria=[], cases=cases).experiment)
+    formation, law = plan.experiment.formation, plan.experiment.formation.law
+    if isinstance(law, dict):  # likewise
+        law = {key: value for key, value in law.items() if key not in law_files(law)}
+        formation = msgspec.structs.replace(formation, law=law)
+    bare = plan.changed(arena=arena, formation=formation, hosts={}, criteria=[], cases=cases)
+    return msgspec.json.encode(bare.experiment)
 
 
 def chosen_case(read: Document, name: str | None) -> Plan:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import pathlib
 import re
 import tomllib
+from base64 import b64encode
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from typing import Any, Final, cast
 from agents.plugins import registry
 from agents.plugins.law import Law, Need
 from agents.plugins.registry import did_you_mean
+from experiments.catalogue import index
 from experiments.definition.experiment import Experiment
 from experiments.definition.links import TARGET_KINDS, link_pairs, pairs_or_none
 from experiments.file.problems import DocumentError, Fault, Path, refusal
@@ -25,6 +28,7 @@ _SHAPES: Final = frozenset({"box", "radius", "wall"})
 SHAPE: Final = "shape"  # a link with its target from [formation.shape]
 ALONE: Final = "link"  # a link without a target
 _TARGETS: Final = frozenset({"distance", "offset", "bearing"})
+LARGEST_FILE: Final = 1_000_000  # bytes that a law reads from a file
 _DEFAULTS: Final = Experiment(title="", robots={}, duration_s=1.0)
 
 
@@ -165,6 +169,49 @@ def fill_from_shape(document: dict[str, Any]) -> list[Fault]:
                 except _NoPlace as error:
                     faults.append(Fault(("formation", "changes", number, "shape"), *error.args))
     return faults
+
+
+def fill_from_files(document: dict[str, Any], folder: pathlib.Path) -> list[Fault]:
+    """Gives the law, in place, the content of the files that it names, which are in `folder` or the catalogue.
+
+    Without such a file it keeps the content that it has: the experiment comes from where the file was.
+    """
+    formation, faults = document.get("formation"), list[Fault]()
+    law = formation.get("law") if isinstance(formation, dict) else None
+    if not isinstance(formation, dict) or not isinstance(law, dict):
+        return []
+    formation["law"] = law = dict(law)
+    for parameter, content in law_files(law).items():
+        path, name = ("formation", "law", parameter), law.get(parameter)
+        if not isinstance(name, str) or not name:
+            continue
+        if "\0" in name or pathlib.Path(name).name != name:
+            hint = "put it beside the experiment file, and give its name alone"
+            faults.append(Fault(path, f"{name!r} is no name of a file", hint))
+            continue
+        file = next((each for each in (folder / name, index.FOLDER / name) if each.is_file()), folder / name)
+        try:
+            with file.open("rb") as stream:
+                found = stream.read(LARGEST_FILE + 1)
+        except OSError as error:
+            if content not in law:
+                hint = "put it beside the experiment file"
+                faults.append(Fault(path, f"{file} cannot be read: {error.strerror or error}", hint))
+            continue
+        if len(found) > LARGEST_FILE:
+            message = f"{name} is longer than {LARGEST_FILE // 1_000_000} MB"
+            faults.append(Fault(path, message, "take a smaller one: it goes with the experiment to every robot"))
+        law[content] = b64encode(found[:LARGEST_FILE]).decode()
+    return faults
+
+
+def law_files(law: object) -> Mapping[str, str]:
+    """Parameters of a law that name files, and those that get their content; none of a law that cannot be used."""
+    name = law.get("kind") if isinstance(law, Mapping) else law
+    try:
+        return cast(type[Law], struct_of(registry.LAWS, name)).FILES if isinstance(name, str) else {}
+    except registry.PluginError:  # said with its place where the law is read
+        return {}
 
 
 class _NoPlace(ValueError):

@@ -25,7 +25,7 @@ PACKAGES: Final = ("agents", "bridges", "twins", "experiments", "tools")
 SHOWN: Final = 8  # characters of a digest that people compare
 # of these the version may change what a run comes to, or what is said on a wire; those not installed are left out
 LIBRARIES: Final = (
-    *("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp"),
+    *("numpy", "eclipse-zenoh", "msgspec", "mcap", "pymunk", "mujoco", "mujoco-core", "daqp", "onnxruntime"),
     *("cflib", "djitellopy", "rosbags"),
 )
 GIT_S: Final = 5.0

@@ -30,9 +30,9 @@ class Tracking(Law, frozen=True):
     delay and never bias (R. Olfati-Saber, "Kalman-consensus filter: optimality, stability, and performance", CDC 2009;
     F. Govaers, "Distributed Kalman filter", in *Kalman Filters: Theory for Advanced Applications*, 2018).
 
-    Readings are emulated: the distance or direction, seen from above, of the place that the target sends, with normal
-    noise. A hash of robot, time and that place draws it: other noise in each run, as motion capture's noise is in the
-    place, and the same in a repetition. The filter gets nothing else of the target.
+    Readings are emulated: the distance or direction, seen from above, of the place that the target sends, with a normal
+    error. A hash of robot, time and that place draws it: another in each run, as motion capture never gives a place
+    twice, and the same in a repetition. The filter gets nothing else of the target.
     """
 
     PREDICTION: ClassVar[str] = "constant-velocity"
@@ -95,15 +95,15 @@ class Tracking(Law, frozen=True):
         """A reading of the target, NaN without one, and its information where the target is believed at x."""
         for target in view.neighbours:
             if target.name == self.target:
-                noise = Random(repr((view.robot.number, view.time, target.position))).gauss(0.0, self.sigma)
+                error = Random(repr((view.robot.number, view.time, target.position))).gauss(0.0, self.sigma)
                 east, north = x[0] - view.position[0], x[1] - view.position[1]
                 there = target.position[0] - view.position[0], target.position[1] - view.position[1]
                 far = max(hypot(east, north), 0.1)  # nearer, the slope of a direction means nothing
                 if self.sees == "distance":
-                    value, g = hypot(*there) + noise, (east / far, north / far, 0.0, 0.0)
+                    value, g = hypot(*there) + error, (east / far, north / far, 0.0, 0.0)
                     change = value - hypot(east, north)
                 else:
-                    value, g = atan2(there[1], there[0]) + noise, (-north / far**2, east / far**2, 0.0, 0.0)
+                    value, g = atan2(there[1], there[0]) + error, (-north / far**2, east / far**2, 0.0, 0.0)
                     change = remainder(value - atan2(north, east), 2.0 * pi)
                 pull = change + g[0] * x[0] + g[1] * x[1]
                 return value, (tuple(each * pull for each in g), [[k * m for m in g] for k in g])

@@ -16,7 +16,9 @@ from agents.plugins.laws import Gradient
 from agents.plugins.planners import Leg
 from agents.plugins.registry import AVOIDANCES, LAWS, PLANNERS, PREDICTORS, TRIGGERS
 from agents.vectors import UNKNOWN
+from experiments.catalogue import index
 from experiments.definition.plan import Plan
+from experiments.file import document
 from tests.agents.bench import Bench
 from tests.agents.few import triangle
 from tests.agents.things import near, own
@@ -37,6 +39,10 @@ SAMPLES = {float: 0.3, int: 1, bool: False, str: "a", list: [[0.3, 0.2], [-0.2, 
 def made(group, name):
     """A plug-in with its defaults; numbers and places stand for parameters without one."""
     kind = registry.struct(group, name)
+    if group == LAWS and kind.LIBRARY:
+        pytest.importorskip(kind.LIBRARY, reason=f"the law {name} needs {kind.LIBRARY}")
+    if group == LAWS and kind.FILES and name in index.names():
+        return document.read(index.find_file(name), []).plan.law
     for sample in ({}, SAMPLES[float], [0.3, 0.2], SAMPLES[list]):
         for other in (SAMPLES[float], [0.3, 0.2], SAMPLES[list]):
             needed = [field.encode_name for field in msgspec.structs.fields(kind) if field.required]

@@ -32,7 +32,8 @@ def park(tmp_path, monkeypatch):
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "hall.toml").write_text("[arena]\nsize = [4.0, 4.0, 2.5]\n")
     file = tmp_path / "lab" / "park.toml"
-    file.write_text('title = "A park"\n')
+    (tmp_path / "lab" / "mine.onnx").write_bytes(b"one")
+    file.write_text('title = "A park"\nformation.law = { kind = "policy", file = "mine.onnx" }\n')
     return file
 
 
@@ -53,6 +54,7 @@ CHANGES = {
     "experiment file": appended("lab", "park.toml"),
     "arena file": appended("lab", "hall.toml"),
     "arena file that hides one of the catalogue": appended("lab", "gate.arena.toml"),
+    "file of a law": lambda park: (park.parent / "mine.onnx").write_bytes(b"two"),
     "code of a plug-in": appended("site", "mine", "__init__.py"),
     "new body in a plug-in": appended("site", "mine", "body.py"),
     "version of a plug-in": renamed,
@@ -148,10 +150,10 @@ def test_what_is_no_file_has_no_verdict(park, name):
 
 
 def test_old_verdicts_go(park, monkeypatch):
-    monkeypatch.setattr(kept, "MOST", 20)
-    for seed in range(25):
+    monkeypatch.setattr(kept, "MOST", 40)
+    for seed in range(45):
         KeptVerdict(str(park), [f"seed={seed}"]).keep(SAID)
-    assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 20
+    assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 40
     assert KeptVerdict(str(park), ["seed=24"]).read() == SAID
 
 

@@ -1,0 +1,144 @@
+"""A learned policy acts in flight as it does offline, and is refused where it does not fit."""
+
+import sys
+from base64 import b64decode
+
+import numpy as np
+import pytest
+
+from agents.decision.stepping import Stepping
+from agents.formation.link import Link
+from agents.plugins.extras import policy
+from agents.plugins.extras.policy import Policy
+from agents.plugins.law import NeighbourView, RobotFacts, View
+from agents.plugins.registry import PluginError
+from agents.vectors import UNKNOWN, ZERO
+from experiments.catalogue import index
+from experiments.file import document
+from experiments.file.document import DocumentError
+from experiments.virtual_time.log import Logbook
+from experiments.virtual_time.simulation import simulate
+
+pytest.importorskip("onnxruntime", reason="the law policy is the extra [policy]: ./zenpark install onnxruntime")
+onnx = pytest.importorskip("onnx", reason="policies are written with onnx")
+
+SHAPE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+
+
+def offline(observations):
+    """Actions (K, 2) of the catalogue's policy for observations (K, 16), by its weights, with numpy alone."""
+    graph = onnx.load(index.FOLDER / "policy.onnx").graph
+    w1, b1, w2, b2, w3, b3 = (onnx.numpy_helper.to_array(each).astype(float) for each in graph.initializer)
+    return np.tanh(np.tanh(observations @ w1 + b1) @ w2 + b2) @ w3 + b3
+
+
+@pytest.mark.parametrize(("case", "most"), [("periodic", 0.03), ("event", 0.04), ("event-loss", 0.04)])
+def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
+    seen, acted, step = [], [], Policy.step
+
+    def watched(self, view, memory):
+        control = step(self, view, memory)
+        seen.append(policy.observe(view, 3))
+        acted.append(control.velocity[:2])
+        return control
+
+    monkeypatch.setattr(Policy, "step", watched)
+    plan = document.read(index.find_file("policy"), []).cases()[case]
+    known = Logbook(simulate(plan, plan.experiment.seed), plan, case).trace()
+    assert len(acted) > 4 * 190
+    assert np.array(acted) == pytest.approx(offline(np.array(seen)), abs=1e-6)
+    place = known.true_position[..., :2] - SHAPE
+    apart = np.linalg.norm(place - place.mean(axis=1, keepdims=True), axis=2)
+    assert apart[0].max() > 0.5
+    assert apart[-1].max() < most
+
+
+def test_observations():
+    facts = RobotFacts("B", 1, 3, flies=False, speed=0.2, step_s=0.1)
+    near = NeighbourView(0, "A", (1.0, 2.0, 0.0), ZERO, 0.0, 0.0, {}, Link(relative=(0.5, -0.5, 0.0)))
+    bare = NeighbourView(2, "C", (0.0, 0.5, 0.0), ZERO, 0.0, 0.0, {}, Link(relative=UNKNOWN))
+    view = View(facts, {}, [near, bare])
+    view.position, view.velocity = (0.2, 0.1, 0.0), UNKNOWN
+    expected = [0.2, 0.1, 0, 0, 0.8, 1.9, -0.5, 0.5, -0.2, 0.4, 0, 0]
+    assert policy.observe(view, 2) == pytest.approx(expected)
+    assert policy.observe(view, 3) == pytest.approx([*expected, 0, 0, 0, 0])
+    assert policy.observe(view, 1) == pytest.approx(expected[:8])
+
+
+def model(folder, inputs, outputs, kind=1):
+    """File of a policy that is a matrix of zeros."""
+    helper = onnx.helper
+    zeros = onnx.numpy_helper.from_array(np.zeros((inputs, outputs), dtype={1: np.float32, 11: float}[kind]), "w")
+    graph = helper.make_graph(
+        [helper.make_node("MatMul", ["o", "w"], ["v"])],
+        "zero",
+        [helper.make_tensor_value_info("o", kind, [1, inputs])],
+        [helper.make_tensor_value_info("v", kind, [1, outputs])],
+        [zeros],
+    )
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    (folder / "own.onnx").write_bytes(made.SerializeToString())
+
+
+def own(folder, name="own.onnx"):
+    """Experiment with a policy that is beside it."""
+    text = index.find_file("policy").read_text("utf-8").replace("policy.onnx", name)
+    (folder / "own.toml").write_text(text, "utf-8")
+    return document.read(folder / "own.toml", [])
+
+
+def begin(given):
+    return Stepping(given.cases()["periodic"].assignment("CF01"))
+
+
+@pytest.mark.parametrize(("inputs", "outputs", "kind"), [(15, 2, 1), (16, 3, 1), (16, 2, 11), (3, 2, 1)])
+def test_a_model_of_other_sizes_is_refused(tmp_path, inputs, outputs, kind):
+    model(tmp_path, inputs, outputs, kind)
+    with pytest.raises(PluginError, match="one float input of 4 \\+ 4n numbers"):
+        begin(own(tmp_path))
+
+
+def test_what_is_no_model_is_refused(tmp_path):
+    (tmp_path / "own.onnx").write_bytes(b"nothing")
+    with pytest.raises(PluginError, match="cannot use its file"):
+        begin(own(tmp_path))
+    with pytest.raises(PluginError, match="give `file`"):
+        policy.load("")
+
+
+def test_a_file_that_is_not_there_is_a_fault_of_its_line(tmp_path):
+    with pytest.raises(DocumentError, match=r"own\.onnx cannot be read"):
+        own(tmp_path)
+    with pytest.raises(DocumentError, match="is no name of a file"):
+        own(tmp_path, "../own.onnx")
+    (tmp_path / "own.onnx").write_bytes(bytes(1_000_001))
+    with pytest.raises(DocumentError, match="is longer than 1 MB"):
+        own(tmp_path)
+
+
+def test_a_model_goes_with_the_experiment(tmp_path):
+    model(tmp_path, 8, 2)
+    given = own(tmp_path)
+    law = given.cases()["event"].experiment.formation.law
+    assert b64decode(law["model"]) == (tmp_path / "own.onnx").read_bytes()
+    (tmp_path / "run").mkdir()
+    given.keep(tmp_path / "run" / "experiment.toml")
+    assert document.read(tmp_path / "run" / "experiment.toml", []).experiment == given.experiment
+    (tmp_path / "own.onnx").unlink()
+    (tmp_path / "own.json").write_bytes(document.write_json(given.plan))
+    assert document.read(tmp_path / "own.json", []).experiment.formation.law == law
+    sent = document.received(document.case_document(given.cases()["event"], "event").decode(), "pipe")
+    assert sent.experiment.formation.law == {"kind": "policy", "model": law["model"]}
+
+
+def test_more_neighbours_than_places_are_a_warning(tmp_path):
+    model(tmp_path, 8, 2)
+    plan = own(tmp_path).cases()["periodic"]
+    severity, message, _ = next(iter(plan.law.analyse(plan)))
+    assert (severity, message.partition(",")[0]) == ("warning", "CF01 has 3 neighbours")
+
+
+def test_without_the_library_the_error_names_the_remedy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(PluginError, match=r"\./zenpark install onnxruntime"):
+        policy.load("not cached")
