@@ -34,6 +34,7 @@ from agents.safety.setpoint_filter import SetpointFilter
 from agents.vectors import NO_SETPOINT, UNKNOWN, ZERO, Pose, Setpoint, Vector, is_finite
 
 CENTRE: Final = "centre"  # missing neighbour of a guided robot without guidance
+OLD_VELOCITY: Final = 3.0  # decisions after which a velocity of the central controller counts no more
 HALT: Final[Setpoint] = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -85,7 +86,7 @@ class Robot:
         self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration)
         stepping = self._stepping = self.goals.stepping
         self._follower = None if stepping is None else VelocityFollower(kind, assignment.ground)
-        speech = None if stepping is None else stepping.speech
+        speech = None if stepping is None or assignment.guided else stepping.speech
         self.transmitter = Transmitter(assignment.trigger, assignment.predictor, kind, speech)
         self.hazards, self.landing = Hazards(kind, limits), Landing(assignment)
         self._detector, self._preflight, self._status = Detector(assignment), Preflight(assignment), Status()
@@ -186,13 +187,13 @@ class Robot:
     @property
     def words(self) -> Words:
         """What is said beside the transmitted pose: variables by name."""
-        speech = None if self._stepping is None else self._stepping.speech
+        speech = None if self.stepping is None else self.stepping.speech
         return () if speech is None else speech.words
 
     @property
     def stepping(self) -> Stepping | None:
-        """The law at work, if it is no gradient."""
-        return self._stepping
+        """The law at work, if it is no gradient; that of a guided robot is at work in its central controller."""
+        return self._stepping if self.guidance is None else None
 
     def missing_neighbours(self) -> list[str]:
         """Neighbours that the robot has never received, or that are lost; likewise its central controller."""
@@ -300,10 +301,14 @@ class Robot:
         if stepping.speech is not None and (running or joins) and not now.invalid and self.guidance is None:
             self.goals.step(t, now.position, now.velocity, now.yaw, start)
 
-    def _renew_goal(self, stepping: Stepping) -> None:
-        """A law gives a velocity: the goal moves on with it on every tick."""
-        follower, velocity, now = self._follower, stepping.velocity, self.now
-        moves = self.lifecycle.phase == RUNNING and not self.keeping.held and self.goals.follows and self.decisions > 0
+    def _renew_goal(self, t: float, stepping: Stepping) -> None:
+        """A law gives a velocity, here or at the central controller: the goal moves on with it on every tick."""
+        follower, velocity, now, guidance = self._follower, stepping.velocity, self.now, self.guidance
+        follows = self.goals.follows and self.decisions > 0
+        if guidance is not None:  # one whose goals do not come any more stands, long before it counts as unguided
+            velocity = guidance.velocity
+            follows = isfinite(velocity[0]) and t - guidance.stamp <= OLD_VELOCITY * self._decide_every * self._dt
+        moves = self.lifecycle.phase == RUNNING and not self.keeping.held and follows
         if follower is None or velocity is None or not moves:
             if follower is not None:
                 follower.reference = UNKNOWN
@@ -372,7 +377,7 @@ class Robot:
         if self.guidance is not None:
             self._follow(self.guidance)
         if self._stepping is not None:
-            self._renew_goal(self._stepping)
+            self._renew_goal(t, self._stepping)
         goal = landing.place if landing.aside else self.goal
         self.avoided = False
         if self._perception is not None:

@@ -1,18 +1,21 @@
 """Centralised control: goals for many robots from the poses that they transmit. Pure.
 
 `Centre` uses `agents.decision.goals` as each robot would for itself, with one difference: it knows a robot only by
-its last received pose, extrapolated by the prediction.
+its last received pose, extrapolated by the prediction. What a law says goes from one robot to the next without a
+network, as it was at the last decision.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import inf, isfinite, nan
 from typing import Final, NamedTuple
 
 from agents.decision.assignment import Assignment
 from agents.decision.goals import GoalComputer, StationKeeping
 from agents.decision.lifecycle import AIRBORNE, RUNNING
+from agents.decision.neighbours import NO_WORDS
+from agents.plugins.law import Values
 from agents.vectors import UNKNOWN, ZERO, Pose, Vector, is_finite
 
 ROUNDING_S: Final = 1e-6  # instants of decisions are multiples of a period that binary fractions miss by less than this
@@ -25,17 +28,20 @@ class CentreGoal(NamedTuple):
     goal: Vector  # [m]
     yaw: float  # wanted at the goal [rad], NaN for any
     pose_stamp: float  # time of the pose from which the goal was computed [s]
+    velocity: Vector = UNKNOWN  # of a law that gives velocities [m/s]; its third NaN: the height is held
 
 
 class Followed:
     """A robot as the central controller knows it."""
 
     __slots__ = (
-        "computer", "goal", "goal_yaw", "guided", "keeping", "lost_since", "needed", "pose_stamp", "position",
-        "receivers", "sent_at", "stamp", "updates", "velocity", "yaw",
+        "computer", "goal", "goal_yaw", "guided", "held", "keeping", "lost_since", "needed", "pose_stamp", "position",
+        "receivers", "sent_at", "stamp", "updates", "velocity", "words", "yaw",
     )  # fmt: skip
 
     guided: bool  # gets goals
+    held: bool  # by its safety, as far as known; set by the caller
+    words: Mapping[str, Values]  # variables that its law says, as they were at the last decision
     needed: bool  # its poses are needed
     computer: GoalComputer  # of its goals
     receivers: list[tuple[GoalComputer, int]]  # guided robots that receive its poses, and by which link
@@ -53,7 +59,7 @@ class Followed:
     def __init__(self, assignment: Assignment) -> None:
         self.guided = self.needed = assignment.guided
         self.computer, self.keeping = GoalComputer(assignment), StationKeeping(assignment.ground)
-        self.receivers = []
+        self.receivers, self.held, self.words = [], False, NO_WORDS
         self.position, self.velocity, self.yaw, self.stamp, self.lost_since = UNKNOWN, ZERO, 0.0, -inf, -inf
         self.goal, self.goal_yaw, self.pose_stamp, self.sent_at, self.updates = UNKNOWN, nan, -inf, -inf, 0
 
@@ -86,7 +92,7 @@ class Centre:
             return
         robot.position, robot.velocity, robot.yaw, robot.stamp = position, velocity, yaw, stamp
         for computer, link in robot.receivers:
-            computer.neighbours.receive(link, position, velocity, stamp, arrival)
+            computer.neighbours.receive(link, position, velocity, stamp, arrival, yaw, robot.words)
 
     def begin_plan(self, row: int, origin: Pose) -> None:
         """Begin the plan of a robot that began at `origin`, x, y, z [m] and yaw [rad], before this controller."""
@@ -141,23 +147,50 @@ class Centre:
             if (goal := self._goal_of(row, t, start[row], runs=runs, waits=waits)) is not None:
                 found.append(goal)
         self.decisions += any_runs
+        self._exchange_words()
         return found
+
+    def _exchange_words(self) -> None:
+        """After all have decided, what each law says becomes known to the others."""
+        for robot in self.robots:
+            stepping = robot.computer.stepping
+            if robot.guided and stepping is not None and stepping.speech is not None:
+                stepping.speech.record()
+                robot.words = dict(stepping.speech.words)
+                for computer, link in robot.receivers:
+                    computer.neighbours.all[link].said = robot.words
+
+    def _step(self, row: int, t: float, position: Vector, start: float) -> None:
+        """Prepare the step of a law that remembers; one that says something steps here, as on a robot."""
+        robot, assignment = self.robots[row], self.assignments[row]
+        stepping = robot.computer.stepping
+        if stepping is None:
+            return
+        stepping.moves = not (robot.held or robot.computer.without_neighbours())
+        stepping.tick = round((t - start) * assignment.body_hz)
+        if stepping.speech is not None:
+            robot.computer.step(t, position, robot.velocity, robot.yaw, start)
 
     def _goal_of(self, row: int, t: float, start: float, *, runs: bool, waits: bool) -> CentreGoal | None:
         robot, assignment = self.robots[row], self.assignments[row]
-        computer, new = robot.computer, False
+        computer, new, velocity = robot.computer, False, UNKNOWN
         position = UNKNOWN
         if isfinite(robot.stamp):
             position = assignment.predictor.position(robot, t - robot.stamp)
         if runs:
+            self._step(row, t, position, start)
             new = computer.decide(t, position, robot.velocity, robot.yaw, start)
             if new:
                 robot.goal, robot.goal_yaw = computer.goal, computer.yaw
                 robot.updates += 1
+            if computer.stepping is not None:
+                if not computer.stepping.sound:
+                    return None  # without goals it holds
+                velocity = (computer.follows and computer.stepping.velocity) or UNKNOWN
         held = (runs and computer.without_neighbours()) or waits
         robot.keeping.hold(held, position)
         if held:
-            robot.goal, robot.goal_yaw = robot.keeping.at, nan
+            robot.goal, robot.goal_yaw, velocity = robot.keeping.at, nan, UNKNOWN
         if new or held:
             robot.pose_stamp = robot.stamp
         if held or not runs:
@@ -166,7 +199,7 @@ class Centre:
         if not ((new or held or again) and is_finite(robot.goal)):
             return None
         robot.sent_at = t
-        return CentreGoal(row, robot.goal, robot.goal_yaw, robot.pose_stamp)
+        return CentreGoal(row, robot.goal, robot.goal_yaw, robot.pose_stamp, velocity)
 
     def _complete(self, row: int, t: float) -> bool:
         """Whether a robot has a pose of each neighbour, or its patience is over."""
@@ -177,10 +210,11 @@ class Centre:
 class Guidance:
     """Goal received from the central controller, its age, and liveliness of the controller."""
 
-    __slots__ = ("_flies", "_silence_s", "fresh", "goal", "goal_yaw", "lost_since", "stamp")
+    __slots__ = ("_flies", "_silence_s", "fresh", "goal", "goal_yaw", "lost_since", "stamp", "velocity")
 
     goal: Vector  # last received [m]
     goal_yaw: float  # wanted there [rad], NaN for any
+    velocity: Vector  # wanted [m/s], its third NaN: the height is held; NaN: the robot goes to the goal
     stamp: float  # time of its decision [s]; minus infinity before the first
     fresh: bool  # not used yet
     lost_since: float  # loss of the controller [s]; infinity while it is alive
@@ -189,13 +223,14 @@ class Guidance:
         """Start without a goal; on wheels it is on the floor, and none is older than `silence_s` [s]."""
         self._flies, self._silence_s = flies, silence_s
         self.goal, self.goal_yaw, self.stamp, self.fresh, self.lost_since = UNKNOWN, nan, -inf, False, inf
+        self.velocity = UNKNOWN
 
-    def receive(self, goal: Vector, yaw: float, stamp: float) -> bool:
+    def receive(self, goal: Vector, yaw: float, stamp: float, velocity: Vector = UNKNOWN) -> bool:
         """Store a goal that was decided at `stamp` [s]; returns whether it was new."""
         if not (stamp > self.stamp and is_finite(goal)):
             return False
         self.goal = goal if self._flies else (goal[0], goal[1], 0.0)
-        self.goal_yaw, self.stamp, self.fresh = yaw, stamp, True
+        self.goal_yaw, self.stamp, self.fresh, self.velocity = yaw, stamp, True, velocity
         if stamp > self.lost_since:  # decided after the loss: another controller
             self.lost_since = inf
         return True

@@ -8,7 +8,7 @@ messages: JSON has no NaN.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import inf, isfinite, remainder, tau
 from typing import ClassVar, Final, Literal, TypeVar
@@ -192,7 +192,7 @@ class Position(Message, frozen=True, omit_defaults=True):
     yaw: float | None = None  # [rad]
 
 
-class Goal(Message, frozen=True):
+class BareGoal(Message, frozen=True):
     """Goal for a robot that does not decide for itself."""
 
     robot: str
@@ -202,6 +202,13 @@ class Goal(Message, frozen=True):
     position: Vector  # [m]
     yaw: float | None  # [rad]
     pose: float  # [s] UTC of the measurement of the robot's pose from which the goal was computed
+
+
+class Goal(BareGoal, frozen=True, omit_defaults=True):
+    """Goal for a robot that does not decide for itself; of a law that gives velocities, with one."""
+
+    # x, y [m/s] and, unless the height is held, z; left out: the robot goes to the position, which it else stands at
+    velocity: list[float] | None = None
 
 
 class CentreState(Message, frozen=True):
@@ -438,6 +445,20 @@ def pose(  # noqa: PLR0917 - the fields of a pose
 def variables(values: Iterable[tuple[str, Sequence[float]]]) -> list[Variable]:
     """Variables to send, by name; those that are not finite are left out."""
     return [Variable(name, list(value)) for name, value in values if all(map(isfinite, value))]
+
+
+def memory(
+    robot: str, seq: int, stamp: float, variables_: Mapping[str, Sequence[float]], measures: Mapping[str, float]
+) -> Memory:
+    """What a law remembers and measures, to send."""
+    numbers = ((name, (value,)) for name, value in measures.items())
+    return Memory(robot, seq, stamp, variables(variables_.items()), variables(numbers))
+
+
+def wanted(velocity: Sequence[float]) -> list[float] | None:
+    """Velocity of a goal to send, rounded as in poses; None without one."""
+    known = [round(each, 6) for each in velocity if isfinite(each)]
+    return known if len(known) > 1 else None
 
 
 def position(robot: str, stamp: float, place: Sequence[float], yaw: float) -> Position:

@@ -68,6 +68,10 @@ def check_goal(goal: Goal, *, now: float, reach: Vector, oldest_s: float) -> Non
     if not 0.0 < goal.pose <= goal.stamp + FUTURE_S:  # the robot's clock may be ahead
         raise Malformed(f"a goal of {goal.stamp} cannot rest on a pose of {goal.pose}")
     _refuse_place(goal.position, reach)
+    if goal.velocity is not None and not (
+        2 <= len(goal.velocity) <= 3 and all(abs(each) <= MAX_SPEED for each in goal.velocity)
+    ):
+        raise Malformed(f"velocity {goal.velocity} is impossible")
     if goal.yaw is not None and not abs(goal.yaw) <= MAX_YAW:
         raise Malformed(f"yaw {goal.yaw} is impossible")
 

@@ -68,7 +68,8 @@ class GoalInbox:
         for row, _, (goal, stamp) in self._channel.due(t):
             guidance = self._robots[row].guidance
             yaw = nan if goal.yaw is None else goal.yaw
-            if guidance is not None and guidance.receive(goal.position, yaw, stamp):
+            x, y, z = (*(goal.velocity or (nan, nan)), nan)[:3]
+            if guidance is not None and guidance.receive(goal.position, yaw, stamp, (x, y, z)):
                 self.news[row].append(messages.GoalReceipt(goal.seq, goal.stamp, goal.pose, utc + t))
 
     def _mark(self, t: float, *, there: bool) -> None:

@@ -119,9 +119,7 @@ class Telemetry:
             self._receipts[row].clear()
 
     def _memory(self, row: int, stepping: Stepping, t: float) -> messages.Memory:
-        measures = ((name, (value,)) for name, value in stepping.measures.items())
-        memory, measured = messages.variables(stepping.memory.items()), messages.variables(measures)
-        return messages.Memory(self._names[row], self._seq, self.utc + t, memory, measured)
+        return messages.memory(self._names[row], self._seq, self.utc + t, stepping.memory, stepping.measures)
 
     def send_ranges(self, states: Sequence[BodyState]) -> None:
         """Sends new range readings of the robots that measure them."""

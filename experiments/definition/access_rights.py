@@ -127,7 +127,7 @@ def _roles(plan: Plan, keys: Keys) -> dict[str, Grant]:
             watch=[*_key_per_name(measured, keys.alive), *tokens],
         ),
         "centre": Grant(
-            publish=[keys.centre, *goals],
+            publish=[keys.centre, *goals, *_key_per_name(plan.guided, keys.memory)],
             subscribe=[keys.pose("*"), keys.status("*")],
             tokens=[keys.lives(keys.centre_alive)],
             watch=[keys.lives(keys.alive("*")), keys.lives(keys.centre_alive)],

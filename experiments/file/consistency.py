@@ -330,9 +330,10 @@ def _remembering(plan: Plan) -> Iterator[Fault]:
     if experiment.formation.update is not None:
         message = f"the law '{name}' is no function of its input alone: a step that is left out would be lost"
         yield Fault(("formation", "update"), message, "leave update out", on_key=True)
-    if experiment.architecture != "distributed":
-        message = f"a central controller computes no law that remembers or gives velocities, as '{name}' does"
-        yield Fault(("architecture",), message, 'write architecture = "distributed", or take another law', on_key=True)
+    if isinstance(experiment.architecture, Hybrid) and plan.law.SAYS:
+        message = f"guided robots do not speak, and '{name}' says something: their free neighbours would hear nothing"
+        hint = 'write architecture = "centralised" or "distributed", or take another law'
+        yield Fault(("architecture",), message, hint, on_key=True)
     if experiment.formation.anchors:
         message = f"anchors pull robots of laws that pull along links; '{name}' does not know them"
         yield Fault(("formation", "anchors"), message, "leave anchors out", on_key=True)

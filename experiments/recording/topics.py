@@ -20,6 +20,7 @@ import msgspec
 
 from agents.network.keys import Keys
 from agents.network.messages import (
+    BareGoal,
     BarePose,
     CentreState,
     Contact,
@@ -58,8 +59,8 @@ class SpokenPose(SentPose, frozen=True, kw_only=True):
     shared: list[Variable]
 
 
-class SentGoal(Goal, frozen=True, kw_only=True):
-    """A goal as the central controller sent it."""
+class SentGoal(BareGoal, frozen=True, kw_only=True):
+    """A goal as the central controller sent it, without its velocity."""
 
     received: float  # [s] UTC, by the recorder
     size: int  # [bytes] of the payload on the network

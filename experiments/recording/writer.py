@@ -18,7 +18,7 @@ from mcap.records import ChunkIndex, MessageIndex, Statistics
 from mcap.writer import CompressionType, Writer
 
 from agents.body.kinds import KINDS, Figures
-from agents.network.messages import BarePose, Event, Pose, State, Vector
+from agents.network.messages import BareGoal, BarePose, Event, Goal, Pose, State, Vector
 from experiments.definition.plan import Plan
 from experiments.recording import version
 from experiments.recording.reader import RecordingError
@@ -123,7 +123,7 @@ ROUNDING_S: Final = 1e-6
 LATEST_S: Final = 2.0**32  # a stamp beyond (the year 2106) is a broken clock; nanoseconds of it may not fit the file
 
 
-BARE: Final = len(BarePose.__struct_fields__)
+BARE: Final = {Pose: len(BarePose.__struct_fields__), Goal: len(BareGoal.__struct_fields__)}
 
 
 def _spoken(message: Message) -> dict[str, Any]:
@@ -217,8 +217,8 @@ class Recording:
         recorded, topic = self._topics[chosen]
         if received is not None:
             values = msgspec.structs.astuple(message)
-            if isinstance(message, Pose):
-                values = values[:BARE]
+            if isinstance(message, Pose | Goal):
+                values = values[: BARE[type(message)]]
             entry = recorded(*values, received=received, size=size, **_spoken(message))
         logged = message.stamp if received is None else received
         if self._utc is not None and received is None:

@@ -104,7 +104,7 @@ class PacedView:
             for robot in robots
         ]
         self._trail.add(instant.now, position)
-        laws = [robot.stepping for robot in robots if robot.stepping is not None]
+        laws = [robot.stepping for robot in robots]  # of guided robots nothing is known here
         return Moment(
             position=position,
             yaw=np.where(np.isfinite(true_yaw), true_yaw, yaw),
@@ -119,8 +119,8 @@ class PacedView:
             shadow=None if np.isnan(shadow).all() else shadow,
             shadow_yaw=None if np.isnan(shadow).all() else _column(states, "shadow_yaw"),
             time=elapsed,
-            places=self._stage.said_places([law.memory for law in laws], position) if laws else None,
-            measures=[law.measures for law in laws],
+            places=self._stage.said_places([{} if law is None else law.memory for law in laws], position),
+            measures=[{} if law is None else law.measures for law in laws],
         )
 
     def _draw(self, instant: Instant, now: float) -> None:

@@ -172,20 +172,20 @@ class Logbook:
         log = self._log
         for k, t in enumerate(log.time.tolist() if log.memory or log.measures else ()):
             for row, name in enumerate(log.names):
-                memory = ((what, values[k, row].tolist()) for what, values in log.memory.items())
-                measures = ((what, [float(values[k, row])]) for what, values in log.measures.items())
-                yield messages.Memory(name, k + 1, EPOCH + t, messages.variables(memory), messages.variables(measures))
+                memory = {what: values[k, row].tolist() for what, values in log.memory.items()}
+                measures = {what: float(values[k, row]) for what, values in log.measures.items()}
+                yield messages.memory(name, k + 1, EPOCH + t, memory, measures)
 
     def _goal_messages(self, centre: CentreLog) -> Iterator[tuple[float, messages.Goal]]:
         """Goals, and when they were sent since the common start [s]."""
         own, names = centre.sent, self._log.names
         assert own.yaw is not None
         assert own.extra is not None
-        columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0])
-        for t, robot, number, place, yaw, pose in zip(*(column.tolist() for column in columns), strict=True):
+        columns = (own.stamp, own.link, own.seq, own.position.round(6), own.yaw.round(6), own.extra[:, 0], own.velocity)
+        for t, robot, number, place, yaw, pose, way in zip(*(column.tolist() for column in columns), strict=True):
             sent, taken = round(EPOCH + t, 6), round(EPOCH + pose, 6)
             heading = None if math.isnan(yaw) else yaw
-            yield t, messages.Goal(names[robot], number, sent, tuple(place), heading, taken)
+            yield t, messages.Goal(names[robot], number, sent, tuple(place), heading, taken, messages.wanted(way))
 
     def _centre_report(self, goals: Goals) -> messages.CentreState:
         """The report of the central controller at the end of the run."""

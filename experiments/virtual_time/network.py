@@ -17,7 +17,7 @@ from agents.decision.stepping import Words
 from agents.network import messages
 from agents.network.channel_model import ROUNDING_S, Channel
 from agents.robot import Robot
-from agents.vectors import UNKNOWN, Vector
+from agents.vectors import UNKNOWN, ZERO, Vector
 from experiments.arrays import PoseTable
 from experiments.definition.link_conditions import FROM_CENTRE, TO_CENTRE, conditions_of
 from experiments.definition.plan import Plan
@@ -98,7 +98,7 @@ class VirtualCentre:
             row = self._guided[link]
             guidance = self._robots[row].guidance
             assert guidance is not None
-            if guidance.receive(sample.position, sample.yaw, sample.stamp):
+            if guidance.receive(sample.position, sample.yaw, sample.stamp, sample.velocity):
                 self._followed.append((row, t, sample))
 
     def retire(self, row: int, t: float) -> None:
@@ -111,11 +111,13 @@ class VirtualCentre:
         """On a tick on which goals are decided: those of the robots that are guided."""
         lives = [robot.lifecycle for robot in self._robots]
         starts = [life.start_at for life in lives]
+        for followed, robot in zip(self.centre.robots, self._robots, strict=True):
+            followed.held = robot.hazards.held
         for goal in self.centre.decide(t, [life.phase for life in lives], starts):
             row = goal.row
             self._seq[row] += 1
-            sample = Sample(row, self._seq[row], t, goal.goal, (0.0, 0.0, 0.0), goal.yaw, goal.pose_stamp)
-            size = self._sizes.of(sample, min(starts)) if self._goals.limited else 0
+            sample = Sample(row, self._seq[row], t, goal.goal, goal.velocity, goal.yaw, goal.pose_stamp)
+            size = self._sizes.of(sample._replace(velocity=ZERO), min(starts)) if self._goals.limited else 0
             self._goals.send(self._goal_link[row], sample, sample.seq, t, start=min(starts), size=size)
             self._sent.append((row, t, sample))
 

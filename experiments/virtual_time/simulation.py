@@ -132,6 +132,12 @@ class Flight:
         self.twin = TwinBody(request, shared_world(plan, names))
         self._body = shadowed(self.twin, request, shadow_periods(plan, names))
         self.network = VirtualNetwork(plan, self.robots, seed, lean=lean)
+        self._laws = [robot.stepping for robot in self.robots]  # those of guided robots are the centre's
+        if (centre := self.network.centre) is not None:
+            guides = centre.centre.robots
+            self._laws = [
+                guide.computer.stepping if guide.guided else law for guide, law in zip(guides, self._laws, strict=True)
+            ]
         self._conductor = VirtualConductor(self.robots)
         rates = plan.experiment.rates
         self.dt, self.log_every = 1.0 / rates.body_hz, round(rates.body_hz / rates.state_hz)
@@ -228,8 +234,7 @@ class Flight:
             sample["phase"] = [robot.lifecycle.phase for robot in self.robots]
             for what in ("goal", "setpoint", "error"):
                 sample[what] = [getattr(robot, what) for robot in self.robots]
-            laws = [robot.stepping for robot in self.robots if robot.stepping is not None]
-            self._remembered.append([(law.memory, law.measures) for law in laws])
+            self._remembered.append([({}, {}) if law is None else (law.memory, law.measures) for law in self._laws])
             sample["obstacles"] = [tuple(each) for each in self.twin.engine.obstacles]
         self._samples.append(sample)
 

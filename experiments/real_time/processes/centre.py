@@ -1,9 +1,9 @@
 """The process of the central controller: `python -m experiments.real_time.processes.centre FILE`.
 
 It receives the poses of the guided robots and of their neighbours, as any neighbour would, and sends each robot its
-goal. `agents.decision.centralised` decides; here are the clock and the network. It needs no memory: after a restart it
-receives the last poses, and by the robots' statuses when and where each began. It runs on the machine of the conductor,
-whose clock is that of the experiment.
+goal. `agents.decision.centralised` decides; here are the clock and the network. After a restart it receives the last
+poses, and by the robots' statuses when and where each began; laws that remember begin anew. It runs on the machine of
+the conductor, whose clock is that of the experiment.
 """
 
 from __future__ import annotations
@@ -72,6 +72,11 @@ class CentreProcess:
         }
         mime = messages.MIME[self._encoding]
         self._goals = {row: pubsub.publisher(session, keys.goal(names[row]), mime) for row in self._guided}
+        self._memories = {
+            row: pubsub.publisher(session, keys.memory(names[row]), mime)
+            for row in self._guided
+            if centre.robots[row].computer.stepping is not None
+        }
         self._reports = pubsub.pose_publisher(session, keys.centre, messages.JSON)
         self._phase, self._start = [IDLE] * len(names), [inf] * len(names)
         self._begun = inf
@@ -100,6 +105,7 @@ class CentreProcess:
             goals = self.centre.decide(t, self._phase, self._start)
             if not self._ownership.settle(self._session, over.is_set):
                 self._send(goals, t)
+                self._send_memories(t)
             if t - self._reported >= REPORT_S - 1e-6:
                 self._report(t)
         self._report(ticks.next)
@@ -133,12 +139,13 @@ class CentreProcess:
         self._phase[row] = PHASES[status.phase]
         if status.origin is not None and all(map(isfinite, status.origin)):
             self.centre.begin_plan(row, status.origin)
+        self.centre.robots[row].held = status.hazard.startswith("hold")
         self._start[row] = status.started - self._utc if status.started > 0.0 else inf
 
     def _send(self, goals: Sequence[CentreGoal], t: float) -> None:
         """Sends goals, rounded as poses are."""
         self._seq += 1
-        for row, (x, y, z), yaw, pose_stamp in goals:
+        for row, (x, y, z), yaw, pose_stamp, velocity in goals:
             goal = messages.Goal(
                 self._names[row],
                 self._seq,
@@ -146,9 +153,18 @@ class CentreProcess:
                 (round(x, 6), round(y, 6), round(z, 6)),
                 round(yaw, 6) if isfinite(yaw) else None,
                 round(self._utc + pose_stamp, 6),
+                messages.wanted(velocity),
             )
             self._goals[row].put(messages.encode(goal, self._encoding))
         self._sent += len(goals)
+
+    def _send_memories(self, t: float) -> None:
+        """Sends what the laws of the guided robots remember and measure."""
+        for row, publisher in self._memories.items():
+            stepping = self.centre.robots[row].computer.stepping
+            if stepping is not None:
+                told = messages.memory(self._names[row], self._seq, self._utc + t, stepping.memory, stepping.measures)
+                publisher.put(messages.encode(told, self._encoding))
 
     def _report(self, t: float) -> None:
         cpu_s = time.process_time()

@@ -189,3 +189,26 @@ def test_age_of_guidance():
     assert guidance.lost_since == inf
     guidance.begin_anew()
     assert guidance.receive((0.0, 0.0, 1.0), nan, -3.0)  # whose clock is behind
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_velocity_of_the_centre_ends_with_its_goals(name):
+    parts = {"formation": Formation(links={"A - B": 0.9}, law="consensus")}
+    bench = guided(name, **parts)
+    bench.running(guide)
+    robot, (x, y, z) = bench.robot, bench.position
+
+    def move(bench):
+        if round(bench.t * 100) % 10 == 0:
+            robot.guidance.receive(bench.position, nan, bench.t, (0.1, 0.0, nan))
+
+    bench.step(1.0, move)
+    assert robot.goal[0] > x + 0.05
+    assert robot.setpoint[0] > (0.02 if name == "A" else x + 0.05)
+    bench.step(0.35)
+    assert robot.goal == (x, y, z)  # long before it counts as unguided
+    assert not robot.hazards.held
+    bench.step(0.8)
+    assert robot.hazards.held
+    assert robot.stepping is None
+    assert robot.words == ()
