@@ -393,8 +393,8 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
         .replace('"CF01 > ', '"CF01 - ')
         .replace("[5.0, 4.0, 2.5]", "[20.0, 20.0, 2.5]")
     )
-    experiment = document.loads(text).cases()[case]
-    known = Logbook(simulate(experiment, 1), experiment, case).trace()
+    plan = document.loads(text).cases()[case]
+    known = Logbook(simulate(plan, 1), plan, case).trace()
     late = known.time > 37.0
     assert np.linalg.norm(out_of_place(known)[late], axis=2).max() < 0.012
     drift = known.true_position[-1, 0, :2] - known.true_position[known.time > 10.0][0, 0, :2]

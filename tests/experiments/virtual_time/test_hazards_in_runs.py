@@ -60,6 +60,26 @@ def test_a_drone_lands_when_its_battery_is_low_and_says_so():
     assert reasons[:2] == ["land: its battery is low: 98% (limit 98%)", "finished"]
 
 
+@pytest.mark.parametrize("architecture", ["distributed", "centralised"])
+def test_a_drone_that_lands_is_lost_to_the_formation(architecture):
+    robots = {
+        "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.3),
+        "G": Robot(kind="khepera4", start=[1.3, 0.1]),
+        "H": Robot(kind="khepera4", start=[0.0, 0.9]),
+    }
+    formation, ends = Formation(links={"F > G": 0.8, "G - H": 0.9}), {}
+    for low in (0.1, 0.99):
+        experiment = pair(
+            robots=robots, formation=formation, safety=Safety(battery_low=low), duration_s=12.0,
+            architecture=architecture,
+        )  # fmt: skip
+        log = simulate(Plan(experiment), 1)
+        ends[low] = log.true_position[np.searchsorted(log.time, 11.9), :, :2]
+    lengths = {low: np.linalg.norm(end[1] - end[[0, 2]], axis=1) for low, end in ends.items()}
+    for low, planar in ((0.1, np.sqrt(0.8**2 - 0.3**2)), (0.99, 0.89)):  # G stops on its way to a drone that is gone
+        assert lengths[low] == pytest.approx([planar, 0.9], abs=0.02)
+
+
 FINDINGS = {
     "battery": ({"battery_low": 0.5}, "battery"),
     "cut": ({"cut_outside": 0.2}, "cut-outside"),
