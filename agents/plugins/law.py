@@ -31,7 +31,7 @@ class Said(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     unit: str = "1"
     metre: float = 1.0  # change of it that counts, for every trigger, as one metre of deviation of the pose
-    # index at which a place x, y [m] begins, if it has one; a third number that ends the variable is z
+    # index, from the end if negative, at which a place x, y [m] begins; a third number that ends the variable is z
     place: int | None = None
 
 

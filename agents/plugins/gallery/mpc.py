@@ -39,7 +39,7 @@ class Mpc(Law, frozen=True):
     arrival is guaranteed: constraints are soft, and robots that block each other stay.
     """
 
-    SAYS: ClassVar[Mapping[str, Said]] = {"path": Said(unit="m")}
+    SAYS: ClassVar[Mapping[str, Said]] = {"path": Said(unit="m", place=-2)}  # its end is drawn
     ALONE: ClassVar[bool] = True
     PREDICTION: ClassVar[str] = "constant-velocity"
     LIBRARY: ClassVar[str] = "daqp"
