@@ -120,7 +120,7 @@ class Horizon:
         since = (self._times[:, None] - self._times) / period  # steps from the end of one to the end of another
         self._shift = np.where(since >= 0.0, period * period * (since + 0.5), 0.0)  # of places, by accelerations
         self._gain = np.where(since >= 0.0, period, 0.0)  # of velocities
-        half = self._shift.T @ self._shift + effort * np.eye(steps)
+        half = np.einsum("ki,kj->ij", self._shift, self._shift) + effort * np.eye(steps)  # a BLAS has bits of its own
         self._hessian = 2.0 * np.kron(np.eye(2), half)
         self._velocities = np.kron(np.eye(2), self._gain)
         self.rest = np.zeros((steps, 2))
@@ -128,7 +128,7 @@ class Horizon:
     def positions(self, p: Planar, v: Planar, a: Array) -> Array:
         """Places from p [m], with v [m/s] and accelerations [m/s²]."""
         np = self._np
-        found: Array = np.asarray(p) + self._times[:, None] * np.asarray(v) + self._shift @ a
+        found: Array = np.asarray(p) + self._times[:, None] * np.asarray(v) + np.einsum("ki,ix->kx", self._shift, a)
         return found
 
     def later(self, path: tuple[float, ...], seconds: float) -> Array:
@@ -181,7 +181,7 @@ class Horizon:
         hessian, rows = np.zeros((2 * steps + count,) * 2), np.zeros((2 * steps + count,) * 2)
         hessian[: 2 * steps, : 2 * steps], rows[: 2 * steps, : 2 * steps] = self._hessian, self._velocities
         linear = np.full(2 * steps + count, penalty)
-        linear[: 2 * steps] = 2.0 * ((free - np.asarray(goal)).T @ self._shift).ravel()
+        linear[: 2 * steps] = 2.0 * np.einsum("kx,ki->xi", free - np.asarray(goal), self._shift).ravel()
         low = np.concatenate((np.full(2 * steps, -most), np.zeros(count), np.repeat(-speed - np.asarray(v), steps)))
         high = np.concatenate(
             (np.full(2 * steps, most), np.full(count, np.inf), np.repeat(speed - np.asarray(v), steps))

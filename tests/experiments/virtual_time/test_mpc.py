@@ -26,7 +26,6 @@ pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark in
 
 NAMES = [f"CF{number:02}" for number in range(1, 9)]
 CONTACT = 0.13  # m, between the axes of two Crazyflies
-APART = 0.55  # m, between random places
 CASES = [pytest.param(number, marks=[] if number < 3 else pytest.mark.nightly) for number in range(20)]
 
 
@@ -37,17 +36,22 @@ def opposite(number):
     return places, places[4:] + places[:4]
 
 
-def random(number):
-    """Random places, and an order in which no robot keeps its own."""
+def random(number, half=1.5, apart=0.55):
+    """Random places in a square, and an order in which no robot keeps its own [m]."""
     draw, places = Random(number), []
     while len(places) < 8:
-        place = draw.uniform(-1.5, 1.5), draw.uniform(-1.5, 1.5)
-        if all(dist(place, other) > APART for other in places):
+        place = draw.uniform(-half, half), draw.uniform(-half, half)
+        if all(dist(place, other) > apart for other in places):
             places.append(place)
     goals = places
     while any(goal == place for goal, place in zip(goals, places, strict=True)):
         goals = draw.sample(places, 8)
     return places, goals
+
+
+def crowded(number):
+    """As `random`, in a quarter of the area."""
+    return random(number, 0.75, 0.4)
 
 
 def flown(starts, goals, *changes, case="periodic"):
