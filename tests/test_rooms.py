@@ -56,7 +56,7 @@ tools.main
 tools.guard
 """
 # laws whose libraries take arrays: they import numpy with them, at first use
-EXTRAS = ("agents.plugins.gallery.mpc", "agents.plugins.extras.policy")
+EXTRAS = ("agents.plugins.extras.mpc", "agents.plugins.extras.policy")
 FLOORS = [line.split() for line in ORDER.strip().splitlines()]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from agents.body.kinds import KINDS
 from agents.decision.stepping import Stepping
-from agents.plugins.gallery.mpc import Mpc, horizon
+from agents.plugins.extras.mpc import Mpc, horizon
 from agents.plugins.law import NeighbourView
 from agents.plugins.registry import PluginError
 from agents.vectors import ZERO
