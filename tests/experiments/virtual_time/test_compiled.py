@@ -24,8 +24,9 @@ from agents.plugins.triggers import Trigger
 from agents.vectors import UNKNOWN
 from experiments.definition.experiment import Channel, Experiment, Formation, Leg, Robot, World
 from experiments.definition.plan import Plan
-from experiments.virtual_time import simulation, stretch
+from experiments.virtual_time import stretch
 from tests.agents.plugins.test_every_plugin import made
+from tests.experiments.virtual_time import evaluators
 from tests.experiments.virtual_time.evaluators import flown, same
 
 pytest.importorskip("numba")
@@ -79,7 +80,7 @@ def assigned(monkeypatch):
             def assignment(self, name):
                 return change(super().assignment(name))
 
-        monkeypatch.setattr(simulation, "Plan", Changed)
+        monkeypatch.setattr(evaluators, "Plan", Changed)
 
     return use
 
