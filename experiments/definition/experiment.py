@@ -402,7 +402,9 @@ WORST: Final = "worst"  # of them
 class Criterion(Part, frozen=True):
     """Limit that a run must keep to pass: of a metric, or of a measure of the law."""
 
-    metric: Annotated[str | None, Meta(description="a metric; or give `measure`")] = None
+    metric: Annotated[
+        str | None, Meta(description='a metric, one in a file beside this one too ("way.py:Way"); or give `measure`')
+    ] = None
     measure: Annotated[
         str | None, Meta(description="a number that the law measures, averaged over the last second of the run")
     ] = None

@@ -11,7 +11,7 @@ import numpy as np
 from agents.body.interface import BodyError
 from agents.body.kinds import KINDS, Kind
 from agents.formation.link import BY_BEARING
-from agents.plugins import registry
+from agents.plugins import files, registry
 from agents.plugins.laws import Gradient
 from agents.plugins.predictors import HOLD
 from agents.plugins.registry import did_you_mean
@@ -33,6 +33,7 @@ from experiments.definition.links import FORM, NO_TARGET, held_height, link_pair
 from experiments.definition.plan import Plan
 from experiments.file import consistency_network
 from experiments.file.problems import Fault, Path, after_the_end, unknown_robot
+from experiments.file.structure import struct_of
 from twins import scene as outlines
 from twins.engines.engine import require_carried
 from twins.engines.point_mass import TWINLESS, has_model
@@ -113,7 +114,12 @@ def criteria_faults(plan: Plan, cases: Iterable[str]) -> Iterator[Fault]:
     cases = list(cases)
     for number, each in enumerate(plan.experiment.criteria):
         path = ("criteria", number)
-        if each.metric is not None and each.metric not in (known := judged_metrics()):
+        if each.metric is not None and files.is_choice(each.metric):
+            try:
+                struct_of(registry.METRICS, each.metric)
+            except registry.PluginError as error:
+                yield Fault((*path, "metric"), str(error), "mend that file (docs/metrics.md)")
+        elif each.metric is not None and each.metric not in (known := judged_metrics()):
             yield Fault((*path, "metric"), f"no {each.metric!r} among the metrics", did_you_mean(each.metric, known))
         if each.of not in (known := [MEAN, WORST, *plan.names]):
             yield Fault((*path, "of"), f"no robot is called '{each.of}'", did_you_mean(each.of, known))

@@ -170,6 +170,10 @@ class _Adopted:
             for name, each in _tables(content).items()
         }
         document: _Table = structure.with_choices(_without_cases(content), (), partial(self._take, ()))
+        criteria = document.get("criteria")
+        for number, each in enumerate(criteria if isinstance(criteria, list) else []):
+            if isinstance(each, dict) and isinstance(each.get("metric"), str):
+                each["metric"] = self._take((), each["metric"], ("criteria", number, "metric"))
         return {**content, **document, **({"cases": {**content["cases"], **cases}} if cases else {})}
 
     def override(self, given: Override) -> Override:

@@ -61,7 +61,7 @@ def described() -> dict[str, Any]:
     definitions["Formation"]["properties"]["links"]["additionalProperties"]["anyOf"].append({"enum": [SHAPE, ALONE]})
     definitions["Robot"]["properties"]["kind"]["enum"] = [kind.name for kind in KINDS.usable()]
     judged = definitions["Criterion"]["properties"]["metric"]
-    judged["enum"] = judged_metrics()
+    judged["anyOf"] = [{"enum": judged_metrics()}, {"type": "string", "pattern": f"^{files.CHOICE}$"}]
     partial = {name + _CASE: _partial(each) for name, each in definitions.items()}
     for key in ("cases", "criteria"):
         del partial["Experiment" + _CASE]["properties"][key]

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from agents.plugins.files import plain
 from experiments.definition.experiment import MEAN, WORST, Criterion
 from experiments.metrics.metric import known_metrics
 from experiments.metrics.results import CaseMetrics, RobotMetrics
@@ -36,7 +37,7 @@ class Judgement(msgspec.Struct, frozen=True):
         """The number that is judged, in words."""
         asked = self.criterion
         metric = known_metrics().get(asked.metric or "")
-        name = metric.head if metric else asked.metric or asked.measure
+        name = metric.head if metric else plain(asked.metric or "") or asked.measure
         where = {MEAN: "", WORST: " of the worst robot"}.get(asked.of, f" of {asked.of}")
         return f"{name}{where} in {self.case or asked.case}"
 
@@ -69,6 +70,7 @@ def document(judged: Sequence[Judgement]) -> dict[str, Any]:
     rows = [
         {
             **msgspec.to_builtins(each.criterion),
+            **({"metric": plain(each.criterion.metric)} if each.criterion.metric else {}),
             "case": each.case or each.criterion.case,
             "passed": each.passed,
             "values": {str(seed): value for seed, value in each.values.items()},
@@ -100,15 +102,15 @@ def _values(
 
 def _value(asked: Criterion, run: CaseMetrics) -> float | None:
     """The number of a run that a criterion judges; None if it is unknown, or the run was interrupted."""
-    name = asked.metric or asked.measure or ""
+    name = plain(asked.metric or asked.measure or "")
     if run.interrupted:
         return None
     by_robot = {robot.robot: robot.value(name) if asked.metric else _measure(robot, name) for robot in run.robots}
+    of_case = all(value is None for value in by_robot.values())
+    if asked.metric and name in run.mean and (asked.of == MEAN or of_case):
+        return run.mean[name]
     if asked.of in by_robot:
         return by_robot[asked.of]
-    metric = known_metrics().get(asked.metric or "")
-    if metric is not None and name in run.mean and (asked.of == MEAN or metric.per == "case"):
-        return run.mean[name]
     out = {*run.leaders, *run.died}
     kept = [value for robot, value in by_robot.items() if robot not in out]
     known = [value for value in kept if value is not None]

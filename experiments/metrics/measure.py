@@ -25,10 +25,12 @@ from experiments.metrics.comparable import reasons
 from experiments.metrics.measurement import BAND, Measurement
 from experiments.metrics.metric import (
     OURS,
+    Metric,
     Number,
     case_values,
     foreign_metrics,
     known_metrics,
+    metrics_of_criteria,
     unusable_metrics,
     values_of,
 )
@@ -94,8 +96,10 @@ def measure(trace: Trace) -> CaseMetrics:
     names, shared = trace.robots, Measurement(trace)
     errors, clearance, kept = shared.errors, shared.clearance, shared.kept
     touched = collisions(trace, clearance)
-    values, faults = values_of(known_metrics(), shared)
-    robots = _robots(shared, touched, values)
+    asked, missing = metrics_of_criteria(trace.plan.experiment.criteria)
+    metrics = known_metrics() | asked
+    values, faults = values_of(metrics, shared)
+    robots = _robots(shared, touched, values, foreign_metrics() | asked)
 
     together = [_all([phase[i].acquired_s for i in kept if errors.own[:, i].any()]) for phase in shared.phases]
     rotation: list[float | None] = []
@@ -122,7 +126,7 @@ def measure(trace: Trace) -> CaseMetrics:
         robots=robots,
         leaders=shared.leaders,
         died=shared.died,
-        mean=case_values(known_metrics(), values, kept),
+        mean=case_values(metrics, values, kept),
         acquired_s=tuple(together),
         rotation_rad_s=tuple(rotation),
         j2=_benchmark_cost(trace, errors) if shared.has_errors else None,
@@ -159,7 +163,7 @@ def measure(trace: Trace) -> CaseMetrics:
         deliveries=centralised.deliveries(trace),
         guidance=centralised.guidance(trace),
         measures=_law_measures(shared, kept),
-        metric_faults=(*unusable_metrics(), *faults),
+        metric_faults=(*unusable_metrics(), *missing, *faults),
         criteria=tuple(trace.plan.experiment.criteria),
     )
     return msgspec.structs.replace(found, spoiled=reasons(found))
@@ -171,9 +175,12 @@ def ended_early(trace: Trace) -> bool:
 
 
 def _robots(
-    shared: Measurement, touched: Sequence[Collision], values: Mapping[str, Sequence[Number]]
+    shared: Measurement,
+    touched: Sequence[Collision],
+    values: Mapping[str, Sequence[Number]],
+    added: Mapping[str, Metric],
 ) -> tuple[RobotMetrics, ...]:
-    """Metrics of each robot, from the contacts and the values of `known_metrics`."""
+    """Metrics of each robot, from the contacts and the values of all metrics; `added` are not ours."""
     trace, errors, clearance = shared.trace, shared.errors, shared.clearance
     rows, duration = len(trace.robots), float(trace.time[-1] - trace.time[0])
     there, mine = errors.expected(), errors.own
@@ -199,7 +206,7 @@ def _robots(
         **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
         "foreign": np.zeros(rows, dtype=np.intp) if trace.foreign is None else trace.foreign,
     }
-    foreign = [name for name, metric in foreign_metrics().items() if metric.per == "robot"]
+    foreign = [name for name, metric in added.items() if metric.per == "robot"]
 
     def plain(i: int) -> dict[str, Any]:
         waits = shared.waits[i]

@@ -19,7 +19,8 @@ from typing import ClassVar, Final, Literal, cast
 import msgspec
 import numpy as np
 
-from agents.plugins import registry
+from agents.plugins import files, registry
+from experiments.definition.experiment import Criterion
 from experiments.metrics.measurement import Measurement
 from experiments.metrics.results import CaseMetrics, RobotMetrics
 from experiments.recording.trace import Trace
@@ -153,6 +154,18 @@ def console_metrics() -> dict[str, Metric]:
     return {name: OURS[name] for name in CONSOLE} | added
 
 
+def metrics_of_criteria(criteria: Sequence[Criterion]) -> tuple[dict[str, Metric], tuple[str, ...]]:
+    """Metrics in files beside an experiment that its criteria name, by name, and why others cannot be used."""
+    found, left_out = {}, []
+    for name in dict.fromkeys(each.metric for each in criteria if each.metric):
+        if files.is_choice(name):
+            try:
+                found[files.plain(name)] = _made(name)
+            except registry.PluginError as error:
+                left_out.append(f"metric {files.plain(name)} is unknown: {' '.join(str(error).split())}")
+    return found, tuple(left_out)
+
+
 def unusable_metrics() -> tuple[str, ...]:
     """Why registered metrics are left out, a sentence each."""
     return _installed()[1]
@@ -179,7 +192,7 @@ def _made(name: str) -> Metric:
     plugin = cast(type[Metric], registry.struct(registry.METRICS, name))
     columns = {field.name for field in fields(Trace)}
     wrong = ""
-    if not name.isidentifier() or name != name.lower():
+    if not files.is_choice(name) and (not name.isidentifier() or name != name.lower()):
         wrong = "its name must be of small letters, digits and _"
     elif name in TAKEN or short_name(name) in {short_name(each) for each in OURS}:
         wrong = "zenpark has something of this name: register it under another one"

@@ -10,6 +10,7 @@ from agents.plugins import files, registry
 from experiments.check.check import check
 from experiments.file.document import DocumentError, case_document, load, loads, received, write_json
 from experiments.file.structure import plugin_files
+from experiments.metrics.criteria import judge
 from experiments.recording import bundle
 from experiments.recording.reader import RecordingError
 from experiments.run import reopen, simulate
@@ -207,3 +208,79 @@ def test_a_law_in_the_subset_is_compiled(task):
 def test_text_in_no_file_looks_beside_the_current_folder(task, monkeypatch):
     monkeypatch.chdir(task.parent)
     assert loads(TASK).cases().keys() == {"slow", "fast"}
+
+
+SPREAD = """
+import numpy as np
+
+from zenpark import Metric
+
+
+class Spread(Metric, frozen=True):
+    label = "Spread"
+    unit = "m"
+    per = "case"
+
+    def of(self, trace, shared):
+        return np.ptp(trace.true_position[-1], axis=0).max()
+
+
+class Last(Metric, frozen=True):
+    label = "x in the end"
+    unit = "m"
+
+    def of(self, trace, shared):
+        return trace.true_position[-1, :, 0]
+
+
+class Broken(Metric, frozen=True):
+    unit = "m"
+"""
+
+
+def judged(task, **criterion):
+    lines = [f"{key} = {value!r}" for key, value in criterion.items()]
+    task.write_text("\n".join([TASK, "[[criteria]]", *lines]), "utf-8")
+    return judge([*simulate(load(task), cases=["fast"]).metrics.values()])
+
+
+@pytest.fixture
+def spread(task):
+    (task.parent / "spread.py").write_text(SPREAD, "utf-8")
+    return task
+
+
+@pytest.mark.parametrize(
+    ("criterion", "low", "high"),
+    [
+        ({"metric": "spread.py:Spread"}, 0.0, 1.0),
+        ({"metric": "spread.py:Last", "of": "B"}, 0.0, 0.5),
+        ({"metric": "spread.py:Last", "of": "worst"}, 0.0, 0.5),
+    ],
+)
+def test_a_criterion_judges_by_a_metric_in_a_file(spread, criterion, low, high):
+    (only,) = judged(spread, **criterion, at_most=high)
+    assert low < only.values[1] < high
+    assert only.passed
+    assert "@" not in only.what
+
+
+def test_a_metric_in_a_file_that_cannot_be_used_is_named(spread):
+    assert "it has no Spred, only" in refused_criterion(spread, "spread.py:Spred")
+    assert "cannot be read" in refused_criterion(spread, "sprad.py:Spread")
+    (only,) = judged(spread, metric="spread.py:Broken", at_most=1.0)
+    assert only.passed is False
+
+
+def refused_criterion(task, metric):
+    task.write_text(f'{TASK}[[criteria]]\nmetric = "{metric}"\nat_most = 1.0\n', "utf-8")
+    return refused(task)
+
+
+def test_a_run_keeps_the_metrics_of_its_criteria(spread, tmp_path, monkeypatch):
+    spread.write_text(TASK + '[[criteria]]\nmetric = "spread.py:Spread"\nat_most = 1.0\n', "utf-8")
+    out = tmp_path / "run"
+    assert call(monkeypatch, "run", spread, "--virtual", "--no-report", "--out", out) == 0
+    assert (out / "spread.py").is_file()
+    assert "spread.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
+    assert reopen(out).summary()["passed"] is True
