@@ -393,7 +393,7 @@ class Hybrid(Part, frozen=True):
 # metrics of zenpark that a criterion can name; those of other distributions come beside them
 JUDGED: Final = (
     *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
-    *("missed_deadlines", "residual", "settle_s", "collisions"),
+    *("missed_deadlines", "residual", "settle_s", "collisions", "listeners"),
 )
 MEAN: Final = "mean"  # over robots
 WORST: Final = "worst"  # of them

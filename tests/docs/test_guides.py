@@ -82,6 +82,7 @@ def test_a_guide_can_be_followed(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZENPARK_RUNTIME_DIR", str(tmp_path / "runs"))
+    Path("docs").symlink_to(DOCS)
     done = 0
     for step in steps(guide):
         if step.kind == "toml":
