@@ -72,7 +72,7 @@ class Cover(Metric, frozen=True):
     label, unit, per = "Cover", "m", "case"
 
     def of(self, trace, shared):
-        x, y = (np.linspace(0.2 - size / 2, size / 2 - 0.2, 40) for size in trace.experiment.arena.size[:2])
+        x, y = (np.linspace(0.2 - size / 2, size / 2 - 0.2, 40) for size in trace.plan.experiment.arena.size[:2])
         floor = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
         return np.linalg.norm(floor - end(trace)[0].mean(axis=0), axis=2).min(axis=1).mean()
 
@@ -83,5 +83,5 @@ class Unserved(Metric, frozen=True):
     label, unit, per = "Unserved", "m", "case"
 
     def of(self, trace, shared):
-        tasks = np.array(trace.experiment.formation.law["tasks"])
+        tasks = np.array(trace.plan.experiment.formation.law["tasks"])
         return np.linalg.norm(tasks[:, None] - end(trace)[0].mean(axis=0), axis=2).min(axis=1).max()
