@@ -43,7 +43,7 @@ def test_places_with_z_and_unknown_ones():
     assert places[:3].tolist() == [[1.0, 2.0, 3.0], [1.0, 2.0, 0.7], [1.0, 2.0, 0.7]]
     assert np.isnan(places[3:]).all()
     assert not Stage.of_robots(("A",)).place_variables
-    planned = Stage.of_experiment(load("mpc", *SHORT).cases()["event"])
+    planned = Stage.of_plan(load("mpc", *SHORT).cases()["event"])
     path = tuple(float(number) for number in range(32))
     assert planned.said_places([{"path": path}], position)[0].tolist() == [[30.0, 31.0, 0.7]]
 
