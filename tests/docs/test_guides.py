@@ -17,9 +17,9 @@ from tools.main import main
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 GUIDES = (
     *("first-hour", "from-a-paper", "mixed-reality", "shadow-twin", "teaching"),
-    *("two-crazyflies", "vicon", "three-machines", "lab-certificates"),
+    *("two-crazyflies", "vicon", "three-machines", "lab-certificates", "course/solutions/README"),
 )
-LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching")  # 10 to 30 s each
+LONG = ("first-hour", "from-a-paper", "mixed-reality", "teaching", "course/solutions/README")  # 10 to 30 s each
 STEP = re.compile(
     r"^```(?P<language>toml|python)\n(?P<block>(?s:.*?))^```|^ {4,}\./zenpark (?P<command>[^#\n]*)(?P<said>.*)",
     re.MULTILINE,
