@@ -33,7 +33,7 @@ class Policy(Law, frozen=True):
     LIBRARY: ClassVar[str] = "onnxruntime"
     FILES: ClassVar[Mapping[str, str]] = {"file": "model"}
 
-    file: Annotated[str, Meta(description="ONNX file, seen from the folder of the experiment file")] = ""
+    file: Annotated[str, Meta(description="ONNX file beside the experiment file: its name")] = ""
     model: Annotated[str, Meta(description="content of that file, in base64: it goes with the experiment")] = ""
 
     def begin(self, robot: RobotFacts) -> Memory:

@@ -1,7 +1,9 @@
 """A learned policy acts in flight as it does offline, and is refused where it does not fit."""
 
+import runpy
 import sys
-from base64 import b64decode
+from base64 import b64decode, b64encode
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +53,28 @@ def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
     apart = np.linalg.norm(place - place.mean(axis=1, keepdims=True), axis=2)
     assert apart[0].max() > 0.5
     assert apart[-1].max() < most
+
+
+def training():
+    """Functions of the program that trains the policy of the catalogue."""
+    return runpy.run_path(str(Path(__file__).parents[3] / "docs" / "policy_training.py"))
+
+
+def test_the_policy_of_the_catalogue_imitates_its_expert():
+    functions = training()
+    seen = functions["situations"](np.random.default_rng(3), 5000)
+    error = offline(seen) - functions["expert"](seen)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.015
+
+
+@pytest.mark.nightly
+def test_training_anew_gives_such_a_policy(tmp_path):
+    functions = training()
+    functions["write"](functions["train"](), tmp_path / "new.onnx")
+    seen = functions["situations"](np.random.default_rng(3), 5000)
+    _, act = policy.load(b64encode((tmp_path / "new.onnx").read_bytes()).decode())
+    error = np.array([act(each) for each in seen]) - functions["expert"](seen)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 0.015
 
 
 def test_observations():

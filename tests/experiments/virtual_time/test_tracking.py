@@ -68,3 +68,14 @@ def test_tracking_by_directions():
     own, central, _ = track("periodic", 1, "formation.law.sees=direction", "formation.law.sigma=0.08")
     assert own < 1.1**2 * central
     assert own < 0.06**2
+
+
+def test_robots_that_do_not_see_the_target_know_it_from_the_others():
+    text = index.find_file("tracking").read_text("utf-8")
+    bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
+    plan = document.loads(bare).cases()["event"]
+    known = Logbook(simulate(plan, 1), plan, "event").trace()
+    late = known.time > 5.0
+    assert np.isnan(known.measures["reading"][late][:, [1, 4]]).all()
+    apart = known.memory["x"][late][:, 1:, :2] - known.true_position[late, :1, :2]
+    assert np.sqrt((apart**2).sum(axis=2).mean(axis=0)).max() < 0.06
