@@ -187,8 +187,10 @@ class Robot:
     @property
     def words(self) -> Words:
         """What is said beside the transmitted pose: variables by name."""
-        speech = None if self.stepping is None else self.stepping.speech
-        return () if speech is None else speech.words
+        stepping = self._stepping
+        if stepping is None or stepping.speech is None or self.guidance is not None:
+            return ()
+        return stepping.speech.words
 
     @property
     def stepping(self) -> Stepping | None:
