@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache, reduce
-from math import atan2, hypot, nan, pi, remainder, sqrt
+from math import atan2, hypot, isnan, nan, pi, remainder, sqrt
 from operator import add, mul
 from random import Random
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
 
-from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Values, View, is_known
-from agents.vectors import Positive
+from agents.plugins.law import Control, Law, Memory, RobotFacts, Said, Severity, Values, View, is_known
+from agents.vectors import Positive, Vector, difference
 
 Matrix = Sequence[Sequence[float]]  # 4 × 4, for a state of x, y [m] and v_x, v_y [m/s]
 Information = tuple[Sequence[float], Matrix]  # y = Y x and Y = P⁻¹
 
+NEAREST: Final = 0.1  # [m] nearer, the slope of a direction means nothing
 IDENTITY: Final = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -67,14 +68,17 @@ class Tracking(Law, frozen=True):
         """Prediction, sum, correction by an own reading."""
         if view.robot.name == self.target:
             return Control(memory=memory)
-        every, heard = memory["all"], view.known("y", "Y")
-        own = self.predict(memory["y"], memory["Y"], view.step_s, every)
-        others = [self.predict(each.said["y"], each.said["Y"], max(each.age, 0.0), every) for each in heard]
+        every, density = memory["all"], self.agility / self.sigma**2
+        own = predicted(memory["y"], memory["Y"], view.step_s, density, every)
+        others = [
+            predicted(each.said["y"], each.said["Y"], max(each.age, 0.0), density, every)
+            for each in view.known("y", "Y")
+        ]
         y, known = total([own, *others])
         if not all(row[k] > 0.0 for k, row in enumerate(inverse(known))):  # what was heard is no information
             others, (y, known) = [], own
-        value, reading = self.read(view, times(inverse(known), y))
-        own = total([own, reading])
+        reading = self.measure(view)
+        own = total([own, told_by(reading, self.sees, view.position, times(inverse(known), y))])
         y, known = total([own, *others])
         covariance = inverse(known)
         x = times(covariance, y)
@@ -83,31 +87,46 @@ class Tracking(Law, frozen=True):
         variance = self.sigma**2 * (covariance[0][0] + covariance[1][1])
         return Control(
             memory={"y": tuple(own[0]), "Y": flat(own[1]), "x": x, "all": flat(known)},
-            measures={"reading": value, "uncertainty": sqrt(max(variance, 0.0))},
+            measures={"reading": reading, "uncertainty": sqrt(max(variance, 0.0))},
         )
 
-    def predict(self, y: Values, matrix: Values, seconds: float, every: Values) -> Information:
-        """Information after some time, where `every` is the sum of what all robots know."""
-        onward, back = transition(round(seconds, 6), self.agility / self.sigma**2, every)
-        return times(onward, y), product(product(onward, rows(matrix)), back)
-
-    def read(self, view: View, x: Sequence[float]) -> tuple[float, Information]:
-        """A reading of the target, NaN without one, and its information where the target is believed at x."""
+    def measure(self, view: View) -> float:
+        """A reading of the target [m] or [rad], NaN without one; a sensor of the robot would give it here."""
         for target in view.neighbours:
             if target.name == self.target:
                 error = Random(repr((view.robot.number, view.time, target.position))).gauss(0.0, self.sigma)
-                east, north = x[0] - view.position[0], x[1] - view.position[1]
-                there = target.position[0] - view.position[0], target.position[1] - view.position[1]
-                far = max(hypot(east, north), 0.1)  # nearer, the slope of a direction means nothing
-                if self.sees == "distance":
-                    value, g = hypot(*there) + error, (east / far, north / far, 0.0, 0.0)
-                    change = value - hypot(east, north)
-                else:
-                    value, g = atan2(there[1], there[0]) + error, (-north / far**2, east / far**2, 0.0, 0.0)
-                    change = remainder(value - atan2(north, east), 2.0 * pi)
-                pull = change + g[0] * x[0] + g[1] * x[1]
-                return value, (tuple(each * pull for each in g), [[k * m for m in g] for k in g])
-        return nan, ((0.0,) * 4, rows((0.0,) * 16))
+                x, y, _ = difference(target.position, view.position)
+                return (hypot(x, y) if self.sees == "distance" else atan2(y, x)) + error
+        return nan
+
+    def analyse(self, plan: Any) -> Iterable[tuple[Severity, str, str]]:  # noqa: ANN401 - as its base
+        """A target that is no robot, or that none sees."""
+        incoming = [link.name for name in plan.names for link in plan.assignment(name).neighbours if link.in_law]
+        if self.target not in plan.names:
+            yield "error", f"the target {self.target!r} is no robot of the experiment", "mend `target` of the law"
+        elif self.target not in incoming:
+            yield "error", f"no robot sees {self.target}", f'give it links, such as "{self.target} > KH01" = "link"'
+
+
+def told_by(reading: float, sees: str, position: Vector, x: Sequence[float]) -> Information:
+    """Information of a reading at a position of a target that is believed at x; none where it is NaN."""
+    east, north = x[0] - position[0], x[1] - position[1]
+    far = max(hypot(east, north), NEAREST)
+    if sees == "distance":
+        change, g = reading - hypot(east, north), (east / far, north / far, 0.0, 0.0)
+    else:
+        change = remainder(reading - atan2(north, east), 2.0 * pi)
+        g = -north / far**2, east / far**2, 0.0, 0.0
+    if isnan(change):
+        return (0.0,) * 4, rows((0.0,) * 16)
+    pull = change + g[0] * x[0] + g[1] * x[1]
+    return tuple(each * pull for each in g), [[k * m for m in g] for k in g]
+
+
+def predicted(y: Values, matrix: Values, seconds: float, density: float, every: Values) -> Information:
+    """Information after some time, where `every` is the sum of what all robots know."""
+    onward, back = transition(round(seconds, 6), density, every)
+    return times(onward, y), product(product(onward, rows(matrix)), back)
 
 
 @lru_cache(maxsize=8)  # most ages are alike

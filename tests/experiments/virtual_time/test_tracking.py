@@ -79,3 +79,18 @@ def test_robots_that_do_not_see_the_target_know_it_from_the_others():
     assert np.isnan(known.measures["reading"][late][:, [1, 4]]).all()
     apart = known.memory["x"][late][:, 1:, :2] - known.true_position[late, :1, :2]
     assert np.sqrt((apart**2).sum(axis=2).mean(axis=0)).max() < 0.06
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [("formation.law.target=KH99", "no robot of the experiment"), ("formation.law.target=KH02", "")],
+)
+def test_a_target_is_a_robot_that_others_see(change, message):
+    plan = document.read(index.find_file("tracking"), [change]).plan
+    assert [severity for severity, text, _ in plan.law.analyse(plan) if message in text] == ["error"] * bool(message)
+
+
+def test_a_target_that_none_sees_is_an_error():
+    text = index.find_file("tracking").read_text("utf-8")
+    plan = document.loads("\n".join(line for line in text.splitlines() if "TB01 > " not in line)).plan
+    assert [message for _, message, _ in plan.law.analyse(plan)] == ["no robot sees TB01"]
