@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from agents.plugins.laws import Gradient
     from agents.plugins.planners import Planner
     from agents.plugins.predictors import Predictor
+    from agents.plugins.registry import PluginError
     from agents.plugins.triggers import Trigger
     from agents.vectors import Vector, clamp, difference, distance, dot, norm, planar, wrap
     from experiments.check import ideal_run
@@ -45,7 +46,7 @@ __all__ = [  # noqa: RUF022 - by subject, as in docs/python.md
     "load", "loads", "check", "simulate", "sweep", "reopen", "reopen_seeds", "show", "folder", "figures",
     "Document", "Run", "Trace",
     # laws
-    "Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link",
+    "Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link", "PluginError",
     # other plug-ins of the file
     "Trigger", "Predictor", "Planner", "Avoidance", "measure_gap", "EngineFactory", "PointMassEngine", "moving_models",
     # metrics
@@ -71,6 +72,7 @@ HOMES: Final = {  # modules, and what of them is named above
     "agents.plugins.laws": "Gradient",
     "agents.plugins.planners": "Planner",
     "agents.plugins.predictors": "Predictor",
+    "agents.plugins.registry": "PluginError",
     "agents.plugins.triggers": "Trigger",
     "agents.vectors": "Vector clamp difference distance dot norm planar wrap",
     "experiments.check": "ideal_run",

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from traceback import extract_tb, walk_tb
 from typing import Final
 
+from agents.plugins.files import plain
 from agents.plugins.registry import PluginError
 
 LONGEST: Final = 60  # characters of a result that is shown
@@ -48,20 +49,20 @@ def failure(what: str, plugin: object, error: Exception) -> PluginError:
     file = _file(plugin)
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
     place = f"{file}:{lines[-1]}" if lines else file
-    return PluginError(f"the {what} {type(plugin).__name__} failed: {type(error).__name__}: {error} ({place})")
+    return PluginError(f"the {what} {type(plugin).__name__} failed: {type(error).__name__}: {error} ({plain(place)})")
 
 
 def wrong(what: str, plugin: object, method: str, result: object, wanted: str) -> PluginError:
     """Error that names a plug-in whose `method` gave a `result` other than what is `wanted`, in words."""
     got = "nothing: is a `return` missing?" if result is None else repr(result)[:LONGEST]
     name, file = type(plugin).__name__, _file(plugin)
-    return PluginError(f"`{method}` of the {what} {name} must give {wanted}, not {got} ({file})")
+    return PluginError(f"`{method}` of the {what} {name} must give {wanted}, not {got} ({plain(file)})")
 
 
 def _unusable(what: str, plugin: object, method: str, error: Exception) -> PluginError:
     hint = ": is a `return` missing?" if "NoneType" in str(error) else ""
     name, file = type(plugin).__name__, _file(plugin)
-    return PluginError(f"`{method}` of the {what} {name} gives what cannot be used: {error}{hint} ({file})")
+    return PluginError(f"`{method}` of the {what} {name} gives what cannot be used: {error}{hint} ({plain(file)})")
 
 
 def _file(plugin: object) -> str:

@@ -21,6 +21,7 @@ from agents.user_folder import OWN, cache_folder
 
 CHOICE: Final = r"[^@:\\/][^@:\\]*\.py:[A-Za-z_][A-Za-z0-9_]*"  # as a user writes it
 PREFIX: Final = "zenpark_file_"  # of the names of their modules
+KEPT: Final = "plugins"  # folder of the copies, in the cache
 LARGEST: Final = 1_000_000  # [bytes] of such a file
 _CHOICE: Final = re.compile(rf"({CHOICE})(?:@([0-9a-f]{{32}}))?")
 _OTHERS: Final = 0o022  # mode of what others may write
@@ -32,8 +33,9 @@ def is_choice(name: str) -> bool:
 
 
 def plain(text: str) -> str:
-    """A text with the names of plug-ins as their user has written them."""
-    return re.sub(r"(\.py:\w+)@[0-9a-f]{32}", r"\1", text)
+    """A text with the names of plug-ins, and of their files, as their user has written them: without the copies."""
+    text = re.sub(r"(\.py:\w+)@[0-9a-f]{32}", r"\1", text)
+    return re.sub(rf"/(?:[^/\s]+/)*{KEPT}/[0-9a-f]{{32}}/", "", text)
 
 
 def adopt(name: str, folder: Path) -> tuple[str, Path]:
@@ -111,7 +113,7 @@ def _module(kept: Path, digest: str) -> ModuleType:
 
 
 def _place(digest: str, path: str) -> Path:
-    return cache_folder() / "plugins" / digest / Path(path).name
+    return cache_folder() / KEPT / digest / Path(path).name
 
 
 def _digest(text: bytes) -> str:

@@ -112,7 +112,7 @@ def _fault_of(plugin: Any, path: str) -> str:  # noqa: ANN401 - likewise
     """What a plug-in lacks of the base at a `path`, `module:name`; empty for one that lacks nothing."""
     base = find(path, "base of a plug-in")
     if not (isinstance(plugin, type) and issubclass(plugin, base)):
-        return f"must be a class that inherits from {path.replace(':', '.')}"
+        return f"must be a class that inherits from {FACE}.{base.__name__}"
     if missing := [name for name in dir(plugin) if getattr(getattr(plugin, name), "__isabstractmethod__", False)]:
         return f"lacks the methods {', '.join(missing)}"
     values = ((name, getattr(plugin, name), allowed) for name, allowed in _literals(base).items())

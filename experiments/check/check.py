@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from agents.plugins.files import plain
 from experiments.check import motion, noise, safety, theory
 from experiments.check import obstacles as surroundings
 from experiments.check.analysis import Analysis, analyse
@@ -45,7 +46,9 @@ def compilation(analysis: Analysis) -> Iterator[Finding]:
                 yield Finding("note", "uncompiled", f"laws that remember are not compiled: {cost}")
             continue
         for text in outside(plugin)[:1]:
-            yield Finding("note", "uncompiled", f"{text}, which is not compiled: {cost} (docs/plugins.md, the subset)")
+            yield Finding(
+                "note", "uncompiled", f"{plain(text)}, which is not compiled: {cost} (docs/plugins.md, the subset)"
+            )
 
 
 SUBJECTS: Final = (

@@ -27,7 +27,20 @@ CODE = {
 }
 # what a plug-in that flies may import: nothing of it needs numpy or anything of `experiments`
 FLYING = (
-    *("Law", "Gradient", "Control", "Memory", "Said", "View", "RobotFacts", "Link", "Trigger", "Predictor", "Planner"),
+    *(
+        "Law",
+        "Gradient",
+        "Control",
+        "Memory",
+        "Said",
+        "View",
+        "RobotFacts",
+        "Link",
+        "PluginError",
+        "Trigger",
+        "Predictor",
+        "Planner",
+    ),
     *("Avoidance", "measure_gap", "Kind", "KINDS", "Ground", "Body", "BodyRequest", "BodyState", "BodyError"),
     *("call_all", "Vector", "norm", "distance", "difference", "dot", "planar", "clamp", "wrap"),
 )

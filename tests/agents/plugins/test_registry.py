@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+import zenpark
 from agents.body.interface import Body
 from agents.plugins import registry
 from agents.plugins.law import Law
@@ -169,8 +170,9 @@ def test_did_you_mean(word, known, answer):
 @pytest.mark.parametrize("name", ["pulse", "function"])
 @pytest.mark.usefixtures("foreign")
 def test_plug_in_inherits_from_its_base(group, name):
-    base = registry.BASES[group].replace(":", ".")
-    with pytest.raises(registry.PluginError, match=rf"'{name}' .* must be a class that inherits from {base}"):
+    base = registry.BASES[group].partition(":")[2]
+    assert base in zenpark.__all__
+    with pytest.raises(registry.PluginError, match=rf"'{name}' .* must be a class that inherits from zenpark.{base}"):
         registry.load(group, name)
 
 

@@ -118,7 +118,7 @@ def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
     [
         ("def pull(", "def pull", "(meet.py, line 12)"),
         ("    gain: Positive = 0.1", "    gain: Positive = gain", "name 'gain' is not defined, line 10"),
-        ("Meet(Gradient, frozen=True)", "Meet", "inherits from agents.plugins.law.Law"),
+        ("Meet(Gradient, frozen=True)", "Meet", "inherits from zenpark.Law"),
     ],
 )
 def test_a_broken_file_is_named_with_its_line(task, old, new, message):
