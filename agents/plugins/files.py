@@ -117,6 +117,6 @@ def _place(digest: str, path: str) -> Path:
 
 
 def _digest(text: bytes) -> str:
-    import hashlib  # noqa: PLC0415 - 8 ms that a robot without such a plug-in does without
+    import hashlib  # noqa: PLC0415 - 8 ms that a quick command does without
 
     return hashlib.sha256(text).hexdigest()[:32]

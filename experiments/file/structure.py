@@ -122,11 +122,18 @@ def with_choices(value: Any, path: Path, change: Callable[[str, Path], str]) -> 
         if isinstance(value, dict) and isinstance(value.get("kind"), str):
             return {**value, "kind": change(value["kind"], (*path, "kind"))}
         return value
-    if isinstance(value, dict):
+    if isinstance(value, dict) and _leads_to_choice(path):
         return {key: with_choices(each, (*path, key), change) for key, each in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list) and _leads_to_choice(path):
         return [with_choices(each, (*path, number), change) for number, each in enumerate(value)]
     return value
+
+
+def _leads_to_choice(path: Path) -> bool:
+    """Whether a choice of a plug-in may stand below a path: thousands of robots and links are passed over."""
+    return any(
+        all(step == part or type(step) is part for step, part in zip(path, each, strict=False)) for each in _GROUPS
+    )
 
 
 def struct_of(group: str, kind: str) -> type[msgspec.Struct]:
