@@ -34,6 +34,8 @@ os.environ["ZENPARK_CACHE_DIR"] = tempfile.mkdtemp(prefix="zenpark-cache-")
 # each call builds all commands anew, 50 ms; a command keeps nothing of a call
 typer.main.get_command = typer.testing._get_command = functools.cache(typer.main.get_command)
 
+gc.disable()  # until all tests are collected: a quarter of the time that this takes
+
 ROOT = Path(__file__).resolve().parent.parent
 
 # The background of a shell ignores Ctrl-C, and whatever a test starts would inherit that; a handler is not inherited.
@@ -66,6 +68,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)
+    gc.enable()
 
 
 PATIENT = """
