@@ -47,7 +47,10 @@ def good(robot: str, seq: int = 1, ahead: float = 0.0) -> dict[str, list[object]
             messages.Order("stop"), messages.Order("get", name="clamp"), messages.Order("set", name="clamp", value=0.2),
             messages.Order("set", name="trigger.period_s", value=0.05),
         ],
-        "goal": [messages.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01) for k in range(2)],
+        "goal": [
+            messages.Goal(robot, seq + k, now, place, 0.1 if k else None, now - 0.01, [0.1, 0.0] if k else None)
+            for k in range(2)
+        ],
     }  # fmt: skip
 
 
