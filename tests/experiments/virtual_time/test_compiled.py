@@ -34,7 +34,7 @@ KINDS = ("crazyflie", "khepera4", "tello", "turtlebot3")
 WANTS = {"distance": BY_DISTANCE, "any": BY_DISTANCE, "relative": BY_RELATIVE, "bearing": BY_BEARING}
 NATURE = {
     "all": Disturbance(position_sigma=0.0005, yaw_sigma=0.002),
-    "crazyflie": Disturbance(position_sigma=0.0005, hover_jitter=Jitter(0.01)),
+    "crazyflie": Disturbance(position_sigma=0.0005, hover_jitter=Jitter(0.01), wind=(0.2, -0.1)),
     "khepera4": Disturbance(odometry_drift=0.002),
     "turtlebot3": Disturbance(latency_s=0.04),
 }
