@@ -284,3 +284,51 @@ def test_a_run_keeps_the_metrics_of_its_criteria(spread, tmp_path, monkeypatch):
     assert (out / "spread.py").is_file()
     assert "spread.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
     assert reopen(out).summary()["passed"] is True
+
+
+OTHERS = """
+from math import nan
+
+from zenpark import Avoidance, Planner, Predictor, Trigger, distance
+
+
+class Every(Trigger, frozen=True):
+    metres: float = 0.1
+
+    def fires(self, view):
+        return distance(view.position, view.last.position) > self.metres
+
+
+class Still(Predictor, frozen=True):
+    def position(self, pose, age):
+        return pose.position
+
+    def velocity(self, pose, age):
+        return 0.0, 0.0, 0.0
+
+
+class Aside(Planner, frozen=True):
+    def target(self, elapsed, anchor, heading):
+        return anchor[0], anchor[1] + 0.05 * elapsed, anchor[2], nan
+
+    def speed(self):
+        return 0.05
+
+
+class Bold(Avoidance, frozen=True):
+    def deviate(self, goal, own, near, period):
+        return goal
+"""
+
+
+def test_all_other_choices_may_be_files(task):
+    (task.parent / "others.py").write_text(OTHERS, "utf-8")
+    top = 'trigger = { kind = "others.py:Every", metres = 0.05 }\nprediction = "others.py:Still"\n'
+    leader = '[robots.L]\nkind = "khepera4"\nstart = [1.2, 0.0]\n'
+    leg = '[[timeline]]\nat_s = 0.0\nrobot = "L"\nplan = "others.py:Aside"\n'
+    text = f'{top}avoidance = "others.py:Bold"\n{TASK}{leader}{leg}'
+    task.write_text(text.replace("[formation.links]", '[formation.links]\n"L > A" = { offset = [-1.7, 0.0] }'), "utf-8")
+    run = simulate(load(task), cases=["fast"])
+    (leading,) = [robot for robot in run.metrics["fast"].robots if robot.robot == "L"]
+    assert run.traces["fast"].true_position[-1, 2, 1] > 0.02
+    assert 0 < leading.messages < 10
