@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -429,6 +430,11 @@ class Criterion(Part, frozen=True):
             raise ValueError("`at_least` is above `at_most`; exchange them")
         if self.relative_to is not None and self.relative_to == self.case:
             raise ValueError("`relative_to` names the case that is judged; name another one")
+
+    def excess(self, value: float) -> float:
+        """By how much a value is beyond the limits; 0 or less where it keeps them."""
+        above = -math.inf if self.at_most is None else value - self.at_most
+        return max(above, -math.inf if self.at_least is None else self.at_least - value)
 
 
 class Experiment(Part, frozen=True):

@@ -25,7 +25,7 @@ class Judgement(msgspec.Struct, frozen=True):
     @property
     def failed(self) -> list[int]:
         """Seeds that do not keep the limit, or whose value is unknown."""
-        return [seed for seed, value in self.values.items() if not _is_within(self.criterion, value)]
+        return [seed for seed, value in self.values.items() if value is None or self.criterion.excess(value) > 0.0]
 
     @property
     def passed(self) -> bool | None:
@@ -124,10 +124,3 @@ def _value(asked: Criterion, run: CaseMetrics) -> float | None:
 def _measure(robot: RobotMetrics, name: str) -> float | None:
     found = robot.measures.get(name)
     return None if found is None else found.end
-
-
-def _is_within(asked: Criterion, value: float | None) -> bool:
-    if value is None:
-        return False
-    low = asked.at_least is None or value >= asked.at_least
-    return low and (asked.at_most is None or value <= asked.at_most)

@@ -25,6 +25,7 @@ from experiments.report.tables import (
     clearance_tables,
     clocks_table,
     collision_table,
+    criteria_table,
     definitions,
     events_tables,
     network_tables,
@@ -41,6 +42,7 @@ PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Received poses are counted over all receivers "
     "together; a pose sent in the last instant of the run may still be under way."
 )
+CRITERIA: Final = "What the experiment file asks of its runs. Every seed must keep each of them."
 CLOCKS: Final = (
     "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
     "run was subtracted from all stamps there and from the start. Drift since then was corrected during the run; "
@@ -133,6 +135,7 @@ def write(
     short, every_event = events_tables(first)
     listing = text or msgspec.json.format(msgspec.json.encode(experiment), indent=2).decode()
     sections = [
+        *_tables("Criteria", CRITERIA, [criteria_table(cases)], folded=False),
         *_results(cases),
         Section("Figures", (FOR_A_PAPER,), pictures=pictures),
         Section("Events", tables=(short,), more=every_event),

@@ -15,6 +15,7 @@ from operator import attrgetter
 from typing import Any, Final
 
 from agents.network.messages import Event
+from experiments.metrics.criteria import judge
 from experiments.metrics.metric import ERRORS, OURS, Metric, known_metrics
 from experiments.metrics.results import Approach, CaseMetrics, Passage, RobotMetrics
 from experiments.metrics.statistics import Spread, by_case, ratios, spread
@@ -464,6 +465,16 @@ def collision_table(cases: Sequence[CaseMetrics]) -> Table:
         rows.append(Row((where, f"{each.time_s:.2f}", each.first, each.second, impulse, depth)))
     head = ("Case", "t [s]", "First", "Second", "Impulse [mN s]", "Overlap [cm]")
     return Table(head, tuple(rows), note=_hidden_rows_note(len(found) - MOST_COLLISIONS, "metrics.json"), words=True)
+
+
+def criteria_table(cases: Sequence[CaseMetrics]) -> Table:
+    """Criteria of the file with what was reached, over the seeds, and how many seeds keep them."""
+    rows = []
+    for each in judge(cases):
+        kept = len(each.values) - len(each.failed)
+        answer = "not judged" if each.passed is None else f"{kept} of {len(each.values)}"
+        rows.append(Row((each.what, each.limit, interval(spread([*each.values.values()])), answer, each.criterion.why)))
+    return Table(("Criterion", "Limit", "Reached", "Seeds", "Why"), tuple(rows), words=True)
 
 
 def clocks_table(traces: Sequence[Trace]) -> Table:

@@ -73,16 +73,14 @@ def criteria_met(cases: Sequence[CaseMetrics]) -> list[Finding]:
 def _missed(judgement: criteria.Judgement) -> str:
     """The criterion that is not met, by how many seeds, and why it is asked."""
     seeds, failed = len(judgement.values), judgement.failed
-    values = [judgement.values[seed] for seed in failed]
-    asked = judgement.criterion
-    off = [value if asked.at_most is None else -value for value in values if value is not None]
-    worst = None if len(off) < len(values) else min(off) if asked.at_most is None else -min(off)
+    values, asked = [judgement.values[seed] for seed in failed], judgement.criterion
+    known = [value for value in values if value is not None]
+    worst = None if len(known) < len(values) else max(known, key=asked.excess)
     which = f" for {len(failed)} of {seeds} seeds, the farthest" * (seeds > 1)
     is_what = "is unknown" if worst is None else f"is {number(worst)}"
     if asked.measure and asked.measure not in judgement.measures:
         is_what += f" (no measure of the law; {did_you_mean(asked.measure, judgement.measures) or 'it has none'})"
-    why = f" {asked.why.strip().rstrip('.')}." if asked.why.strip() else ""
-    return f"{judgement.what} {is_what}{which}, not {judgement.limit}.{why}"
+    return f"{judgement.what} {is_what}{which}, not {judgement.limit}. {asked.why}".rstrip()
 
 
 def _of_each_case(

@@ -12,6 +12,8 @@ from experiments.file.document import loads, write_json
 from experiments.metrics.criteria import document, has_passed, judge
 from experiments.metrics.metric import OURS
 from experiments.metrics.results import RobotMetrics
+from experiments.report.page import number
+from experiments.report.tables import criteria_table
 from experiments.report.verdict import criteria_met
 from experiments.run import reopen, simulate, simulate_seeds
 from tools.main import main
@@ -81,6 +83,24 @@ def test_numbers_that_can_be_judged(cases, criterion, passed):
     assert answer(cases, case="periodic", **criterion) == [passed]
 
 
+def test_the_value_farthest_out_of_a_range_is_named(cases):
+    def texts(**limits):
+        found = [msgspec.structs.replace(case, seed=k, case="one") for k, case in enumerate(cases)]
+        return criteria_met(with_criteria(found, Criterion(metric="f_hz", **limits)))[1].text
+
+    event, periodic = sorted(case.mean["f_hz"] for case in cases)
+    middle = 0.5 * (event + periodic)
+    near, far = texts(at_least=middle - 0.1, at_most=middle + 0.2), texts(at_least=middle - 0.2, at_most=middle + 0.1)
+    assert f"is {number(event)} for 2 of 2 seeds, the farthest, not at most" in near
+    assert f"is {number(periodic)} for 2 of 2 seeds" in far
+
+
+def test_a_report_lists_criteria_with_what_was_reached(cases):
+    table = criteria_table(cases)
+    assert [row.cells[3] for row in table.rows] == ["1 of 1", "0 of 1", "0 of 1"]
+    assert criteria_table(with_criteria(cases)).rows == ()
+
+
 def test_what_was_not_run_is_not_judged(cases):
     event = cases[1:]
     assert answer(event, metric="f_hz", case="periodic", at_most=1.0) == [None]
@@ -130,5 +150,7 @@ def test_a_run_ends_by_its_criteria(limits, code, tmp_path, monkeypatch, capsys)
     passed = code == 0
     assert json.loads(capsys.readouterr().out)["passed"] is passed
     words = "Passed: 1 of 1 criteria are met." if passed else "nobody is that good"
-    assert words in (out / "report.html").read_text("utf-8")
+    page = (out / "report.html").read_text("utf-8")
+    assert words in page
+    assert "Every seed must keep each of them" in page
     assert reopen(out).summary()["passed"] is passed
