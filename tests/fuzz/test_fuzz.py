@@ -41,7 +41,7 @@ def once() -> Iterator[object]:
             yield pytest.param(file, SHORT, id=f"{file.stem}-begins")
 
 
-@pytest.mark.parametrize(("file", "size"), once())
+@pytest.mark.parametrize(("file", "size"), list(once()))
 def test_what_escaped_once_does_not_again(file: Path, size: int) -> None:
     assert replay(PLACES[file.name.partition("--")[0]], file.read_bytes()[:size])
 
