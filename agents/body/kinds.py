@@ -87,26 +87,24 @@ class ProtocolTwin:
     device: Mapping[str, object] = field(default_factory=dict, hash=False)  # settings on top of those of the file
 
 
+class Agility(msgspec.Struct, frozen=True):
+    """Rates and limits of a kind, as `Kind` has them."""
+
+    response: float  # K [1/s]
+    turn_response: float  # K_α [1/s]
+    speed: float  # limit [m/s]
+    turn_rate: float  # limit [rad/s]
+
+
 class Steering(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Steering of a kind that takes twists and does not turn like two wheels; `twist` is quiet."""
 
-    def twist(  # noqa: PLR0917 - numbers alone, as `agents.decision.position_control.drive`
-        self,
-        x: float,
-        y: float,
-        yaw: float,
-        goal_yaw: float,
-        response: float,
-        turn_response: float,
-        speed: float,
-        turn_rate: float,
-    ) -> tuple[float, float]:
+    def twist(self, x: float, y: float, yaw: float, goal_yaw: float, agility: Agility) -> tuple[float, float]:
         """Linear [m/s] and angular speed [rad/s] toward a goal that is x, y [m] away, and there to `goal_yaw` [rad].
 
-        `yaw` is measured [rad], `goal_yaw` NaN for any; the rates `response` and `turn_response` [1/s] and the limits
-        `speed` [m/s] and `turn_rate` [rad/s] are those of the kind.
+        `yaw` is measured [rad], `goal_yaw` NaN for any.
         """
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} must define `twist`")
 
 
 @dataclass(frozen=True)

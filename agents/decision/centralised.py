@@ -83,8 +83,8 @@ class Centre:
         """Rows of robots whose poses are needed."""
         return [row for row, robot in enumerate(self.robots) if robot.needed]
 
-    def receive(  # noqa: PLR0917 - the fields of a pose
-        self, row: int, position: Vector, velocity: Vector, yaw: float, stamp: float, arrival: float
+    def receive(
+        self, row: int, position: Vector, velocity: Vector, stamp: float, arrival: float, *, yaw: float
     ) -> None:
         """Store a pose of a robot; an outdated one is dropped."""
         robot = self.robots[row]

@@ -38,7 +38,7 @@ class ControlUpdates:
         self.asking, self._anchored = TriggerState(trigger), anchored
         self._inputs = [Input() for _ in range(links)]
 
-    def due(  # noqa: PLR0917 - one caller, quiet
+    def due(  # noqa: PLR0917 - quiet: compilers take no arguments by name alone
         self, t: float, position: Vector, velocity: Vector, neighbours: Neighbours, predictor: Predictor,
         since_start: float, offset: Vector, error: float, energy: float,
     ) -> bool:  # fmt: skip

@@ -204,18 +204,17 @@ class GoalComputer:
         if self._reshapes:
             self._reshape(t - start, position, t)
         if self.stepping is not None:
-            self.stepping.step(self._view(self.stepping, t, position, velocity, yaw, start))
+            self.stepping.step(self._view(t, position, velocity, yaw, start))
 
     def is_sound(self, t: float, position: Vector) -> bool:
         """Whether the law, asked at `t` [s] for a robot that stands at `position` [m], wants what is finite."""
         if self.stepping is None:
             return is_finite(self.law_offset(t, position))
-        return is_sound(self.stepping.rehearse(self._view(self.stepping, t, position, ZERO, 0.0, t)))
+        return is_sound(self.stepping.rehearse(self._view(t, position, ZERO, 0.0, t)))
 
-    def _view(  # noqa: PLR0917 - as `decide`
-        self, stepping: Stepping, t: float, position: Vector, velocity: Vector, yaw: float, start: float
-    ) -> View:
-        view, predictor = stepping.view(), self._predictor
+    def _view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
+        stepping, predictor = cast(Stepping, self.stepping), self._predictor
+        view = stepping.view()
         view.position, view.velocity, view.yaw, view.leads = position, velocity, yaw, not self.follows
         if self.itinerary is not None:
             x, y, z, _ = self.itinerary.target(t - start, (position[0], position[1], self.ground), yaw)

@@ -109,9 +109,9 @@ class Neighbours:
         self.incomplete, self.lagging, self.refused = True, False, False
         self.foreign_at, self.silence_s = -inf, silence_s
 
-    def receive(  # noqa: PLR0917 - the fields of a pose
+    def receive(
         self, link: int, position: Vector, velocity: Vector, stamp: float, arrival: float,
-        yaw: float = nan, said: Mapping[str, tuple[float, ...]] = NO_WORDS,
+        *, yaw: float = nan, said: Mapping[str, tuple[float, ...]] = NO_WORDS,
     ) -> bool:  # fmt: skip
         """Store a pose of the sender on a link, if it is newer than the known one; returns whether it is.
 

@@ -39,7 +39,7 @@ class Transmitter:
         """Use another trigger of the same kind from now on; what was remembered stays."""
         self.asking.trigger, self._smooths = trigger, trigger.smoothing_s > 0.0
 
-    def transmits(  # noqa: PLR0917 - one caller, on every tick
+    def transmits(  # noqa: PLR0917 - quiet: compilers take no arguments by name alone
         self,
         t: float,
         position: Vector,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import atan, cos, isfinite, nan, sin, sqrt
 from typing import Final
 
-from agents.body.kinds import Kind, Steered, Steering
+from agents.body.kinds import Agility, Kind, Steered, Steering
 from agents.vectors import clamp
 
 BASE: Final = 0.15  # [m] between the axles
@@ -24,17 +24,7 @@ class Pursuit(Steering, frozen=True):
 
     radius: float = RADIUS  # smallest turning radius [m]
 
-    def twist(  # noqa: PLR0917 - as its base
-        self,
-        x: float,
-        y: float,
-        yaw: float,
-        goal_yaw: float,
-        response: float,
-        turn_response: float,
-        speed: float,
-        turn_rate: float,
-    ) -> tuple[float, float]:
+    def twist(self, x: float, y: float, yaw: float, goal_yaw: float, agility: Agility) -> tuple[float, float]:
         """As `Steering.twist`; the yaw at the goal is that of arrival."""
         distance = sqrt(x * x + y * y)
         if distance <= NEAR:
@@ -42,7 +32,7 @@ class Pursuit(Steering, frozen=True):
         if not isfinite(yaw):
             return nan, nan
         along, across = cos(yaw) * x + sin(yaw) * y, cos(yaw) * y - sin(yaw) * x
-        v = min(response * distance, speed)
+        v = min(agility.response * distance, agility.speed)
         ahead = along >= 0.0
         curvature = FIRMLY * 2.0 * across / (distance * distance)
         if abs(curvature) * self.radius > 1.0:  # no arc leads there: drive away, and turn the near end to it
@@ -50,7 +40,7 @@ class Pursuit(Steering, frozen=True):
             curvature = -1.0 / self.radius if across > 0.0 else 1.0 / self.radius
         if not ahead:
             v = -v
-        omega = clamp(v * curvature, -turn_rate, turn_rate)
+        omega = clamp(v * curvature, -agility.turn_rate, agility.turn_rate)
         return v, omega
 
 

@@ -421,9 +421,9 @@ def heading(yaw: float) -> float | None:
     return remainder(yaw, tau) if isfinite(yaw) else None
 
 
-def pose(  # noqa: PLR0917 - the fields of a pose
-    robot: str, seq: int, stamp: float, position: Sequence[float], velocity: Sequence[float], yaw: float,
-    words: Iterable[tuple[str, Sequence[float]]] = (),
+def pose(
+    robot: str, seq: int, stamp: float, position: Sequence[float], velocity: Sequence[float],
+    *, yaw: float, words: Iterable[tuple[str, Sequence[float]]] = (),
 ) -> Pose:  # fmt: skip
     """A pose to send, rounded to micrometres and microradians: a third fewer bytes, far below any sensor's noise.
 

@@ -616,8 +616,8 @@ class Runtime:
     def _send_pose(self, row: int, robot: Robot, yaw: float, t: float) -> None:
         self._counts.sent[row] += 1
         pose = messages.pose(
-            self._names[row], self._counts.sent[row], self._utc + t, robot.sent_position, robot.sent_velocity, yaw,
-            robot.words,
+            self._names[row], self._counts.sent[row], self._utc + t, robot.sent_position, robot.sent_velocity,
+            yaw=yaw, words=robot.words,
         )  # fmt: skip
         payload = messages.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)

@@ -347,7 +347,7 @@ class PoseInbox(ModelledInbox):
             yaw = nan if pose.yaw is None else pose.yaw
             said = {each.name: tuple(each.value) for each in pose.shared} if pose.shared else NO_WORDS
             self._robots[row].neighbours.receive(
-                k, pose.position, velocity, received.measured - utc, arrival, yaw, said
+                k, pose.position, velocity, received.measured - utc, arrival, yaw=yaw, said=said
             )
             self.news[row].append(
                 messages.PoseReceipt(pose.robot, pose.seq, pose.stamp, utc + arrival, pose.position, velocity)

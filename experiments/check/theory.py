@@ -25,8 +25,9 @@ FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another s
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
 HUNTS: Final = 2.0  # of the share of an error that one decision corrects
-# of a pose: running number, stamp [s], position [m], velocity [m/s] and yaw [rad]
-LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) * 3, -1.234567)
+# of a pose: running number, stamp [s], position [m] and velocity [m/s]
+LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) * 3)
+LONG_YAW: Final = -1.234567  # [rad]
 LONG_NUMBER: Final = -1.234567e-05  # of what is said
 MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
 RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
@@ -318,7 +319,7 @@ def load(analysis: Analysis) -> tuple[int, int, float]:
     name = max(analysis.names, key=len)
     said = Stepping(plan.assignment(name)).says if plan.law.SAYS else {}
     bare, whole = (
-        len(messages.encode(messages.pose(name, *LONG_POSE, words), experiment.network.encoding))
+        len(messages.encode(messages.pose(name, *LONG_POSE, yaw=LONG_YAW, words=words), experiment.network.encoding))
         for words in ((), [(variable, (LONG_NUMBER,) * size) for variable, size in said.items()])
     )
     rate = experiment.rates.pose_hz

@@ -156,7 +156,7 @@ class Logbook:
         columns = (sent.stamp, sent.link, sent.seq, sent.position, sent.velocity, sent.yaw)
         words = self._words(sent)
         for t, row, seq, position, velocity, yaw in zip(*(column.tolist() for column in columns), strict=True):
-            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw, next(words))
+            yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw=yaw, words=next(words))
 
     def _words(self, sent: PoseTable) -> Iterator[Words]:
         """What was said beside each pose."""

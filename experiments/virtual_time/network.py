@@ -91,7 +91,7 @@ class VirtualCentre:
         """Delivers at `t` [s]: poses to the central controller, goals to the robots."""
         for link, arrival, sample in self._poses.due(t):
             row = self._needed[link]
-            self.centre.receive(row, sample.position, sample.velocity, sample.yaw, sample.stamp, arrival)
+            self.centre.receive(row, sample.position, sample.velocity, sample.stamp, arrival, yaw=sample.yaw)
             self._received.append((row, arrival, sample))
         newest = {link: sample for link, _, sample in sorted(self._goals.due(t), key=lambda each: each[2].stamp)}
         for link, sample in sorted(newest.items()):  # of several for one robot the newest counts
@@ -147,8 +147,9 @@ class _Sizes:
         """Bytes of a pose; `start` is the common start [s]."""
         stamp = EPOCH + (sample.stamp - start if sample.stamp >= start else 0.0)
         pose = messages.pose(
-            self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity, sample.yaw, sample.words
-        )
+            self._names[sample.row], sample.seq, stamp, sample.position, sample.velocity,
+            yaw=sample.yaw, words=sample.words,
+        )  # fmt: skip
         return len(messages.encode(pose, self._encoding))
 
 
@@ -231,8 +232,8 @@ class VirtualNetwork:
                 sample.velocity,
                 sample.stamp,
                 arrival,
-                sample.yaw,
-                dict(sample.words) if sample.words else NO_WORDS,
+                yaw=sample.yaw,
+                said=dict(sample.words) if sample.words else NO_WORDS,
             )
             if not self._lean:
                 self._received.add((link, arrival, sample))

@@ -66,7 +66,7 @@ def say(session: zenoh.Session, key: str, payload: bytes) -> None:
 
 def forged(robot: str) -> bytes:
     """A pose that every check would believe."""
-    return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    return messages.encode(messages.pose(robot, 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
 
 
 def settled(laboratory: Laboratory, seconds: float = 0.5) -> None:

@@ -156,7 +156,7 @@ def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
     flight.until_said("phase conductor: formation")
     endpoints = (flight.folder / "network.txt").read_text().split()
     stop = messages.encode(messages.Stop("mallory", "because"))
-    pose = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    pose = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
     for who in ("KH09", "KH02", "observer", "recorder"):
         with network.open_session(endpoints, name="intruder", identity=who) as intruder:
             for _ in range(10):

@@ -105,7 +105,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
     finally:
         looker.close()
     before = made.statuses()
-    forged = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+    forged = messages.encode(messages.pose("KH01", 10**9, time.time(), [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0))
     stop = messages.encode(messages.Stop("mallory", "because"))
     for mode in ("client", "router"):  # the latter would be a link, were it a router's certificate
         chosen = config(settings("client", connect=[other], name="intruder", identity="KH03"))

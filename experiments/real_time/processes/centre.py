@@ -128,7 +128,7 @@ class CentreProcess:
             pose = received.pose
             yaw = nan if pose.yaw is None else pose.yaw
             velocity = pose.velocity or messages.STILL
-            self.centre.receive(row, pose.position, velocity, yaw, received.measured - self._utc, arrival)
+            self.centre.receive(row, pose.position, velocity, received.measured - self._utc, arrival, yaw=yaw)
             self._received[row] += self._within_run(pose.stamp - self._utc)
 
     def _within_run(self, stamp: float) -> bool:

@@ -45,7 +45,7 @@ class Desk:
     def hear(self, rows, t, places=None, stamp=None):
         for row in rows:
             place = (self.places if places is None else places)[row]
-            self.centre.receive(row, place, STILL, 0.0, t if stamp is None else stamp, t)
+            self.centre.receive(row, place, STILL, t if stamp is None else stamp, t, yaw=0.0)
 
     def decide(self, t):
         """Goals by row."""

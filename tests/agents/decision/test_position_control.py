@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.body.kinds import KINDS
-from agents.decision.position_control import REACHED, TURNED, PositionController, drive
+from agents.body.kinds import KINDS, Agility
+from agents.decision.position_control import REACHED, TURNED, PositionController, TwoWheels
 from agents.kinds.crazyflie import CRAZYFLIE
 from agents.kinds.khepera4 import KHEPERA4
 from agents.kinds.tello import TELLO
@@ -19,7 +19,7 @@ FEW = settings(max_examples=25)
 GROUND = pytest.mark.parametrize("kind", [KHEPERA4, TURTLEBOT3], ids=lambda kind: kind.name)
 PLACE = st.tuples(*[st.floats(-0.6, 0.6)] * 2)
 YAW = st.floats(-pi, pi)
-UNIT = {"response": 1.0, "turn_response": 1.5, "speed": 1.0, "turn_rate": 9.0}
+UNIT = Agility(response=1.0, turn_response=1.5, speed=1.0, turn_rate=9.0)
 
 
 def run(kind, start, yaw, goal, goal_yaw, *, seconds=16.0, dt=0.02, late=0):
@@ -65,13 +65,13 @@ def test_end_that_drives_ahead_is_chosen_once(kind, late):
 
 
 def test_wheels_drive_backward_to_what_lies_behind():
-    assert drive(0.2, 0.0, 0.0, nan, **UNIT) == pytest.approx((0.2, 0.0))
-    assert drive(-0.2, 0.0, 0.0, nan, **UNIT) == pytest.approx((-0.2, 0.0))
+    assert TwoWheels().twist(0.2, 0.0, 0.0, nan, UNIT) == pytest.approx((0.2, 0.0))
+    assert TwoWheels().twist(-0.2, 0.0, 0.0, nan, UNIT) == pytest.approx((-0.2, 0.0))
 
 
 def test_farias_law():
     bearing, distance = 0.7, 0.3
-    twist = drive(distance * cos(bearing), distance * sin(bearing), 0.0, nan, **UNIT)
+    twist = TwoWheels().twist(distance * cos(bearing), distance * sin(bearing), 0.0, nan, UNIT)
     assert twist == pytest.approx((distance * (pi - bearing) / pi, 1.5 * sin(bearing)))
 
 

@@ -188,10 +188,10 @@ def test_deviation_counts_in_metres():
 
 
 def test_poses_without_words_are_as_they_were():
-    pose = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0), 0.5)
+    pose = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0), yaw=0.5)
     text = b'{"robot":"A","seq":1,"stamp":2.0,"position":[1.0,2.0,3.0],"velocity":[0.0,0.0,0.0],"yaw":0.5}'
     assert messages.encode(pose, "json") == text
-    spoken = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), UNKNOWN, nan, (("x", (1.0, 2.0)), ("y", (nan,))))
+    spoken = messages.pose("A", 1, 2.0, (1.0, 2.0, 3.0), UNKNOWN, yaw=nan, words=(("x", (1.0, 2.0)), ("y", (nan,))))
     assert messages.encode(spoken, "json").endswith(b'"shared":[{"name":"x","value":[1.0,2.0]}]}')
     for mime in ("json", "msgpack"):
         payload = messages.encode(spoken, mime)

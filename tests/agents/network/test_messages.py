@@ -201,7 +201,7 @@ def test_the_largest_honest_state_fits():
 
 
 def test_a_pose_is_rounded_to_what_sensors_know():
-    made = wire.pose("KH01", 7, 1.23456789, [1 / 3, -2 / 3, 0.0], [1e-9, 1.0, -1.0], 2.0000004)
+    made = wire.pose("KH01", 7, 1.23456789, [1 / 3, -2 / 3, 0.0], [1e-9, 1.0, -1.0], yaw=2.0000004)
     assert made == Pose("KH01", 7, 1.234568, (0.333333, -0.666667, 0.0), (0.0, 1.0, -1.0), 2.0)
 
 
@@ -209,7 +209,7 @@ def test_a_pose_is_rounded_to_what_sensors_know():
 def test_unknown_numbers_are_left_out(encoding):
     nothing = [math.nan] * 3
     for said in (
-        wire.pose("A", 1, 1000.0, [0.1, 0.2, 0.3], nothing, math.nan),
+        wire.pose("A", 1, 1000.0, [0.1, 0.2, 0.3], nothing, yaw=math.nan),
         State("A", 1, 1000.0, "ready", wire.vector([0.1, 0.2, math.nan]), wire.vector(nothing), wire.heading(math.inf)),
         wire.position("A", 1000.0, [0.1, 0.2, 0.3], math.nan),
     ):
@@ -222,7 +222,7 @@ def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
     """Yaw of robots on wheels is counted on; beyond 1000 rad every reader refused the pose (159 turns)."""
     for yaw in (0.0, 3.1, -3.1, 1000.5, -1e6, 1e9):
         poses = (
-            wire.pose("KH01", 1, 999.0, [0.0] * 3, [0.0] * 3, yaw),
+            wire.pose("KH01", 1, 999.0, [0.0] * 3, [0.0] * 3, yaw=yaw),
             wire.position("KH01", 999.0, [0.0] * 3, yaw),
         )
         for said in poses:

@@ -56,7 +56,7 @@ class Robot:
                 channel.add(Sample(key, **what))
 
     def pose(self, seq: int, x: float, *, session: str | None, age: float = 0.0, speed: float = 0.0) -> None:
-        said = messages.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], 0.0)
+        said = messages.pose("B", seq, UTC + self.t - age, [x, 0.0, 0.0], [speed, 0.0, 0.0], yaw=0.0)
         self.tell(KEYS.pose("B"), payload=messages.encode(said), session=session)
 
     def token(self, session: str | None, *, gone: bool = False) -> None:

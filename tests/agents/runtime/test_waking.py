@@ -47,7 +47,8 @@ class Stage:
         while self.arrivals and self.arrivals[0] <= end - 1000.0:
             self.now = max(self.now, 1000.0 + self.arrivals.pop(0))
             self.seq += 1
-            pose = messages.pose("B", self.seq, self.runtime._utc + self.now - 1000.0, [0.4, 0.0, 0.0], [0.0] * 3, 0.0)
+            stamp = self.runtime._utc + self.now - 1000.0
+            pose = messages.pose("B", self.seq, stamp, [0.4, 0.0, 0.0], [0.0] * 3, yaw=0.0)
             for channel in self.net.channels:
                 if channel.key == KEYS.pose("B"):
                     channel.add(Sample(channel.key, messages.JSON, messages.encode(pose)))

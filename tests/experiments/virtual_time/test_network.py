@@ -123,7 +123,7 @@ def test_samples_have_their_size_on_the_wire(encoding):
     channel = Channel(delay_s=0.0, bandwidth=bandwidth)
     got = Talk(channel, more={"network": Network(encoding=encoding)}).run(1, [0, 1]).run(40).received
     for link, row in ((A_TO_B, 0), (A_TO_C, 0), (B_TO_A, 1), (B_TO_C, 1)):
-        pose = messages.pose("AB"[row], 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], 0.0)
+        pose = messages.pose("AB"[row], 1, EPOCH, [float(row), 0.0, 1.0], [-float(row), -0.0, -1.0], yaw=0.0)
         size = len(messages.encode(pose, encoding))
         assert size > 60
         assert got.arrival[got.link == link] == pytest.approx(8.0 * size / bandwidth, abs=1e-12)
