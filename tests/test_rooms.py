@@ -200,7 +200,6 @@ CHOOSES_PLUGINS = {
     "experiments.definition.plan",
     "experiments.file.structure",  # structs of parameters, for the check of types
     "experiments.metrics.metric",
-    "twins.body",  # the engine of a world
 }
 
 

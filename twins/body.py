@@ -13,16 +13,14 @@ from agents.body.external_pose import PATIENCE_S, External, velocity_after
 from agents.body.interface import BodyRequest, BodyState, Disturbance
 from agents.body.kinds import Kind
 from agents.body.shadow_twin import Placeable
-from agents.plugins import registry
 from agents.vectors import NO_SETPOINT, ZERO, Setpoint, Vector
-from twins.engines.engine import Engine, EngineFactory, Motion, Stage, Touch
+from twins.engines.engine import Engine, Motion, Stage, Touch, World
 from twins.engines.point_mass import PointMassEngine, model, require_models
 from twins.models import noise
 from twins.models.disturbance import Drift, HoverJitter, Latency, Measurement
 from twins.models.onboard_flight import OnboardFlight
 
 if TYPE_CHECKING:  # a process of one robot needs no scene, which needs numpy
-    from twins.scene import World
     from twins.sensing.range_sensors import RangeSensors
 
 CATCH_UP_S = 1.0  # a process that was frozen for longer resumes where it was: the lost time is not simulated
@@ -176,7 +174,7 @@ class TwinBody(Placeable):
     twins: list[Twin]
 
     def __init__(self, request: BodyRequest, world: World | None = None, substeps: int = 1) -> None:
-        """Without a world every robot is alone; raises BodyError or PluginError for an unknown kind or engine.
+        """Without a world every robot is alone; raises BodyError for a kind without a twin, or a missing library.
 
         `substeps`: steps of the models in a tick.
         """
@@ -193,8 +191,7 @@ class TwinBody(Placeable):
         else:
             mirrored = world.mirrored
             stage = Stage(request.kinds, request.start, request.yaw, dt, mirrored, world.scene)
-            factory: EngineFactory = registry.build(registry.ENGINES, world.engine)
-            self.engine = factory.build(stage)
+            self.engine = world.engine.build(stage)
             if type(self.engine) is PointMassEngine:
                 self._alone = self.engine
         self.twins = [

@@ -213,14 +213,3 @@ def _disjoint(polygon: Array, low: Array, high: Array) -> bool:
     mine, other = polygon @ axes.T, rectangle @ axes.T
     gap = np.maximum(other.min(axis=0) - mine.max(axis=0), mine.min(axis=0) - other.max(axis=0))
     return bool((gap > 0.0).any())
-
-
-@dataclass(frozen=True)
-class World:
-    """World shared by n twins; sequences have an entry for each."""
-
-    scene: Scene
-    engine: str | Mapping[str, object]  # registered engine: name, or table with `kind` and parameters
-    sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.SENSORS`)
-    sensor_noise: float  # of the range sensors, as a multiple of the real noise
-    mirrored: Sequence[bool]  # robots that really are elsewhere, shown here at their received poses

@@ -92,7 +92,7 @@ class Centre:
             return
         robot.position, robot.velocity, robot.yaw, robot.stamp = position, velocity, yaw, stamp
         for computer, link in robot.receivers:
-            computer.neighbours.receive(link, position, velocity, stamp, arrival, yaw, robot.words)
+            computer.neighbours.receive(link, position, velocity, stamp, arrival, yaw=yaw, said=robot.words)
 
     def begin_plan(self, row: int, origin: Pose) -> None:
         """Begin the plan of a robot that began at `origin`, x, y, z [m] and yaw [rad], before this controller."""

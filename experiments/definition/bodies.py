@@ -17,7 +17,8 @@ from agents.vectors import Vector, clamp
 from experiments.definition.experiment import VICON_TWIN, WORLD
 from experiments.definition.plan import Plan
 from twins import scene as outlines
-from twins.scene import Scene, World
+from twins.engines.engine import World
+from twins.scene import Scene
 
 BODIES: Final = ("twin", "world", "protocol")  # what `--bodies` takes
 TRIES: Final = 200  # places that are drawn for a robot before it stays where the file puts it
@@ -91,7 +92,7 @@ def shared_world(plan: Plan, names: Sequence[str], *, sensing: bool | None = Non
         carried.append(own if used or robot.sensors else ())
     return World(
         scene=plan.scene,
-        engine=experiment.world.engine,
+        engine=plan.engine,
         sensors=tuple(carried),
         sensor_noise=experiment.world.sensor_noise,
         mirrored=(False,) * len(names),

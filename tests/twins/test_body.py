@@ -19,7 +19,10 @@ from agents.plugins.registry import load
 from agents.vectors import NO_SETPOINT, ZERO
 from tests.twins.requests import request
 from twins.body import CATCH_UP_S, TwinBody
-from twins.scene import Scene, World
+from twins.engines.engine import World
+from twins.engines.point_mass import PointMass
+from twins.engines.pymunk_engine import Planar
+from twins.scene import Scene
 
 DT = 0.01
 AHEAD = (0.2, 0.0, 0.0, 0.0)
@@ -138,7 +141,7 @@ def test_hover_jitter_fades_on_the_way_down():
     assert (state.true_position, state.flying) == (ZERO, False)
 
 
-@pytest.mark.parametrize("engine", ["point-mass", "pymunk"])
+@pytest.mark.parametrize("engine", [PointMass(), Planar()], ids=["point-mass", "pymunk"])
 def test_wind_pushes_what_flies_by_the_error_of_its_loop(engine):
     world = World(Scene.empty(), engine, ((),) * 2, 1.0, (False,) * 2)
     twin = TwinBody(request((CRAZYFLIE, KHEPERA4), STARTS[:2], disturbance=Disturbance(wind=(0.8, -0.3))), world)
@@ -268,7 +271,7 @@ def test_external_pose_replaces_the_measured_one():
 
 
 def test_mirrored_robot_is_where_it_is_shown():
-    world = World(Scene.empty(), "point-mass", ((), ()), 1.0, (False, True))
+    world = World(Scene.empty(), PointMass(), ((), ()), 1.0, (False, True))
     twin = TwinBody(request((KHEPERA4, CRAZYFLIE)), world)
     states = twin.read(DT)
     assert np.isnan(states[1].position).all()

@@ -35,7 +35,7 @@ def main(endpoint: str, name: str, hz: str, *neighbours: str) -> int:
             time.sleep(max(0.0, due - time.monotonic()))
             seq += 1
             place = [0.123456 + 1e-6 * seq, -0.5, 0.8]
-            poses.put(messages.encode(messages.pose(name, seq, time.time(), place, [0.01, 0.02, 0.0], 0.1), "json"))
+            poses.put(messages.encode(messages.pose(name, seq, time.time(), place, [0.01, 0.02, 0.0], yaw=0.1), "json"))
             for subscriber in subscribers:
                 for sample in network.received(subscriber.handler):
                     messages.decode(sample.payload.to_bytes(), str(sample.encoding), messages.Pose)

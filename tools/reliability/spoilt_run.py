@@ -250,7 +250,8 @@ class SpoiltRun:
 
     def spoil(self, robot: str, session: zenoh.Session) -> int:
         """Send nonsense on every key that a robot and its body read, but the stop's; return the number of payloads."""
-        keys, whole = self._keys, messages.encode(messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0))
+        keys, absurd = self._keys, messages.pose(robot, 1, 0.0, [9e9, 0.0, 0.0], [0.0, 0.0, 0.0], yaw=0.0)
+        whole = messages.encode(absurd)
         read = (keys.pose, keys.position, keys.setpoint, keys.state, keys.status, keys.goal, keys.ranges)
         for key in read * GARBAGE:
             payloads = (

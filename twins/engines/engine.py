@@ -183,6 +183,17 @@ class EngineFactory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise TypeError(f"{type(self).__name__} must define `build`")
 
 
+@dataclass(frozen=True)
+class World:
+    """World shared by n twins; sequences have an entry for each."""
+
+    scene: Scene
+    engine: EngineFactory
+    sensors: Sequence[tuple[str, ...]]  # range sensors, by name (`twins.sensing.range_sensors.SENSORS`)
+    sensor_noise: float  # of the range sensors, as a multiple of the real noise
+    mirrored: Sequence[bool]  # robots that really are elsewhere, shown here at their received poses
+
+
 def require_carried(engine: EngineFactory, kinds: Iterable[Kind]) -> None:
     """Raises BodyError for kinds whose motion an engine does not carry."""
     if refused := sorted({kind.name for kind in kinds if not isinstance(kind.motion, engine.CARRIES)}):

@@ -20,9 +20,8 @@ import numpy as np
 from agents.body.interface import BodyError, BodyRequest, RangeScan
 from agents.protocols.khepera4 import LIGHT_BEARING, RIM, SOUND_BEARING
 from twins.arrays import Array, Index
-from twins.engines.engine import Engine
+from twins.engines.engine import Engine, World
 from twins.models.noise import stream
-from twins.scene import World
 from twins.sensing.ray_casting import Beams, Caster, Fan
 
 DRAWN_AHEAD: Final = 512  # numbers per robot and sensor

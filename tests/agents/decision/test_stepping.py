@@ -100,7 +100,7 @@ def test_neighbours_are_heard_and_forgotten():
     def say(bench):
         for link in range(2):
             words = {"count": (3.0,)} if link else {"count": (3.0, 4.0), "other": (1.0,)}  # of another size
-            bench.neighbours.receive(link, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, 0.3, words)
+            bench.neighbours.receive(link, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, yaw=0.3, said=words)
 
     bench.step(0.3, say)
     assert bench.robot.stepping.measures == {"heard": 1.0}
@@ -234,7 +234,9 @@ def test_the_law_of_the_docs_steps():
     def say(bench):
         for link in range(2):
             words = {"x": (1.0,), "q": (0.0,)}
-            bench.neighbours.receive(link, (0.5, 0.5 * link, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, nan, words)
+            bench.neighbours.receive(
+                link, (0.5, 0.5 * link, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, yaw=nan, said=words
+            )
 
     bench.running(say).step(3.0, say)
     assert 1.0 < bench.robot.stepping.memory["x"][0] < 3.0

@@ -177,7 +177,7 @@ def talk(bench, order=1):
             swing = 0.1 * sin(3.0 * bench.t + link)
             said = {name: tuple(swing + 0.1 * k for k in range(size)) for name, size in stepping.says.items()}
             x, y, z = PLACES[bench.neighbours.all[link].name]
-            bench.neighbours.receive(link, (x + swing, y, z), (0.1, 0.0, 0.0), bench.t, bench.t, 0.3, said)
+            bench.neighbours.receive(link, (x + swing, y, z), (0.1, 0.0, 0.0), bench.t, bench.t, yaw=0.3, said=said)
     drive(bench)
 
 
@@ -212,11 +212,11 @@ def test_laws_that_remember_keep_what_they_know(name):
     bench.position = place
     bear(0.5, talk)
     words = {name: (nan,) * size for name, size in stepping.says.items()}
-    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, nan, words)
+    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t, bench.t, yaw=nan, said=words)
     bear(0.5, drive)
     old = {name: (9.0,) * size for name, size in stepping.says.items()}
     before = bench.neighbours.all[0].said
-    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t - 1.0, bench.t, nan, old)
+    bench.neighbours.receive(0, (0.5, 0.5, 0.0), (0.0, 0.0, 0.0), bench.t - 1.0, bench.t, yaw=nan, said=old)
     assert bench.neighbours.all[0].said == before
 
 

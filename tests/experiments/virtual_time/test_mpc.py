@@ -118,7 +118,7 @@ def come(bench):
     """B stands, and says that it comes; C stands elsewhere."""
     path = tuple(number for k in range(16) for number in (0.4 - 0.04 * k, 0.0))
     for link, place, words in ((0, (0.4, 0.0, 0.0), {"path": path}), (1, (0.0, -1.5, 0.0), {})):
-        bench.neighbours.receive(link, place, ZERO, bench.t, bench.t, 0.0, words)
+        bench.neighbours.receive(link, place, ZERO, bench.t, bench.t, yaw=0.0, said=words)
 
 
 @pytest.fixture

@@ -17,8 +17,9 @@ from tests.twins.planar_drive import columns, command, stage
 from tests.twins.requests import request
 from tests.twins.runge_kutta import runge_kutta
 from twins.body import TwinBody
+from twins.engines.engine import World
 from twins.models.quadrotor import GRAVITY, Quadrotor
-from twins.scene import Obstacle, Scene, World
+from twins.scene import Obstacle, Scene
 
 pytest.importorskip("mujoco", reason="the engine mujoco is the extra [mujoco]: ./zenpark install mujoco-core")
 
@@ -320,7 +321,7 @@ def test_mirrored_robots_are_where_they_are_shown():
 
 def twin(kinds, disturbance=None):
     rows = len(kinds)
-    world = World(Scene.empty(), "mujoco", ((),) * rows, 1.0, (False,) * rows)
+    world = World(Scene.empty(), RigidBody(), ((),) * rows, 1.0, (False,) * rows)
     return TwinBody(request(kinds, disturbance=disturbance), world)
 
 
@@ -370,7 +371,8 @@ def test_missing_library_is_named(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.nightly
 def test_drones_hunt_with_the_gain_of_wheels():
-    from experiments.definition.experiment import Link, World  # noqa: PLC0415
+    from experiments.definition.experiment import Link  # noqa: PLC0415
+    from experiments.definition.experiment import World as WorldTable  # noqa: PLC0415
     from experiments.definition.plan import Plan  # noqa: PLC0415
     from experiments.file import document  # noqa: PLC0415
     from experiments.virtual_time.simulation import simulate  # noqa: PLC0415
@@ -384,7 +386,7 @@ def test_drones_hunt_with_the_gain_of_wheels():
             for pair, link in park.formation.links.items()
         }
         formation = msgspec.structs.replace(park.formation, links=formed)
-        parts = {"formation": formation, "world": World(engine="mujoco"), "duration_s": 20.0, "timeline": []}
+        parts = {"formation": formation, "world": WorldTable(engine="mujoco"), "duration_s": 20.0, "timeline": []}
         log = simulate(Plan(msgspec.structs.replace(park, **parts)), (1,))
         place = log.true_position[(log.time > 15.0) & (log.time < 20.0)]
         apart = np.linalg.norm(place[:, links.receiver] - place[:, links.sender], axis=2)

@@ -15,9 +15,9 @@ from agents.kinds.turtlebot3 import TURTLEBOT3
 from agents.vectors import ZERO
 from tests.twins.requests import request
 from twins.body import TwinBody
-from twins.engines.engine import Stage
+from twins.engines.engine import Stage, World
 from twins.engines.point_mass import PointMass
-from twins.scene import Obstacle, Scene, World
+from twins.scene import Obstacle, Scene
 from twins.sensing import range_sensors
 from twins.sensing.range_sensors import SENSORS, RangeSensors
 
@@ -25,7 +25,7 @@ from twins.sensing.range_sensors import SENSORS, RangeSensors
 def placed(kinds, carried, *, obstacles=None, size=(6.0, 6.0, 2.5), noise=0.0, mirrored=None):
     n = len(kinds)
     scene = Scene.furnished(size, obstacles or {}, {}, walled=True)
-    return World(scene, "point-mass", tuple(carried), noise, mirrored or (False,) * n)
+    return World(scene, PointMass(), tuple(carried), noise, mirrored or (False,) * n)
 
 
 def engine_of(asked, world):
