@@ -26,6 +26,7 @@ pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark in
 
 NAMES = [f"CF{number:02}" for number in range(1, 9)]
 CONTACT = 0.13  # m, between the axes of two Crazyflies
+WITHOUT = tuple(f"robots.{name}.avoids=false" for name in NAMES)  # the plans alone
 CASES = [pytest.param(number, marks=[] if number < 3 else pytest.mark.nightly) for number in range(20)]
 
 
@@ -70,14 +71,37 @@ def nearest(trace):
     return np.linalg.norm(place[:, first] - place[:, second], axis=2).min()
 
 
+def farthest(trace, goals):
+    """Distance from its goal of the robot that is farthest from it at the end [m]."""
+    return np.linalg.norm(trace.true_position[-1, :, :2] - goals, axis=1).max()
+
+
 @pytest.mark.parametrize("number", CASES)
 @pytest.mark.parametrize("swap", [opposite, random])
 def test_eight_robots_swap_places_without_contact(swap, number):
     starts, goals = swap(number)
     trace = flown(starts, goals)
     assert nearest(trace) > CONTACT
-    left = np.linalg.norm(trace.true_position[-1, :, :2] - goals, axis=1)
-    assert left.max() < 0.05
+    assert farthest(trace, goals) < 0.05
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("swap", "changes", "touching", "waiting"),
+    [
+        pytest.param(opposite, WITHOUT, 0, 0, id="opposite-without-avoidance"),
+        pytest.param(random, WITHOUT, 0, 0, id="random-without-avoidance"),
+        pytest.param(crowded, (), 0, 1, id="crowded"),
+        pytest.param(crowded, WITHOUT, 0, 0, id="crowded-without-avoidance"),
+        pytest.param(opposite, (*WITHOUT, "formation.law.right=0.0"), 4, 0, id="not-to-the-right"),
+    ],
+)
+def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, waiting):
+    """Counts of 20 cases, as docs/mpc.md has them."""
+    ends = [(flown(starts, goals, *changes), goals) for starts, goals in map(swap, range(20))]
+    assert sum(nearest(trace) < CONTACT for trace, _ in ends) == touching
+    assert sum(farthest(trace, goals) > 0.05 for trace, goals in ends) == waiting
 
 
 @pytest.mark.parametrize("case", ["event", "event-loss"])
