@@ -2,6 +2,7 @@
 
 import math
 import random
+from functools import partial
 from math import inf, isfinite, nan
 
 import pytest
@@ -13,6 +14,7 @@ from agents.robot import Robot
 from experiments.file.document import load
 
 ODD = (nan, inf, -inf, 0.0, -0.0, 1e308, -1e308, 1e-308, 5e-324, 1e154, -1e154, 1e6, -1e6)
+SLOW = partial(pytest.param, marks=pytest.mark.slow)
 
 
 class Nonsense:
@@ -76,7 +78,7 @@ def keeps_limits(robot: Robot) -> bool:
     return all(known) and math.hypot(*robot.setpoint[:1]) <= kind.speed + 1e-9
 
 
-@pytest.mark.parametrize("name", ["robotic-park", "obstacle-course", "convoy", "architectures"])
+@pytest.mark.parametrize("name", ["robotic-park", *map(SLOW, ["obstacle-course", "convoy", "architectures"])])
 @pytest.mark.parametrize("trigger", registry.names(registry.TRIGGERS))
 def test_nonsense_raises_nothing(name, trigger):
     for number, given in enumerate(load(name).cases().values()):

@@ -61,10 +61,10 @@ def test_losses_by_chance(loss):
     assert gone[1:][gone[:-1]].mean() == pytest.approx(loss, abs=0.03)  # the sample before tells nothing
 
 
-LONG = [pytest.param(0.3, 20.0, 10_000, marks=pytest.mark.slow)]
+LONG = [pytest.param(*each, marks=pytest.mark.slow) for each in ((0.1, 5.0, MANY), (0.3, 20.0, 10_000))]
 
 
-@pytest.mark.parametrize(("loss", "burst", "count"), [(0.1, 5.0, MANY), (0.3, 2.0, MANY), *LONG])
+@pytest.mark.parametrize(("loss", "burst", "count"), [(0.3, 2.0, MANY), *LONG])
 def test_losses_in_bursts(loss, burst, count):
     gone = np.concatenate([lost(link, count, loss=loss, burst=burst) for link in range(8)])
     length = bursts(gone)

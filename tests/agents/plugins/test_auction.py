@@ -62,6 +62,7 @@ def won(talking):
     return [int(each.measures["task"]) for each in talking.controls]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_sum_of_ways_is_within_the_bound_of_the_least(loss):
     gaps = []
@@ -94,6 +95,7 @@ def test_all_bid_anew_when_a_task_appears():
     assert ways <= least(begin, tasks) + EPSILON * len(places)
 
 
+@pytest.mark.slow
 def test_robots_that_begin_anew_take_no_task_twice():
     for seed in range(40):
         places, tasks, pairs = drawn(seed)

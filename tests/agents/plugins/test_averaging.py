@@ -23,6 +23,7 @@ def modes(pairs, count):
     return np.linalg.eigvalsh(np.diag(weights.sum(axis=1)) - weights).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 4])
 def test_growth_is_that_of_the_estimator(every):
     kept, lost = 0, 0

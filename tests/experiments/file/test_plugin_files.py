@@ -161,6 +161,7 @@ def test_every_process_of_the_machine_loads_it_by_its_digest(task):
     assert [run.seed for run in result.runs] == [1]
 
 
+@pytest.mark.slow
 def test_another_machine_loads_nothing(task, tmp_path, monkeypatch):
     out = tmp_path / "run"
     assert call(monkeypatch, "run", task, "--virtual", "--no-report", "--out", out) == 0
@@ -189,6 +190,7 @@ def test_hosts_do_not_load_it(task):
     assert "is a file of this machine" in refused(task)
 
 
+@pytest.mark.slow
 def test_a_bundle_runs_code_only_if_the_user_agrees(task, tmp_path, monkeypatch, capsys):
     out, archive = tmp_path / "run", tmp_path / "run.zip"
     assert call(monkeypatch, "run", task, "--virtual", "--no-report", "--out", out) == 0

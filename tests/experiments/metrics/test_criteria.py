@@ -139,6 +139,7 @@ def test_a_case_keeps_criteria_when_it_is_written():
     assert b'"relative_to"' in write_json(Plan(case))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limits", "code"), [(HALF, 0), (HALF + TIGHT, 1)])
 def test_a_run_ends_by_its_criteria(limits, code, tmp_path, monkeypatch, capsys):
     file, out = tmp_path / "task.toml", tmp_path / "run"

@@ -289,6 +289,7 @@ def test_document_has_the_shape_for_scripts():
     assert msgspec.json.decode(msgspec.json.encode(found)) == found
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_measured_by_its_own_length():
     measured = measure.measure(cut(park(), 8.0))
     whole = measure.measure(park())
