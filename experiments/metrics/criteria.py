@@ -93,7 +93,7 @@ def _measures(runs: Sequence[CaseMetrics]) -> tuple[str, ...]:
 def _values(
     asked: Criterion, runs: Sequence[CaseMetrics], reference: Mapping[int, float | None]
 ) -> dict[int, float | None]:
-    """What is judged, by seed; empty where the reference was not run."""
+    """Judged values by seed; empty where the reference was not run."""
     values = {run.seed: _value(asked, run) for run in runs}
     if asked.relative_to is None:
         return values

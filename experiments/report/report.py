@@ -42,7 +42,7 @@ PROOF: Final = (
     "Every pose carries a running number, so a gap proves a loss. Received poses are counted over all receivers "
     "together; a pose sent in the last instant of the run may still be under way."
 )
-CRITERIA: Final = "What the experiment file asks of its runs. Every seed must keep each of them."
+CRITERIA: Final = "Limits that stand in the experiment file. Every seed must keep each of them."
 CLOCKS: Final = (
     "What a host's clock read more than the conductor's, by the shortest of many round trips. The offset before the "
     "run was subtracted from all stamps there and from the start. Drift since then was corrected during the run; "

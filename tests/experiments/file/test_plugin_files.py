@@ -146,7 +146,7 @@ def test_a_changed_file_is_another_plug_in(task):
     assert len({runs.code_of(case) for case in cases}) == 2
 
 
-def test_every_process_of_the_machine_loads_it_by_its_digest(task):
+def test_every_process_loads_it_by_its_digest(task):
     case = load(task).cases()["fast"]
     written = task.parent.parent / "case.json"
     written.write_bytes(write_json(case))
@@ -191,7 +191,7 @@ def test_hosts_do_not_load_it(task):
 
 
 @pytest.mark.slow
-def test_a_bundle_runs_code_only_if_the_user_agrees(task, tmp_path, monkeypatch, capsys):
+def test_a_bundle_runs_code_by_agreement_alone(task, tmp_path, monkeypatch, capsys):
     out, archive = tmp_path / "run", tmp_path / "run.zip"
     assert call(monkeypatch, "run", task, "--virtual", "--no-report", "--out", out) == 0
     bundle.write(out, archive, [*load(task).cases().values()])
@@ -207,7 +207,7 @@ def test_a_law_in_the_subset_is_compiled(task):
     assert notes == []
 
 
-def test_text_in_no_file_looks_beside_the_current_folder(task, monkeypatch):
+def test_text_in_no_file_looks_here(task, monkeypatch):
     monkeypatch.chdir(task.parent)
     assert loads(TASK).cases().keys() == {"slow", "fast"}
 
@@ -260,14 +260,14 @@ def spread(task):
         ({"metric": "spread.py:Last", "of": "worst"}, 0.0, 0.5),
     ],
 )
-def test_a_criterion_judges_by_a_metric_in_a_file(spread, criterion, low, high):
+def test_a_criterion_names_a_metric_in_a_file(spread, criterion, low, high):
     (only,) = judged(spread, **criterion, at_most=high)
     assert low < only.values[1] < high
     assert only.passed
     assert "@" not in only.what
 
 
-def test_a_metric_in_a_file_that_cannot_be_used_is_named(spread):
+def test_an_unusable_metric_in_a_file_is_named(spread):
     assert "it has no Spred, only" in refused_criterion(spread, "spread.py:Spred")
     assert "cannot be read" in refused_criterion(spread, "sprad.py:Spread")
     (only,) = judged(spread, metric="spread.py:Broken", at_most=1.0)

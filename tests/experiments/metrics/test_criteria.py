@@ -83,7 +83,7 @@ def test_numbers_that_can_be_judged(cases, criterion, passed):
     assert answer(cases, case="periodic", **criterion) == [passed]
 
 
-def test_the_value_farthest_out_of_a_range_is_named(cases):
+def test_the_value_farthest_out_of_range_is_named(cases):
     def texts(**limits):
         found = [msgspec.structs.replace(case, seed=k, case="one") for k, case in enumerate(cases)]
         return criteria_met(with_criteria(found, Criterion(metric="f_hz", **limits)))[1].text
