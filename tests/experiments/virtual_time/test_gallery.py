@@ -47,6 +47,7 @@ def test_average_of_constant_signals_has_no_error(case, most):
     assert known.measures["disagreement"].shape == (len(known.time), 6)
 
 
+@pytest.mark.slow
 def test_average_of_ramps_has_a_bounded_error():
     known = trace("average", "periodic", "formation.law.ramp={ KH01 = 0.3, KH04 = -0.1 }", "duration_s=60")
     error = known.memory["x"][..., 0] - 3.0 - known.time[:, None] * 0.2 / 6
@@ -55,11 +56,13 @@ def test_average_of_ramps_has_a_bounded_error():
     assert np.abs(later - later[-1]).max() < 0.01  # it grows no more
 
 
+@pytest.mark.slow
 def test_events_save_messages():
     counts = [len(trace("average", case).sent) for case in CASES]
     assert counts[1] < counts[0] / 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 1e-3), ("event", 3e-3), ("event-loss", 0.01)])
 def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
     """Both ends of a link compare what was said: by events the averages keep no error but the threshold's ripple.
@@ -84,6 +87,7 @@ def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
     assert np.abs(known.memory["s"][-1] - centre).max() < 2.0 * most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_robots_fly_to_the_tasks_that_they_won(case):
     known = trace("auction", case)
@@ -104,6 +108,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
     assert np.linalg.norm(place[-1, task < 0] - place[0, task < 0], axis=1).max() < 0.05  # one is left, and stays
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_consensus_meets_at_the_mean_at_the_rate_of_the_graph(case):
     known = trace("consensus", case)
@@ -129,6 +134,7 @@ def apart_from_mean(known):
     return np.linalg.norm(place - place.mean(axis=1, keepdims=True), axis=(1, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "floor", "extra"), [("event", 0.01, 0.0), ("event-decaying", 0.005, 0.05), ("event-loss", 0.01, 0.0)]
 )
@@ -157,6 +163,7 @@ def test_consensus_by_events_stays_in_its_bound_and_keeps_events_apart(case, flo
         assert least.max() > 0.05  # more than two ticks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "silence"), [(0.0, ""), (0.2, ", maximum_silence_s = 1.0")])
 def test_consensus_by_a_share_of_the_error_keeps_its_rate_and_has_no_floor(loss, silence):
     """Dimarogonas, Frazzoli, Johansson, TAC 57(5), 2012, with the sum of a robot's errors for that of its law."""
@@ -182,6 +189,7 @@ def test_consensus_by_a_share_of_the_error_keeps_its_rate_and_has_no_floor(loss,
         assert np.diff(events[events > 2.0]).min() > share / (gain * spectrum[-1] * (1.0 + share))
 
 
+@pytest.mark.slow
 def test_followers_go_into_the_hull_of_their_leaders():
     links = {"CF01 > CF03": "link", "CF03 - CF04": "link", "CF04 - CF05": "link", "CF02 > CF05": "link"}
     words = ", ".join(f'"{name}" = "{kind}"' for name, kind in links.items())
@@ -194,6 +202,7 @@ def test_followers_go_into_the_hull_of_their_leaders():
         assert place == pytest.approx((1.0 - share) * first + share * second, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("share", [0.6, 1.0, 1.2])
 def test_pursuit_meets_circles_or_leaves_by_its_angle(case, share):
@@ -219,6 +228,7 @@ def lag(known):
     return np.linalg.norm(place - place[:, :1], axis=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.001), ("event", 0.005), ("event-loss", 0.008)])
 def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
     known = trace("leader-observer", case)
@@ -228,6 +238,7 @@ def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
     assert lag(known)[0].max() > 0.2
 
 
+@pytest.mark.slow
 def test_followers_that_do_not_know_the_velocity_lag_by_speed_over_gain():
     known = trace("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
     assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
@@ -256,6 +267,7 @@ def off_centroid(places):
     return worst
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_coverage_lowers_its_cost_and_ends_at_centroids(case):
     known = trace("coverage", case)
@@ -274,6 +286,7 @@ def five_alone():
     return costs(simulate(without_standby(given.cases()["periodic"]), 1).true_position[-1:, :, :2])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_coverage_makes_up_for_a_robot_that_lands_in_mid_flight(case):
     """The battery of CF06, a Crazyflie among Tellos, is low first."""
@@ -325,6 +338,7 @@ def test_followers_without_any_leader_stop():
     assert [control.velocity[:2] for control in controls] == [(0.0, 0.0)] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.04), ("event", 0.05), ("event-loss", 0.08)])
 def test_a_flock_keeps_spacing_and_velocity_and_its_mean_obeys_the_rendezvous(case, most):
     known = trace("flocking", case)
@@ -346,6 +360,7 @@ def test_a_flock_keeps_spacing_and_velocity_and_its_mean_obeys_the_rendezvous(ca
         mean = mean + step * speed
 
 
+@pytest.mark.slow
 def test_the_same_twice_and_another_seed_elsewhere():
     plan = document.read(index.find_file("average"), ["duration_s=5"]).cases()["event-loss"]
     first, again, other = (simulate(plan, seed) for seed in (1, 1, 2))
@@ -353,6 +368,7 @@ def test_the_same_twice_and_another_seed_elsewhere():
     assert any(not np.array_equal(first.memory[name], other.memory[name]) for name in first.memory)
 
 
+@pytest.mark.slow
 def test_a_recording_has_memory_measures_and_words(tmp_path):
     _, logbook = flown("average", "event", "duration_s=5")
     logbook.record(tmp_path / "run.mcap", "")
@@ -375,6 +391,7 @@ def out_of_place(known):
     return place[:, 1:] - place[:, :1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.002), ("event", 0.005), ("event-loss", 0.008)])
 def test_integral_action_leaves_no_error_in_a_wind(case, most):
     known = trace("integral", case)
@@ -385,6 +402,7 @@ def test_integral_action_leaves_no_error_in_a_wind(case, most):
         assert z == pytest.approx(CRAZYFLIE.response * beyond * wind, abs=0.003)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_integral_action_needs_no_leader_for_the_shape(case):
     text = index.find_file("integral").read_text()
@@ -401,6 +419,7 @@ def test_integral_action_needs_no_leader_for_the_shape(case):
     assert np.linalg.norm(drift) > 0.5  # with the wind
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_displacement_keeps_an_error_in_a_wind(case):
     known = trace("integral", case, 'formation.law={ kind = "displacement" }')
@@ -425,6 +444,7 @@ def test_an_integral_stops_at_its_limit_and_while_its_robot_is_held():
     assert memory["z"] == pytest.approx((-0.1, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_robots_enclose_a_target_that_two_of_them_see(case):
     known = trace("enclosing", case)

@@ -76,6 +76,7 @@ def farthest(trace, goals):
     return np.linalg.norm(trace.true_position[-1, :, :2] - goals, axis=1).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", CASES)
 @pytest.mark.parametrize("swap", [opposite, random])
 def test_eight_robots_swap_places_without_contact(swap, number):
@@ -104,6 +105,7 @@ def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, w
     assert sum(farthest(trace, goals) > 0.05 for trace, goals in ends) == waiting
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["event", "event-loss"])
 def test_swap_by_events_and_with_losses(case):
     starts, goals = opposite(0)
@@ -126,6 +128,7 @@ law = { kind = "mpc", goal = { KH01 = [1.0, 0.6] } }
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["crazyflie", "khepera4", "omni", "double-integrator"])
 def test_one_robot_reaches_its_goal_within_its_limits(kind):
     text = ALONE.replace("KIND", kind).replace("HOVER", "hover = 0.8" if kind == "crazyflie" else "")

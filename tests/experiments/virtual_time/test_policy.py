@@ -34,6 +34,7 @@ def offline(observations):
     return np.tanh(np.tanh(observations @ w1 + b1) @ w2 + b2) @ w3 + b3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.03), ("event", 0.04), ("event-loss", 0.04)])
 def test_a_policy_acts_in_flight_as_offline(case, most, monkeypatch):
     seen, acted, step = [], [], Policy.step
