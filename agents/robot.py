@@ -186,7 +186,7 @@ class Robot:
 
     @property
     def words(self) -> Words:
-        """What is said beside the transmitted pose: variables by name."""
+        """Variables, by name, that go out with the transmitted pose."""
         stepping = self._stepping
         if stepping is None or stepping.speech is None or self.guidance is not None:
             return ()
@@ -346,7 +346,7 @@ class Robot:
         self.finish(t)
 
     def finish(self, t: float) -> None:
-        """What follows the detection of hazards."""
+        """Everything after the detection of hazards."""
         troubled = self.causes != 0 or self.hazards.under_way
         if troubled:
             self.respond()

@@ -53,7 +53,7 @@ class _RepeatedOrder(msgspec.Struct):
 
 @dataclass(slots=True)
 class _Robot:
-    """What is known of a robot, and what was ordered."""
+    """Last state of a robot, and its orders."""
 
     name: str
     address: str

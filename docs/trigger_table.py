@@ -81,7 +81,7 @@ def written(choice: dict[str, Any] | None) -> str:
 
 
 def communication(base: Plan, seeds: Sequence[int]) -> None:
-    """Who speaks when, on a good network and on a bad one."""
+    """Transmissions by trigger, on a good network and on a bad one."""
     print("| trigger | with | f [Hz] | saved | IAE | ITAE | belief | shortest | formed | IAE, bad | formed, bad |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     reference = measured(base.changed(trigger=MATCHED["periodic"]), seeds)

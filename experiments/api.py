@@ -98,7 +98,7 @@ HOME: Final = {name: module for module, names in HOMES.items() for name in names
 
 @cache
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a class, a function or a module
-    """What a name stands for; raises AttributeError, with the nearest name, if there is none."""
+    """Object behind a name; raises AttributeError, with the nearest name, if there is none."""
     if name not in HOME:
         message = f"module 'zenpark' has no attribute {name!r}"
         if not name.startswith("__"):  # those Python itself asks for

@@ -214,7 +214,7 @@ def _flown(name: str, plan: Plan, seed: int, progress: Callable[[float], object]
 
 
 def _result(future: Future[Flown]) -> Flown:
-    """What another process has flown; raises ExplainedError if it was killed."""
+    """Run of another process; raises ExplainedError if it was killed."""
     try:
         return future.result()
     except BrokenProcessPool:

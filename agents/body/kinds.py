@@ -79,7 +79,7 @@ class Airframe:
 
 @dataclass(frozen=True)
 class ProtocolTwin:
-    """What `--bodies protocol` makes of a robot."""
+    """Protocol twin of a kind, for `--bodies protocol`."""
 
     body: str  # of the group `zenpark.devices`
     process: str | None = None  # that the robots of a kind share, if one link carries several
@@ -222,7 +222,7 @@ class Kinds(Mapping[str, Kind]):
             self.loaded[figures.name] = Kind(**msgspec.structs.asdict(figures))
 
     def usable(self) -> list[Kind]:
-        """Those that can be used."""
+        """Kinds that can be used."""
         found = []
         for name in self:
             try:

@@ -24,7 +24,7 @@ DIGITS: Final = 7  # significant ones of what is said: units are unknown
 
 
 class Speech:
-    """What a robot says beside its pose; triggers ask how far neighbours are from it.
+    """Variables that a robot transmits with its pose; triggers ask how far neighbours are from it.
 
     Before its first step it says nothing: a robot that joins a run under way would draw the others to values that do
     not move yet.
@@ -58,7 +58,7 @@ class Speech:
         return worst
 
     def record(self) -> None:
-        """It is said now."""
+        """Note that the present words are transmitted now."""
         if self._stepped:
             self.said, self.spoken = self.now, True
 
@@ -163,7 +163,7 @@ class Stepping:
             self.speech.update(self.memory)
 
     def rehearse(self, view: View) -> Control:
-        """What the law decides; nothing is kept. Raises PluginError where a result is not what it must be."""
+        """Step of the law, of which nothing is kept. Raises PluginError where a result is not what it must be."""
         law, memory = self._law, self.memory
         control = law.step(view, memory)
         if not isinstance(control, Control):

@@ -1,4 +1,4 @@
-"""What a robot knows of its formation: targets of links, anchors, changes of shape.
+"""Knowledge of a robot about its formation: targets of links, anchors, changes of shape.
 
 May import: agents.vectors.
 """

@@ -65,7 +65,7 @@ class Pose(BarePose, frozen=True, omit_defaults=True):
 
 
 class Memory(Message, frozen=True, omit_defaults=True):
-    """What the law of a robot remembers and measures, for recorder and viewers; unknown variables are left out."""
+    """Memory and measures of a robot's law, for recorder and viewers; unknown variables are left out."""
 
     robot: str
     seq: int
@@ -450,7 +450,7 @@ def variables(values: Iterable[tuple[str, Sequence[float]]]) -> list[Variable]:
 def memory(
     robot: str, seq: int, stamp: float, variables_: Mapping[str, Sequence[float]], measures: Mapping[str, float]
 ) -> Memory:
-    """What a law remembers and measures, to send."""
+    """Message with the memory and the measures of a law."""
     numbers = ((name, (value,)) for name, value in measures.items())
     return Memory(robot, seq, stamp, variables(variables_.items()), variables(numbers))
 

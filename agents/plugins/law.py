@@ -84,7 +84,7 @@ class NeighbourView:
 
 
 class View:
-    """What a robot knows at a step of its law."""
+    """Knowledge of a robot at a step of its law."""
 
     __slots__ = (
         "leads", "moves", "neighbours", "position", "robot", "said", "scan", "step_s", "target", "target_velocity",
@@ -118,7 +118,7 @@ class View:
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a step of a law decides; with neither velocity nor goal the robot stays where it is."""
+    """Result of a step of a law; with neither velocity nor goal the robot stays where it is."""
 
     memory: Memory = {}  # all variables, as they are from now on
     velocity: Vector | None = None  # [m/s]; the third NaN: the height is held

@@ -109,7 +109,7 @@ def _fitting(group: str, name: str, plugin: Any) -> Any:  # noqa: ANN401 - likew
 
 
 def _fault_of(plugin: Any, path: str) -> str:  # noqa: ANN401 - likewise
-    """What a plug-in lacks of the base at a `path`, `module:name`; empty for one that lacks nothing."""
+    """Parts that a plug-in lacks of the base at a `path`, `module:name`; empty for one that lacks nothing."""
     base = find(path, "base of a plug-in")
     if not (isinstance(plugin, type) and issubclass(plugin, base)):
         return f"must be a class that inherits from {FACE}.{base.__name__}"

@@ -1,4 +1,4 @@
-"""What a check says: findings with severity, code, message and remedy at a place of the file, and figures."""
+"""Results of a check: findings with severity, code, message and remedy at a place of the file, and figures."""
 
 from __future__ import annotations
 

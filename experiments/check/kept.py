@@ -34,7 +34,7 @@ OTHERS: Final = 0o022  # mode of a folder in which others may write
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What a check says of an experiment."""
+    """Kept results of a check of an experiment."""
 
     path: str  # of its file
     title: str

@@ -301,7 +301,7 @@ def _lost(what: str, spare: Mask, needed: list[str]) -> str:
 
 
 def law(analysis: Analysis) -> Iterator[Finding]:
-    """What a law that remembers knows of its own theory, and what must not be lost of what it says."""
+    """Theory of a law that remembers, as the law knows it, and words that must not be lost."""
     plan, path = analysis.plan, ("formation", "law")
     channel = plan.experiment.channel
     losses = [channel.loss, *(each.loss or 0.0 for each in channel.links.values())]

@@ -19,7 +19,7 @@ RELEASE: Final = 1.1  # of the range: what separates coming from going, so that 
 
 
 class TargetKind(NamedTuple):
-    """What a law that needs a kind of target takes of a link."""
+    """Kind of target that a law takes of a link."""
 
     fields: tuple[str, ...]  # of `Target` that give it; the first is the one that a drawn shape gives
     words: str

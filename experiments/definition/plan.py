@@ -108,7 +108,7 @@ class Plan:
 
     @property
     def target_kind(self) -> TargetKind:
-        """What the law takes of a link."""
+        """Kind of target that the law takes of a link."""
         return TARGET_KINDS[self.law.NEEDS]
 
     @property

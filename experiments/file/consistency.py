@@ -329,7 +329,7 @@ def _triggers(plan: Plan) -> Iterator[Fault]:
 
 
 def _remembering(plan: Plan) -> Iterator[Fault]:
-    """What a law that is no gradient does not go with: it has no errors, and its memory is the robot's own."""
+    """Settings that exclude a law that is no gradient: such a law has no errors, and its memory is the robot's own."""
     experiment, name, kind = plan.experiment, plan.law_name, plan.trigger_name
     if isinstance(plan.law, Gradient):
         return

@@ -95,7 +95,7 @@ class Planned:
 
 
 class Ledger:
-    """What a run notes."""
+    """Notes of a run."""
 
     __slots__ = ("count", "lean", "reason", "rows", "sample", "samples", "sent", "times")
 

@@ -151,7 +151,7 @@ def _njit(function: Callable[..., Any]) -> Any:
 
 
 def _strict(function: Callable[..., Any], name: str, value: Any) -> Any:
-    """What a name of a function of others stands for, None for what the compiler knows; raises SyntaxError."""
+    """Object behind a name in a function of others, None for one that the compiler knows; raises SyntaxError."""
     if name == POWER:
         return _njit(_power)
     if value is None and name in BUILTINS:
@@ -175,7 +175,7 @@ def _is_numbers(value: Any) -> bool:
 
 @cache
 def _strict_math() -> ModuleType:
-    """What plug-ins of others have of `math`."""
+    """Functions and constants of `math` for plug-ins of others."""
     made = ModuleType("strict_math")
     for name, function in STRICT.items():
         setattr(made, name, compiled(function))

@@ -159,7 +159,7 @@ class Logbook:
             yield messages.pose(names[row], seq, EPOCH + t, position, velocity, yaw=yaw, words=next(words))
 
     def _words(self, sent: PoseTable) -> Iterator[Words]:
-        """What was said beside each pose."""
+        """Variables transmitted with each pose."""
         ends = list(accumulate(self._log.says.values(), initial=0))
         spans = list(zip(self._log.says, pairwise(ends), strict=True))
         for row in () if sent.extra is None else sent.extra.tolist():
@@ -168,7 +168,7 @@ class Logbook:
             yield ()
 
     def _memories(self) -> Iterator[messages.Memory]:
-        """What the laws remember and measure, at each sample."""
+        """Memory and measures of the laws at each sample."""
         log = self._log
         for k, t in enumerate(log.time.tolist() if log.memory or log.measures else ()):
             for row, name in enumerate(log.names):

@@ -37,7 +37,7 @@ def is_foreign(function: Callable[..., Any]) -> bool:
 
 
 def faults(definition: ast.FunctionDef) -> Iterator[tuple[int, str]]:
-    """What a function has that is outside of the subset, each with its line in the source."""
+    """Constructs of a function outside of the subset, each with its line in the source."""
     body = [each for each in definition.body if not _is_text(each)]
     if len(body) == 1 and isinstance(body[0], ast.Raise):
         return  # a method that must be defined
@@ -51,7 +51,7 @@ def faults(definition: ast.FunctionDef) -> Iterator[tuple[int, str]]:
 
 @cache
 def outside(owner: type) -> tuple[str, ...]:
-    """What the methods of a plug-in of others have that is outside of the subset, each with its place."""
+    """Constructs outside of the subset in methods of a plug-in of others, each with its place."""
     found = []
     for function in {name: getattr(owner, name, None) for name in dir(owner) if name != "__init__"}.values():
         if inspect.isfunction(function) and is_foreign(function):

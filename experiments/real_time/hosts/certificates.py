@@ -83,7 +83,7 @@ def fingerprint(certificate: str) -> str:
 
 
 def of_host(name: str, hosts: Mapping[str, Host]) -> list[str]:
-    """Whose certificates belong into the folder of a host: of its robots, and of another's that is the same folder."""
+    """Robots whose certificates a host's folder holds, including those of hosts that share the folder."""
     place = hosts[name].address, hosts[name].lab
     return [robot for host in hosts.values() if (host.address, host.lab) == place for robot in host.robots]
 

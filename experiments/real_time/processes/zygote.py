@@ -79,7 +79,7 @@ def command(listener: socket.socket) -> list[str]:
 
 
 class Request(NamedTuple):
-    """What to run, as `python -m MODULE ARGUMENT...` does."""
+    """Module to run, as `python -m MODULE ARGUMENT...` does."""
 
     name: str  # of the process, for `ps`
     module: str
