@@ -39,6 +39,7 @@ def test_a_take_off_with_a_yaw_leaves_poses_young(monkeypatch):
         assert np.percentile(flight_of(fleet), 99) < YOUNG_S
 
 
+@pytest.mark.slow
 def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
     """More logs than polls: the drone says so by its stamps, long before a packet is lost."""
     with Fleet(monkeypatch, 1, 90.0, log_hz=100.0) as fleet:
@@ -55,6 +56,7 @@ def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
         assert not fleet.twin.flock.quadrotor.flying.any()
 
 
+@pytest.mark.slow
 def test_gaps_after_the_take_off(monkeypatch):
     """Of the file: the first is flown through, the second ends in a landing."""
     with Fleet(monkeypatch, 2, 400.0, gaps=[[4.0, 1.2], [2.0, 0.5]]) as fleet:

@@ -43,6 +43,7 @@ class Client:
         self.height = None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hover", "gap", "begin"), [(2.0, 2.0, 0.43), (2.0, 2.5, 1.0), (1.2, 2.5, 0.3), (0.8, 1.0, 0.03)]
 )
@@ -58,6 +59,7 @@ def test_gap_in_the_climb(fleet, hover, gap, begin, speed):
     assert fleet.twin.flock.supervisor.state[0] != State.CRASHED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stays_s", [0.0, 2.0, 5.0])
 def test_flight_by_another_client_is_landed(fleet, stays_s):
     """It leaves at once, or when it has ended the landing again and again."""
@@ -74,6 +76,7 @@ def test_flight_by_another_client_is_landed(fleet, stays_s):
     assert fleet.twin.flock.supervisor.state[0] != State.LOCKED
 
 
+@pytest.mark.slow
 def test_another_client_in_flight_is_ended(fleet):
     """Its setpoint mutes the planner: 2 s later the drone would lock. It flies on."""
     fleet.climb(0.5, 0.45)
@@ -87,6 +90,7 @@ def test_another_client_in_flight_is_ended(fleet):
     assert fleet.heights[0] > 0.3
 
 
+@pytest.mark.slow
 def test_another_client_cuts_the_motors(fleet):
     """By a setpoint of zero thrust, as its library sends when it closes a link; or by ending the plan. It flies on."""
     fleet.climb(0.5, 0.45)
@@ -100,6 +104,7 @@ def test_another_client_cuts_the_motors(fleet):
     assert fleet.twin.flock.supervisor.state[0] == State.FLYING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["refused", "unanswered"])
 def test_memory_that_takes_no_setpoint(fleet, how):
     """The drone descends by itself, and would stand with its motors on: it is landed. The radio is not flooded."""
@@ -134,6 +139,7 @@ def test_short_gaps_one_after_the_other(fleet):
     assert fleet.phases == {Phase.FLYING}
 
 
+@pytest.mark.slow
 def test_landing_from_eight_metres(fleet):
     fleet.climb(8.0, 7.5)
     fleet.run(3.0)

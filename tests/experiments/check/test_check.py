@@ -38,8 +38,19 @@ PARK, TRIANGLE = "robotic-park", "triangle"
 # ------------------------------------------------------------------ experiments that work
 
 
-def test_numbers_of_the_reference():
-    found = figures(document.read(PARK).cases()["event"])
+@pytest.fixture(scope="module")
+def examined():
+    """Findings on the reference experiment and figures of both cases."""
+    return examine(document.read(PARK))
+
+
+@pytest.fixture
+def park(examined):
+    return examined[0]
+
+
+def test_numbers_of_the_reference(examined):
+    found = examined[1]["event"]
     assert (found.robots, found.links, found.edges, found.parts) == (7, 21, 12, 1)
     assert found.leaders == ("TB01",)
     assert (found.rank, found.rank_needed) == (11, 11)
@@ -55,13 +66,7 @@ def test_numbers_of_the_reference():
     assert found.end["TB01"] == pytest.approx((0.15, 0.8, 0.0), abs=REACHED)
     assert found.end_inside
     assert 15.0 < found.messages_hz < 45.0  # 7 robots; published: 5.07 Hz for each follower
-    assert figures(document.read(PARK).cases()["periodic"]).messages_hz == pytest.approx(350.0)
-
-
-@pytest.fixture(scope="module")
-def park():
-    """Findings on the reference experiment, both cases."""
-    return check(document.read(PARK))
+    assert examined[1]["periodic"].messages_hz == pytest.approx(350.0)
 
 
 def test_the_reference_is_feasible_but_its_leader_is_quick(park):

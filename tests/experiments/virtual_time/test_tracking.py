@@ -53,6 +53,7 @@ def track(case, seed, *changes):
     return *squares, normalised.mean(axis=1)[::20]  # every two seconds, since errors last that long
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 1.1), ("event", 1.15), ("event-loss", 1.15)])
 def test_tracking_is_as_accurate_as_a_central_filter_and_consistent(case, most):
     runs = [track(case, seed) for seed in (1, 2, 3)]
@@ -64,12 +65,14 @@ def test_tracking_is_as_accurate_as_a_central_filter_and_consistent(case, most):
     assert low < normalised.mean() < high
 
 
+@pytest.mark.slow
 def test_tracking_by_directions():
     own, central, _ = track("periodic", 1, "formation.law.sees=direction", "formation.law.sigma=0.08")
     assert own < 1.1**2 * central
     assert own < 0.06**2
 
 
+@pytest.mark.slow
 def test_robots_that_do_not_see_the_target_know_it_from_the_others():
     text = index.find_file("tracking").read_text("utf-8")
     bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
