@@ -77,6 +77,7 @@ def farthest(trace, goals):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("number", CASES)
 @pytest.mark.parametrize("swap", [opposite, random])
 def test_eight_robots_swap_places_without_contact(swap, number):
@@ -86,6 +87,7 @@ def test_eight_robots_swap_places_without_contact(swap, number):
     assert farthest(trace, goals) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
@@ -105,6 +107,7 @@ def test_contacts_and_deadlocks_are_those_of_the_page(swap, changes, touching, w
     assert sum(farthest(trace, goals) > 0.05 for trace, goals in ends) == waiting
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["event", "event-loss"])
 def test_swap_by_events_and_with_losses(case):
