@@ -46,7 +46,9 @@ def text(page: Path) -> str:
 def test_the_site_has_every_page_and_fetches_nothing(site):
     docs = ROOT / "docs"
     pages = {
-        page.relative_to(docs).with_suffix("") for folder in (docs, docs / "results") for page in folder.glob("*.md")
+        page.relative_to(docs).with_suffix("")
+        for folder in (docs, docs / "gallery", docs / "results")
+        for page in folder.glob("*.md")
     }
     navigation = (site / "index.html").read_text("utf-8")
     assert not [page for page in pages if not (site / f"{page}.html").exists()]
