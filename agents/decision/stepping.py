@@ -30,16 +30,17 @@ class Speech:
     not move yet.
     """
 
-    __slots__ = ("_metres", "_stepped", "now", "said", "spoken")
+    __slots__ = ("_metres", "_stepped", "now", "said", "spoken", "words")
 
     now: dict[str, Values]  # variables as they are
     said: dict[str, Values]  # and as said last; at first as they begin
     spoken: bool  # it has said something
+    words: Words  # variables as said last, those that are known
 
     def __init__(self, law: Law, memory: Memory) -> None:
         self._metres = {name: said.metre for name, said in law.SAYS.items()}
         self.update(memory)
-        self.said, self.spoken, self._stepped = self.now, False, False
+        self.said, self.spoken, self._stepped, self.words = self.now, False, False, ()
 
     def update(self, memory: Memory) -> None:
         """The variables are these after a step."""
@@ -51,6 +52,8 @@ class Speech:
         if not self._stepped:
             return of_pose
         worst = of_pose if self.spoken else inf
+        if self.now is self.said:  # it has not stepped since
+            return worst
         for name, metre in self._metres.items():
             now, said = self.now[name], self.said[name]
             if is_known(now):
@@ -59,15 +62,9 @@ class Speech:
 
     def record(self) -> None:
         """Note that the present words are transmitted now."""
-        if self._stepped:
+        if self._stepped and not (self.spoken and self.said is self.now):
             self.said, self.spoken = self.now, True
-
-    @property
-    def words(self) -> Words:
-        """Variables as said last, those that are known."""
-        if not self.spoken:
-            return ()
-        return tuple((name, values) for name, values in self.said.items() if is_known(values))
+            self.words = tuple((name, values) for name, values in self.now.items() if is_known(values))
 
 
 class Stepping:
