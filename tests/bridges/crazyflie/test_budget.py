@@ -16,9 +16,9 @@ SINKS = 0.5  # [m/s] a landing is slower
     [
         (1, 400.0, {}),
         (4, 400.0, {}),
-        (8, 400.0, {"stream_hz": 7.0}),
+        pytest.param(8, 400.0, {"stream_hz": 7.0}, marks=pytest.mark.nightly),
         (15, 664.0, {"stream_hz": 5.0}),
-        (5, 250.0, {"stream_hz": 7.0}),
+        pytest.param(5, 250.0, {"stream_hz": 7.0}, marks=pytest.mark.nightly),
     ],
 )
 def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchanges, rates):

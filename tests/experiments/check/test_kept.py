@@ -150,11 +150,11 @@ def test_what_is_no_file_has_no_verdict(park, name):
 
 
 def test_old_verdicts_go(park, monkeypatch):
-    monkeypatch.setattr(kept, "MOST", 40)
-    for seed in range(45):
+    monkeypatch.setattr(kept, "MOST", 10)
+    for seed in range(13):
         KeptVerdict(str(park), [f"seed={seed}"]).keep(SAID)
-    assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 40
-    assert KeptVerdict(str(park), ["seed=24"]).read() == SAID
+    assert len(list((park.parents[1] / "cache" / "check").iterdir())) == 10
+    assert KeptVerdict(str(park), ["seed=8"]).read() == SAID
 
 
 @pytest.mark.slow

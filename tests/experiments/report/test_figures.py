@@ -35,7 +35,7 @@ RUNS = {
 
 
 LARGE = "40 robots, 5 cases"
-EVERY = [pytest.param(name, marks=pytest.mark.slow if name == LARGE else ()) for name in RUNS]
+EVERY = [pytest.param(name, marks=pytest.mark.nightly if name == LARGE else ()) for name in RUNS]
 
 
 @pytest.fixture(scope="module", params=EVERY)
