@@ -1,6 +1,6 @@
 """Pictures of the gallery: .venv/bin/python docs/gallery/draw.py [LAW ...]
 
-Behind `--real` stand folders of runs instead: their figures are printed, in the words of the table of the gallery.
+Behind `--runs` stand folders of runs instead: their figures are printed, in the words of the table of the gallery.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def draw(name: str) -> dict[str, float]:
 
 def main(words: Sequence[str]) -> None:
     """Draws laws, or prints the figures of runs."""
-    if words[:1] == ["--real"]:
+    if words[:1] == ["--runs"]:
         for folder in words[1:]:
             for case, trace in reopen(folder).traces.items():
                 subject = SUBJECTS[law_of(trace)["kind"]]
