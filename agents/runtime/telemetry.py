@@ -26,6 +26,7 @@ from agents.runtime import range_inbox
 from agents.runtime.pose_inbox import PoseInbox
 
 STATUS_S: Final = 1.0
+ROUNDING_S: Final = 1e-6
 INCIDENTS: Final = 16  # repeated in each status
 WORDS: Final = tuple(phase.word for phase in Phase)
 UNDER_WAY: Final = ("airborne", "running")
@@ -80,6 +81,7 @@ class Telemetry:
         self._receipts = [deque[messages.GoalReceipt]() for _ in names] if receipts is None else receipts
         self._seq = 0
         self._scanned = [-inf] * len(names)
+        self._told: list[tuple[object, float]] = [(None, -inf)] * len(names)  # memories sent last, and when [s]
         self._origin: list[messages.Setpoint | None] = [None] * len(names)
         self._last: list[messages.Status | None] = [None] * len(names)
         self._reported: list[tuple[object, ...]] = [()] * len(names)
@@ -113,13 +115,19 @@ class Telemetry:
             )
             for payload in messages.payloads(message, self._encoding):
                 self._states[row].put(payload)
-            if (publisher := self._memories[row]) is not None and robot.stepping is not None:
-                publisher.put(messages.encode(self._memory(row, robot.stepping, t), self._encoding))
+            if robot.stepping is not None:
+                self._send_memory(row, robot.stepping, t)
             self._neighbours.news[row].clear()
             self._receipts[row].clear()
 
-    def _memory(self, row: int, stepping: Stepping, t: float) -> messages.Memory:
-        return messages.memory(self._names[row], self._seq, self.utc + t, stepping.memory, stepping.measures)
+    def _send_memory(self, row: int, stepping: Stepping, t: float) -> None:
+        """Send what the law remembers as soon as it has stepped, and else once in the time of a step."""
+        publisher, (last, sent_at) = self._memories[row], self._told[row]
+        if publisher is None or (stepping.memory is last and t - sent_at < stepping.facts.step_s - ROUNDING_S):
+            return
+        self._told[row] = stepping.memory, t
+        memory = messages.memory(self._names[row], self._seq, self.utc + t, stepping.memory, stepping.measures)
+        publisher.put(messages.encode(memory, self._encoding))
 
     def send_ranges(self, states: Sequence[BodyState]) -> None:
         """Sends new range readings of the robots that measure them."""

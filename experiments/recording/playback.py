@@ -258,6 +258,7 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
     known = {what: each for what, each in columns.items() if what not in OPTIONAL or np.isfinite(each).any()}
     contacts = messages_in_run(content[Contact], start, duration)
     world = messages_in_run(content[WorldState], start, duration)
+    told, stepping = _by_robot(content[Memory], robots), HOLD_PERIODS / min(rate, experiment.rates.coordination_hz)
     goals = _goals(content, states, robots, start, duration) if plan.guided else None
     return Trace(
         case=about.case,
@@ -285,13 +286,8 @@ def _trace(content: _Content, about: AboutRun, run: tuple[float, float]) -> Trac
         goals=goals,
         clocks=Correction(content[HostClock]).offsets(),
         joined=_joined(states, plan, start),
-        memory=_memories(_by_robot(content[Memory], robots), start, time, HOLD_PERIODS / rate, "memory"),
-        measures={
-            name: values[..., 0]
-            for name, values in _memories(
-                _by_robot(content[Memory], robots), start, time, HOLD_PERIODS / rate, "measures"
-            ).items()
-        },
+        memory=_memories(told, start, time, stepping, "memory"),
+        measures={name: values[..., 0] for name, values in _memories(told, start, time, stepping, "measures").items()},
         **known,
     )
 
