@@ -27,7 +27,7 @@ pytest.importorskip("daqp", reason="the law mpc is the extra [mpc]: ./zenpark in
 NAMES = [f"CF{number:02}" for number in range(1, 9)]
 CONTACT = 0.13  # m, between the axes of two Crazyflies
 WITHOUT = tuple(f"robots.{name}.avoids=false" for name in NAMES)  # the plans alone
-CASES = [pytest.param(number, marks=[] if number < 3 else pytest.mark.nightly) for number in range(20)]
+CASES = [pytest.param(number, marks=[] if number < 1 else pytest.mark.nightly) for number in range(20)]
 
 
 def opposite(number):
