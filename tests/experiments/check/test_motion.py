@@ -175,10 +175,10 @@ def test_flight_with_noise_counts_messages_alone(monkeypatch):
 
     flown = simulation.simulate
 
-    def stuck_by_noise(experiment, seed, *, quiet, **how):
+    def stuck_by_noise(plan, seed, *, quiet, **how):
         if not quiet:
             raise conductor.Stuck("not ready after 60 s: R0")
-        return flown(experiment, seed, quiet=quiet, **how)
+        return flown(plan, seed, quiet=quiet, **how)
 
     monkeypatch.setattr(simulation, "simulate", stuck_by_noise)
     np.testing.assert_array_equal(predict(Plan(noisy)).position, ideal.position)

@@ -67,10 +67,10 @@ def test_run_depends_on_its_seed_alone(park):
 def test_stuck_run_leaves_the_others(park, monkeypatch):
     real = runs.simulate
 
-    def fails_with_2(experiment, seed, *, lean):
+    def fails_with_2(plan, seed, *, lean):
         if seed == 2:
             raise runs.Stuck("not airborne after 60 s: CF01")
-        return real(experiment, seed, lean=lean)
+        return real(plan, seed, lean=lean)
 
     monkeypatch.setattr(runs, "simulate", fails_with_2)
     short = msgspec.structs.replace(park, duration_s=1.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from agents.errors import ExplainedError
+from agents.plugins.triggers import SendOnDelta
 from experiments.definition.experiment import Experiment
 from experiments.definition.plan import Plan
 from experiments.file.document import load
@@ -140,10 +141,10 @@ def test_runs_that_fail_are_counted_and_named(tmp_path, monkeypatch):
 
     real = runs.simulate
 
-    def stuck(experiment, seed, *, lean):
-        if isinstance(experiment.trigger, dict) and experiment.trigger.get("threshold") == 0.02 and seed == 2:
+    def stuck(plan, seed, *, lean):
+        if plan.trigger == SendOnDelta(threshold=0.02) and seed == 2:
             raise Stuck("not airborne after 60 s: CF01")
-        return real(experiment, seed, lean=lean)
+        return real(plan, seed, lean=lean)
 
     monkeypatch.setattr(runs, "simulate", stuck)
     found = swept(tmp_path)
