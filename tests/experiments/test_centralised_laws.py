@@ -16,6 +16,7 @@ from tests.experiments.virtual_time.test_gallery import flown, trace
 CENTRALISED = "architecture=centralised"
 
 
+@pytest.mark.slow
 def test_centre_finds_the_average():
     known = trace("average", "periodic", CENTRALISED)
     assert np.abs(known.memory["x"][-1] - 3.0).max() < 1e-4
@@ -42,6 +43,7 @@ def test_guided_and_free_robots_meet():
     assert np.linalg.norm(place - place.mean(axis=1)[:, None], axis=(1, 2))[-1] < 0.03
 
 
+@pytest.mark.slow
 def test_leaders_say_their_velocity_at_the_centre():
     known = trace("leader-observer", "periodic", CENTRALISED)
     own = trace("leader-observer", "periodic")

@@ -128,6 +128,7 @@ def test_memory_that_takes_no_setpoint(fleet, how):
     drone.memories.write = write
 
 
+@pytest.mark.slow
 def test_short_gaps_one_after_the_other(fleet):
     """Each is flown through, with a moment between them that is enough for one setpoint."""
     fleet.climb(0.5, 0.45)
@@ -149,6 +150,7 @@ def test_landing_from_eight_metres(fleet):
     assert fleet.touch < TOUCHES
 
 
+@pytest.mark.slow
 def test_setpoint_lost_at_the_begin_of_a_gap(fleet):
     """A lower one that was sent, and not received: the drone is still where the last received one has led it."""
     fleet.climb(2.0, 0.3)

@@ -199,6 +199,7 @@ def test_sensor_not_due_keeps_its_readings():
     assert (second[360:] != first[360:]).all()  # 10 Hz
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "sensor", "gap", "sigma"),
     [
@@ -224,6 +225,7 @@ def test_noise_has_sigma_of_the_maker(kind, sensor, gap, sigma, scale):
     assert lost == pytest.approx(SENSORS[sensor].dropout * scale, abs=0.004)
 
 
+@pytest.mark.slow
 def test_lidar_readings_are_within_limits():
     for gap, limit in ((0.3, 0.015), (3.0, 0.15)):
         readings = facing(TURTLEBOT3, "lds01", gap, 1.0, np.arange(100) * 0.2, robots=20)

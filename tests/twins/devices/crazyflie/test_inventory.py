@@ -82,6 +82,7 @@ def files(tmp_path):
     return cached(tmp_path)
 
 
+@pytest.mark.slow
 def test_tables_of_a_real_firmware(files):
     tables = inventory(tuple(files))
     assert (len(tables.parameters.variables), len(tables.logs.variables)) == (402, 637)

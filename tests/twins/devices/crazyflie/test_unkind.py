@@ -24,6 +24,7 @@ def set_parameter(wire, name, packing, value):
 # ---------------------------------------------------------------------- commands
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("takeoff", "land"),
     [
@@ -52,6 +53,7 @@ def test_older_commands_are_flown(takeoff, land):
     assert wire.position[2] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -72,6 +74,7 @@ def test_older_setpoints_turn_the_other_way(old, new):
     assert abs(yaws[1]) == pytest.approx(math.radians(30.0), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lean", "axis", "sign"), [((10.0, 0.0), 1, -1.0), ((0.0, 10.0), 0, -1.0)])
 @pytest.mark.parametrize("kind", [Setpoint.HEIGHT, Setpoint.OLD_HEIGHT])
 def test_roll_and_pitch_are_flown(kind, lean, axis, sign):
