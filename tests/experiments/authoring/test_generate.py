@@ -70,8 +70,8 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
         assert np.abs(place - np.array(Plan(experiment).start_poses()[0])).max() > 0.1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
     experiment = written(tmp_path, "hemisphere", "100", LayoutOptions(duration_s=25.0)).experiment
     log = simulation.simulate(Plan(experiment), seed)

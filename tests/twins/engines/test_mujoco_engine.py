@@ -183,6 +183,7 @@ def test_nose_points_where_drone_flies():
     assert engine.motions[0].velocity[1] > 5 * abs(engine.motions[0].velocity[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CRAZYFLIE, TELLO])
 def test_take_off_and_landing(kind):
     engine = RigidBody().build(stage((kind,), [(0.3, -0.2)]))

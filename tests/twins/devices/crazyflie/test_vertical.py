@@ -27,6 +27,7 @@ def heights(wire, seconds, each=None):
     return np.array(reached)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["crazyflie", "brushless"])
 @pytest.mark.parametrize(("height", "span"), [(0.5, 1.5), (0.8, 2.0), (1.0, 2.5), (1.0, 2.0), (2.0, 5.0)])
 def test_take_off_overshoots_and_returns(height, span, platform):
@@ -37,6 +38,7 @@ def test_take_off_overshoots_and_returns(height, span, platform):
     assert 10.0 < away < 15.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step", "rise_ms", "overshoot"), [(0.3, 566.0, 0.09), (1.0, 733.0, 0.13)])
 def test_steps_in_height(step, rise_ms, overshoot):
     wire = Wire().hovering()
@@ -47,6 +49,7 @@ def test_steps_in_height(step, rise_ms, overshoot):
     assert reached.max() - 1.0 == pytest.approx(overshoot, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wait", [1.0, 2.5, 3.3, 6.0])
 def test_landing_from_the_overshoot_ends_on_the_floor(wait):
     """Ordered as by the bridge; the motors stop on the floor, and it does not hit it."""
@@ -62,6 +65,7 @@ def test_landing_from_the_overshoot_ends_on_the_floor(wait):
     assert np.diff(lowest).min() / DT > -0.5
 
 
+@pytest.mark.slow
 def test_thrust_in_hover_carries_the_weight():
     """29 g, and 39.3 g of a Brushless with guards, each with a deck, by the firmware's curves of thrust."""
     assert Wire().hovering().flock.vertical.thrust == pytest.approx([39300.0], rel=0.002)
@@ -71,6 +75,7 @@ def test_thrust_in_hover_carries_the_weight():
     assert brushless.hovering().flock.vertical.thrust == pytest.approx([31750.0], rel=0.002)
 
 
+@pytest.mark.slow
 def test_second_flight_overshoots_as_the_first():
     """Motors off, the loops forget."""
     wire = Wire().hovering(0.8)
