@@ -102,6 +102,12 @@ class Stepping:
         law = self._law
         if not (isinstance(law.SAYS, Mapping) and all(isinstance(said, Said) for said in law.SAYS.values())):
             raise PluginError(f"SAYS of the law {type(law).__name__} must name a Said for each variable")
+        for name, said in law.SAYS.items():
+            if not (isinstance(said.metre, Real) and said.metre > 0.0):
+                raise PluginError(
+                    f"SAYS of the law {type(law).__name__}: the metre of {name} is {said.metre!r}, not a positive "
+                    "number; infinity for a variable whose changes are no reason to transmit"
+                )
         try:
             begun = law.begin(self.facts)
         except PluginError:  # such as a library that is not installed: with its remedy
@@ -169,6 +175,8 @@ class Stepping:
         if {name: _size(values) for name, values in control.memory.items()} != sizes:
             wanted = ", ".join(f"{name} ({size})" for name, size in sizes.items()) or "no variables"
             raise wrong("law", law, "step", dict(control.memory), f"a memory of the variables and sizes {wanted}")
+        if control.velocity is not None and control.goal is not None:
+            raise wrong("law", law, "step", control, "a velocity or a goal, not both")
         for way in (control.velocity, control.goal):
             if way is not None and _size(way) != len(self._target):
                 raise wrong("law", law, "step", way, "three numbers as velocity or goal")

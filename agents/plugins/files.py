@@ -54,6 +54,8 @@ def adopt(name: str, folder: Path) -> tuple[str, Path]:
     file = folder / path
     if ".." in file.relative_to(folder).parts:
         raise ValueError(f"{path!r} leads out of the folder of the experiment; put it beside the experiment file")
+    if file.exists() and not file.is_file():  # a pipe would be waited for
+        raise ValueError(f"{path} is no file; put the Python file beside the experiment file")
     try:
         with file.open("rb") as opened:
             about, text = os.fstat(opened.fileno()), opened.read(LARGEST + 1)

@@ -122,7 +122,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     memory: Memory = {}  # all variables, as they are from now on
     velocity: Vector | None = None  # [m/s]; the third NaN: the height is held
-    goal: Vector | None = None  # [m]; likewise
+    goal: Vector | None = None  # [m]; likewise. Limited per axis and decision by `clamp` of the formation
     yaw: float = nan  # wanted [rad], NaN for any
     measures: Mapping[str, float] = {}  # numbers by name for figures and metrics, never said
 

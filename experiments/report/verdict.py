@@ -66,8 +66,17 @@ def criteria_met(cases: Sequence[CaseMetrics]) -> list[Finding]:
     return [
         Finding(mark, f"{words}: {count}."),
         *(Finding("bad", _missed(each)) for each in bad),
+        *(Finding("plain", _met(each)) for each in found if each.passed),
         *(Finding("fair", f"Not judged: {each.what} ({each.limit}), since that was not run.") for each in unknown),
     ]
+
+
+def _met(judgement: criteria.Judgement) -> str:
+    """Value that meets a criterion; of several seeds the one nearest to its limit."""
+    known = [value for value in judgement.values.values() if value is not None]
+    which = ", the nearest to its limit" * (len(known) > 1)
+    value = max(known, key=judgement.criterion.excess)
+    return f"{judgement.what} is {number(value)}{which}, as asked: {judgement.limit}."
 
 
 def _missed(judgement: criteria.Judgement) -> str:

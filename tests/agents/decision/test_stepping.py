@@ -72,6 +72,10 @@ class Naming(Counting, frozen=True):
     SAYS = ("count",)
 
 
+class Weightless(Counting, frozen=True):
+    SAYS: ClassVar[Mapping[str, Said]] = {"count": Said(metre=0.0)}
+
+
 def given(law):
     return replace(Plan(triangle()).assignment("A"), law=law, start=None, starts=())
 
@@ -127,6 +131,7 @@ def test_a_robot_says_what_its_last_step_decided():
         Control(memory={"count": (1.0, 2.0), "secret": (0.0, 0.0)}),
         Control(memory={"count": ("a",), "secret": (0.0, 0.0)}),
         Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, velocity=(1.0, 2.0)),
+        Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, velocity=(0.0, 0.0, nan), goal=(0.0, 0.0, nan)),
         Control(memory={"count": (1.0,), "secret": (0.0, 0.0)}, measures={"x": "much"}),
     ],
 )
@@ -143,6 +148,10 @@ def test_a_law_that_cannot_begin_is_named():
         Stepping(given(Bare()))
     with pytest.raises(PluginError, match="SAYS of the law Naming must name a Said for each variable"):
         Stepping(given(Naming()))
+    with pytest.raises(
+        PluginError, match=r"SAYS of the law Weightless: the metre of count is 0\.0, not a positive number"
+    ):
+        Stepping(given(Weightless()))
     with pytest.raises(PluginError, match="the law Wide says 65 numbers; a pose carries 64"):
         Stepping(given(Wide()))
 

@@ -1,5 +1,6 @@
 """Plug-ins in a Python file beside an experiment: adopted where it is read, loaded by digest, and nowhere else."""
 
+import os
 import shutil
 import sys
 
@@ -111,6 +112,12 @@ def test_a_wrong_choice_names_place_and_remedy(task, law, message, hint):
     assert message in text
     assert hint in text
     assert "@" not in text
+
+
+def test_a_pipe_is_not_waited_for(task):
+    os.mkfifo(task.parent / "pipe.py")
+    task.write_text(TASK.replace('law = "meet.py:Meet"', 'law = "pipe.py:Meet"'), "utf-8")
+    assert "pipe.py is no file" in refused(task)
 
 
 @pytest.mark.parametrize(
