@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import inf
 from typing import Final
 
@@ -199,3 +199,75 @@ class OwnershipCheck:
             self._taken = str(taken)
         except network.Unreachable:
             pass  # `end` was called
+
+
+class NameKeeper:
+    """Names of the robots of one process: their claim, the check after a standstill, and their tokens.
+
+    The token of a robot shows its neighbours that it is alive and takes part. The watchdog withdraws tokens, too, in a
+    thread of its own.
+    """
+
+    def __init__(self, keys: Keys, names: Sequence[str], began: float) -> None:
+        """Names of a process that began at `began`, UTC [s]."""
+        self.hands_off = False  # another process drives the bodies, or may do so
+        self._keys, self._names, self._began = keys, names, began
+        self._check = OwnershipCheck([keys.alive(name) for name in names], network.ROBOT_LEASE_S)
+        self._owned: list[zenoh.LivelinessToken] = []
+        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # by row
+        self._lock = threading.Lock()
+
+    def claim(self, session: zenoh.Session, endpoints: Sequence[str], stop: threading.Event) -> None:
+        """Claims the names, before any body is touched; raises NameTaken and network.Unreachable as `claim`."""
+        alive = [self._keys.alive(name) for name in self._names]
+        try:
+            self._owned = claim(session, alive, began=self._began, endpoints=endpoints, stop=stop)
+            self._check.stood_still()
+        except NameTaken as taken:
+            raise NameTaken(
+                f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
+                "(`./zenpark keys` shows who is there), or choose another router with --connect"
+            ) from None
+
+    def stood_still(self) -> bool:
+        """Standstill of the process since the last call, so long that its names may have another owner."""
+        return self._check.stood_still()
+
+    def begin_check(self, session: zenoh.Session) -> None:
+        """Starts a check of the ownership."""
+        self._check.begin(session)
+
+    def is_owner(self) -> bool:
+        """Whether the names belong to this process; False while a check runs.
+
+        Raises NameTaken if they belong to another one; the bodies are that one's then.
+        """
+        try:
+            return self._check.over()
+        except NameTaken as taken:
+            self.hands_off = True
+            raise NameTaken(
+                f"{self._owners_text(taken)}: another process has taken this name while this one stood still or was "
+                "cut off; it leaves, and its body to the other one"
+            ) from None
+
+    def declare(self, session: zenoh.Session, rows: Iterable[int]) -> None:
+        """Declares the tokens of those rows that have none."""
+        with self._lock:
+            for row in rows:
+                if row not in self._tokens:
+                    self._tokens[row] = pubsub.alive_token(session, self._keys.alive(self._names[row]))
+
+    def withdraw(self, rows: Iterable[int], only_if: Callable[[], bool] = lambda: True) -> None:
+        """Undeclares the tokens of these rows, if `only_if` is true when no other thread touches them."""
+        with self._lock:
+            tokens = [self._tokens.pop(row) for row in rows if row in self._tokens] if only_if() else []
+        for token in tokens:
+            token.undeclare()  # type: ignore[no-untyped-call]
+
+    def end(self) -> None:
+        """Ends a running check."""
+        self._check.end()
+
+    def _owners_text(self, taken: NameTaken) -> str:
+        return ", ".join(self._keys.whose(token) or token for token in str(taken).split(", "))

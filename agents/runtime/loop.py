@@ -32,7 +32,7 @@ from agents.network import session as network
 from agents.network.access_control import Rights
 from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
-from agents.network.name_ownership import ANSWER_S, NameTaken, OwnershipCheck, claim
+from agents.network.name_ownership import ANSWER_S, NameKeeper
 from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
 from agents.network.zenoh_config import ASK_S
 from agents.plugins.calls import explain
@@ -109,16 +109,11 @@ class Runtime:
         self._ticks = Ticks(common.body_hz, clock=uptime)
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
-        self._ownership = OwnershipCheck([setup.keys.alive(name) for name in self._names], network.ROBOT_LEASE_S)
-        self._hands_off = False  # another process drives the bodies, or may do so
+        self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc())
         self._reason_to_end: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
         self._on_wheels = tuple(row for row, each in enumerate(assignments) if not each.kind.flies)
-        self._began = setup.clock.utc()
-        self._owned: list[zenoh.LivelinessToken] = []
-        self._tokens: dict[int, zenoh.LivelinessToken] = {}  # of rows that are alive for their neighbours
-        self._tokens_lock = threading.Lock()  # the watchdog's alarm takes them back from another thread
         self._coming_down = False  # the loop is over
         ceiling = common.limits.high[2] if any(each.kind.flies for each in assignments) else 0.0
         self._descent_s = ceiling / SLOWEST  # [s] longest landing: what still descends after a limit would fall
@@ -152,8 +147,8 @@ class Runtime:
             )
             out.callback(leave, session, self)
             self._subscribe_to_stops(session)
-            self._take_names(session, asked)
-            out.callback(self._ownership.end)
+            self._keeper.claim(session, self._setup.endpoints, asked)
+            out.callback(self._keeper.end)
             self._body.open()
             out.callback(self._close_body)
             out.callback(self._watchdog.end)
@@ -164,7 +159,7 @@ class Runtime:
         return 0
 
     def _close_body(self) -> None:
-        if not self._hands_off:
+        if not self._keeper.hands_off:
             self._body.close()
 
     def _reason(self, asked: bool) -> str | None:
@@ -174,7 +169,7 @@ class Runtime:
 
     def _come_down(self) -> None:
         """Lands robots that still fly after an error, before the motors are switched off."""
-        if self._hands_off:
+        if self._keeper.hands_off:
             return
         self._coming_down = True
         self._watchdog.start()
@@ -198,7 +193,7 @@ class Runtime:
 
         A body that cannot be read gets all of that time if it flew before. The first error is raised at the end.
         """
-        if self._hands_off:
+        if self._keeper.hands_off:
             return
         failures: list[Exception] = []
         begin, again, obeyed = self._ticks.elapsed(), -inf, False
@@ -226,33 +221,6 @@ class Runtime:
 
     # ------------------------------------------------------------------ the network
 
-    def _take_names(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Claims the names of the robots, before any body is touched."""
-        keys, setup = self._setup.keys, self._setup
-        tokens = [keys.alive(name) for name in self._names]
-        try:
-            self._owned = claim(session, tokens, began=self._began, endpoints=setup.endpoints, stop=stop)
-            self._ownership.stood_still()
-        except NameTaken as taken:
-            raise NameTaken(
-                f"{self._owners_text(taken)}: a robot of this name is on the network already; end it first "
-                "(`./zenpark keys` shows who is there), or choose another router with --connect"
-            ) from None
-
-    def _owners_text(self, taken: NameTaken) -> str:
-        return ", ".join(self._setup.keys.whose(token) or token for token in str(taken).split(", "))
-
-    def _owns_names(self) -> bool:
-        """Whether the names belong to this process; False while that is being checked."""
-        try:
-            return self._ownership.over()
-        except NameTaken as taken:
-            self._hands_off = True
-            raise NameTaken(
-                f"{self._owners_text(taken)}: another process has taken this name while this one stood still or was "
-                "cut off; it leaves, and its body to the other one"
-            ) from None
-
     def _await_ownership(self) -> bool:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
@@ -260,12 +228,12 @@ class Runtime:
         wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
         the process drives its bodies again then, until it learns that they belong to another one.
         """
-        if not self._ownership.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
+        if not self._keeper.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
             return False
         limits, drives = self._limits, self._on_wheels
-        woke, self._hands_off = uptime(), True
-        self._ownership.begin(self._session)
-        while not self._owns_names():
+        woke, self._keeper.hands_off = uptime(), True
+        self._keeper.begin_check(self._session)
+        while not self._keeper.is_owner():
             waited = uptime() - woke
             if waited > limits.offline_s or (waited > ANSWER_S and self._reason_to_end() is not None):
                 self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
@@ -275,8 +243,8 @@ class Runtime:
                 drives = ()
             self._watchdog.beat()
             time.sleep(self._dt)
-        self._ownership.stood_still()
-        self._hands_off = False
+        self._keeper.stood_still()
+        self._keeper.hands_off = False
         return True
 
     def _subscribe_to_stops(self, session: zenoh.Session) -> None:
@@ -325,22 +293,15 @@ class Runtime:
         self._declare_tokens()
 
     def _declare_tokens(self) -> None:
-        with self._tokens_lock:
-            for row, name in enumerate(self._names):
-                if row not in self._retired and row not in self._tokens:
-                    self._tokens[row] = pubsub.alive_token(self._session, self._setup.keys.alive(name))
+        self._keeper.declare(self._session, (row for row in self._everyone if row not in self._retired))
 
     def _call_for_help(self, why: str) -> None:
         """Removes the robots from the formation while their loop hangs, or is over; called by the watchdog's thread."""
         print(f"{', '.join(self._names)}: {why}; landing it", flush=True)
         if self._joined:
             self._telemetry.repeat_statuses(why, self._setup.clock.utc())
-            with self._tokens_lock:
-                # a loop that has recovered meanwhile keeps its tokens
-                hangs = self._coming_down or bool(self._watchdog.tripped)
-                tokens = [self._tokens.pop(row) for row in list(self._tokens)] if hangs else []
-            for token in tokens:
-                token.undeclare()  # type: ignore[no-untyped-call]
+            # a loop that has recovered meanwhile keeps its tokens
+            self._keeper.withdraw(self._everyone, lambda: self._coming_down or bool(self._watchdog.tripped))
 
     def _recover(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""
@@ -383,8 +344,8 @@ class Runtime:
             self._router_due = t + ROUTER_S
             before, self._silent_since = self._silent_since, self._router.silent_since(t, self._neighbours.arrived)
             if before < inf and self._silent_since == inf:
-                self._ownership.begin(self._session)  # it was cut off
-            self._owns_names()
+                self._keeper.begin_check(self._session)  # it was cut off
+            self._keeper.is_owner()
         return self._silent_since
 
     def _cut(self, _stop: messages.Stop) -> None:
@@ -584,10 +545,7 @@ class Runtime:
             unasked = during[row] and not life.reason.startswith((messages.EMERGENCY, LAND, STOP))
             if down and (unasked or row in self._leaving) and row not in self._retired:
                 self._retired.add(row)
-                with self._tokens_lock:
-                    token = self._tokens.pop(row, None)
-                if token is not None:  # else the watchdog has undeclared it
-                    token.undeclare()  # type: ignore[no-untyped-call]
+                self._keeper.withdraw((row,))  # nothing, if the watchdog has done it
         if back := [row for row in self._retired if not (during[row] or row in self._leaving)]:
             self._retired.difference_update(back)
             self._declare_tokens()

@@ -139,7 +139,7 @@ def test_standstill_without_router_halts_then_lands(kind, after_s, monkeypatch):
     with Net().worn() as net:
         stage.begin(net)
         stage.run(visit)
-    stage.runtime._ownership.end()
+    stage.runtime._keeper.end()
     landed = [at - woke[0] for at, order in stage.orders if order == "land"]
     assert landed[: len(after_s)] == pytest.approx(after_s, abs=0.05)
     assert "no router tells who owns its name" in stage.runtime.robots[0].lifecycle.reason
