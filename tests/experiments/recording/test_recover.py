@@ -20,9 +20,10 @@ from tools.commands import results as commands
 
 KILLED = """
 from pathlib import Path
+from experiments.definition.plan import Plan
 from experiments.recording.writer import Recording
 from tests.experiments.recordings import *
-recording = Recording(Path({path!r}), PAIR, DOCUMENT, case="only", seed=4, clock="real")
+recording = Recording(Path({path!r}), Plan(PAIR), DOCUMENT, case="only", seed=4, clock="real")
 put(recording, whole_run())
 recording.flush()
 print("flushed", flush=True)
