@@ -175,7 +175,7 @@ def within(begin: float, until: float) -> Callable[[Trace, Array], float]:
 
 
 class Subject(NamedTuple):
-    """What is drawn of a law, and the figure that the table of the gallery has."""
+    """Picture of a law, and its figure in the table of the gallery."""
 
     curve: Callable[[Trace], Array]
     label: str

@@ -75,7 +75,7 @@ class Metric(msgspec.Struct, frozen=True):
 
 
 def _ours(of: Callable[[Measurement], Array | Index], label: str, meaning: str, **facts: object) -> Metric:
-    """One of our metrics as an object of a class of its own, with the attributes `facts`."""
+    """A metric of zenpark as an object of a class of its own, with the attributes `facts`."""
     body = {"of": lambda _self, _trace, shared: of(shared), "label": label, "__doc__": meaning, **facts}
     made = msgspec.defstruct(label, [], bases=(Metric,), namespace=body, module=__name__, frozen=True)
     return cast(type[Metric], made)()

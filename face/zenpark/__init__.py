@@ -1,4 +1,4 @@
-"""What notebooks and plug-ins import: `from zenpark import load, simulate` (docs/python.md).
+"""Names for notebooks and plug-ins: `from zenpark import load, simulate` (docs/python.md).
 
 The launcher of the checkout is a file of this name, so the package stands in a folder of its own. An editable
 installation copies it, which is why its contents are elsewhere, in `experiments.api`.

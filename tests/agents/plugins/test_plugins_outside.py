@@ -199,7 +199,7 @@ def test_kind_of_the_docs_is_known_everywhere(installed, tmp_path):
 
 @pytest.mark.slow
 def test_broken_kind_is_left_out(tmp_path):
-    """It spoils neither the help nor experiments without it."""
+    """A broken plug-in spoils neither the help nor experiments without it."""
     about = tmp_path / "broken-1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1\n")

@@ -1,1 +1,1 @@
-"""One script for each simulator, run by that simulator's own interpreter: `ring` and numpy are all that they share."""
+"""A script for each simulator, run by that simulator's own interpreter: `ring` and numpy are all that they share."""

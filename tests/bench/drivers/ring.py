@@ -40,7 +40,7 @@ def starts(robots):
 
 
 def neighbour_errors(position, place):
-    """What the offsets to both neighbours lack (N, 2), summed over the two links of each robot [m]."""
+    """Missing offsets to both neighbours (N, 2), summed over the two links of each robot [m]."""
     lacking = position - place
     return np.roll(lacking, 1, axis=0) + np.roll(lacking, -1, axis=0) - 2.0 * lacking
 

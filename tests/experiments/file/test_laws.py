@@ -1,4 +1,4 @@
-"""What goes with a law that remembers, and what does not."""
+"""Settings that go with a law that remembers, and settings that do not."""
 
 import pytest
 

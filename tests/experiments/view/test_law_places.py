@@ -1,4 +1,4 @@
-"""What robots say beside their poses: places in the scene, measures in the table."""
+"""Variables that robots transmit with their poses: places in the scene, measures in the table."""
 
 from __future__ import annotations
 
