@@ -457,7 +457,7 @@ def test_no_take_off_after_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     assert said == ["stop", "stop"]
 
 
-def test_pose_of_wheels_is_as_old_as_its_yaw(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_of_wheels_is_as_old_as_yaw(monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot that steers by a yaw that is not told any more has no position; one in the air does."""
     body, samples, now = ExternalBody(request("tcp/127.0.0.1:1")), list[tuple[int, float, Vector, float]](), [0.0]
     body._positions = SimpleNamespace(  # type: ignore[assignment]

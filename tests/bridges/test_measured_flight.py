@@ -35,7 +35,7 @@ class Seen:
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.08), (0.0, 0.0, 0.7)])
-def test_flight_from_floor_or_table_ends_at_its_place(start):
+def test_flight_from_floor_or_table_ends_in_place(start):
     seen = Seen(start)
     assert not seen.go((0.0, 0.0, 1.2), 2.0)
     assert not seen.go((1.0, 0.0, 1.2), 5.0)

@@ -56,7 +56,7 @@ def test_humble_has_no_hashes():
     assert ros2.types("humble").hash(ros2.TWIST) == "TypeHashNotSupported"
 
 
-def test_cdr_is_what_the_encapsulation_says_byte_by_byte():
+def test_cdr_matches_its_encapsulation_byte_by_byte():
     types = ros2.types("jazzy")
     twist = types.encode(types.twist((0.22, 0.0, 0.0), (0.0, 0.0, -2.84)), ros2.TWIST)
     assert twist == b"\0\1\0\0" + struct.pack("<6d", 0.22, 0.0, 0.0, 0.0, 0.0, -2.84)
@@ -87,7 +87,7 @@ def test_cdr_is_identical_to_rosbags(distro, kind):
     assert len(raw) == {ros2.TWIST: 52, ros2.TWIST_STAMPED: 68, ros2.POSE_STAMPED: 84}[kind]
 
 
-def test_transforms_are_tf_byte_by_byte_and_read_back():
+def test_transforms_match_tf_bytes_and_are_read_back():
     types = ros2.types("jazzy")
     state = messages.State("tb3-0", 1, 12.5, "running", (1.0, -2.0, 0.5), None, math.pi, None, None, 0.0)
     made = transform(types, state, (1.0, -2.0, 0.5), "tb3_0")
@@ -155,7 +155,7 @@ def test_bytes_that_are_no_message_are_refused(raw, kind):
         assert kind in str(error)  # noqa: PT017 - most bytes are refused, a few are a message
 
 
-def test_a_twist_is_no_stamped_twist_and_the_other_way_round():
+def test_twist_and_stamped_twist_are_told_apart():
     types = ros2.types("jazzy")
     twist = types.twist((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
     stamped = types.make(ros2.TWIST_STAMPED, header=types.header(1.0, "base_link"), twist=twist)
@@ -175,7 +175,7 @@ def test_attachment_is_that_of_zenoh_ext():
         ros2.attached(raw[:32])
 
 
-def test_gid_is_xxh3_of_the_token_low_half_first():
+def test_gid_is_xxh3_of_token_low_half_first():
     assert ros2.gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]  # the published value of no input
     digest = xxhash.xxh3_128_intdigest(b"@ros2_lv/0")
     assert ros2.gid("@ros2_lv/0") == struct.pack("<QQ", digest & (2**64 - 1), digest >> 64)

@@ -43,7 +43,7 @@ def turtlebot(port):
 
 
 @pytest.mark.parametrize("opened", [crazyflie, khepera, tello, turtlebot])
-def test_a_device_that_is_driven_gets_nothing_from_a_second(opened):
+def test_driven_device_gets_nothing_from_a_second_process(opened):
     with socket.socket(type=socket.SOCK_DGRAM) as packets, socket.socket() as connections:
         packets.bind(("127.0.0.1", 0))
         port = packets.getsockname()[1]
@@ -65,7 +65,7 @@ def test_a_device_that_is_driven_gets_nothing_from_a_second(opened):
 
 
 @pytest.mark.slow
-def test_a_body_that_cannot_be_opened_leaves_its_device_to_others():
+def test_unopened_body_leaves_its_device_to_others():
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         body, device = khepera(nobody.getsockname()[1])  # refuses connections: it does not listen

@@ -77,7 +77,7 @@ def test_the_triangle_forms_up_in_a_strangers_simulator(
 
 @pytest.mark.mechanism("foreign simulator hangs")
 @pytest.mark.system
-def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: RouterProcess, tmp_path: Path) -> None:
+def test_hanging_simulator_lands_its_robots_and_others_stay(router: RouterProcess, tmp_path: Path) -> None:
     flying = Simulator(router.endpoint, "CF01")
     watcher = Watcher(router.endpoint)
     file = ROOT / "experiments" / "catalogue" / "triangle.toml"
@@ -107,7 +107,7 @@ def test_when_the_simulator_hangs_robots_land_and_the_others_stay(router: Router
 
 
 @pytest.mark.system
-def test_when_the_robots_process_dies_the_simulator_lands_it(router: RouterProcess, tmp_path: Path) -> None:
+def test_dead_robot_process_is_landed_by_simulator(router: RouterProcess, tmp_path: Path) -> None:
     """What `docs/external-simulators.md` asks of a simulator, kept by ours."""
     file = tmp_path / "alone.toml"
     file.write_text(

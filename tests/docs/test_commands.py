@@ -34,7 +34,7 @@ def parse(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_command_line_knows_every_command_of_a_page(page):
+def test_command_line_knows_every_command_of_a_page(page):
     for text in commands(page):
         words = shlex.split(text)
         if words and "--help" not in words:
@@ -63,7 +63,7 @@ def _leaves(command, path=()):
 @pytest.mark.parametrize(
     ("path", "command"), [pytest.param(*each, id=" ".join(each[0])) for each in _leaves(COMMAND_LINE)]
 )
-def test_the_help_of_every_command_ends_with_examples_that_it_takes(path, command):
+def test_help_of_commands_ends_with_valid_examples(path, command):
     lines = [line.strip() for line in (command.epilog or "").splitlines() if "./zenpark" in line]
     assert lines
     for line in lines:

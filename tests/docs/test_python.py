@@ -57,7 +57,7 @@ def imported(tree: ast.AST) -> dict[str, str]:
     return found
 
 
-def test_every_name_is_known_to_type_checkers_and_has_a_home():
+def test_every_name_has_a_type_and_a_home():
     tree = ast.parse(Path(api.__file__).read_text("utf-8"))
     (typed,) = [node for node in tree.body if isinstance(node, ast.If)]
     assert imported(typed) == api.HOME
@@ -130,7 +130,7 @@ def loaded(program: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_plugins_of_robots_load_no_more_than_they_name():
+def test_robot_plugins_load_only_what_they_name():
     own = {"zenpark", "experiments", "experiments.api"}
     assert loaded("import zenpark") == loaded("import __future__, functools, importlib, typing") | own
     modules = loaded(f"from zenpark import {', '.join(FLYING)}")

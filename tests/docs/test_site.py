@@ -83,7 +83,7 @@ def test_search_and_formulas_work_from_disk(site):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_reference_has_every_key_command_topic_and_column(site):
+def test_reference_has_every_key_command_topic_and_column(site):
     file = (site / "reference" / "experiment-file.html").read_text("utf-8")
     assert not [entry.key for entry in reference.entries() if entry.words[-1] not in file]
     commands = text(site / "reference" / "commands.html")

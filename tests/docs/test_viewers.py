@@ -27,7 +27,7 @@ def panels(part: Any) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_the_layout_for_foxglove_names_what_a_recording_has(tmp_path):
+def test_foxglove_layout_names_what_a_recording_has(tmp_path):
     simulate(load("triangle", "duration_s=1.0", "timeline=[]"), cases=["event"], folder=tmp_path)
     file = tmp_path / "event.mcap"
     with file.open("rb") as stream:

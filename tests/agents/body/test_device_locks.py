@@ -25,7 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "runs"
 
 
-def test_a_device_is_had_once_and_again_when_it_was_let_go(folder: Path) -> None:
+def test_device_has_one_holder_until_released(folder: Path) -> None:
     first, second = Claims(["A", "B"], ["one", "two"]), Claims(["C", "D"], ["three", "two"])
     first.take()
     with pytest.raises(BodyError, match=r"^D: two is in use: this process drives it for B; end that first$"):
@@ -41,7 +41,7 @@ def test_a_device_is_had_once_and_again_when_it_was_let_go(folder: Path) -> None
     third.release()
 
 
-def test_another_process_is_named_and_its_death_frees_the_device(folder: Path) -> None:
+def test_holder_is_named_and_its_death_frees_device(folder: Path) -> None:
     other = subprocess.Popen(
         [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=dict(os.environ)
     )
@@ -89,6 +89,6 @@ def test_different_crazyflies_are_different() -> None:
     assert len({device_of(address) for address in addresses}) == len(addresses)
 
 
-def test_a_host_that_cannot_be_resolved_is_its_name() -> None:
+def test_unresolvable_host_keeps_its_name() -> None:
     assert numeric("No.Such.invalid") == "no.such.invalid"
     assert numeric("127.1") == "127.0.0.1"

@@ -52,7 +52,7 @@ def test_poses_that_are_old_or_jump_are_refused():
     assert external.velocity == (0.0, 0.0, 0.0)
 
 
-def test_without_a_measured_yaw_the_own_one_goes_on():
+def test_own_yaw_continues_without_measured_yaw():
     external = External()
 
     def yaw(t, measured, own):

@@ -32,7 +32,7 @@ def position(stamp: float, robot: str = "T") -> bytes:
     return sent(KEYS.position("T"), messages.Position(robot, stamp, PLACE, 0.3))[0]
 
 
-def test_a_position_stamped_ahead_counts_as_now_and_one_that_is_refused_is_told_of_as_well() -> None:
+def test_stamps_ahead_count_as_now_and_are_reported() -> None:
     net = Net()
     with net.worn():
         heard = MeasuredPositions(net.session, KEYS, ("A", "T"), [1], (9.0, 9.0, 9.0), exact=[1], silence_s=0.5)  # type: ignore[arg-type]
@@ -93,7 +93,7 @@ def flown(
 
 
 @pytest.mark.parametrize("ahead", [0.0, 2.0, 4.5])
-def test_a_robot_is_blind_in_time_however_far_ahead_its_positions_were_stamped(ahead: float) -> None:
+def test_blindness_is_noticed_in_time_despite_stamps_ahead(ahead: float) -> None:
     silent = 3.0
     _, said = flown(lambda t: ahead if t < silent else None, 4.5)
     blind, text = next((t, text) for t, text in said if "its own position is lost" in text)
@@ -104,7 +104,7 @@ def test_a_robot_is_blind_in_time_however_far_ahead_its_positions_were_stamped(a
     assert warned == ([told] if ahead else [])
 
 
-def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
+def test_stamps_behind_are_reported_before_positions_expire() -> None:
     _, said = flown(lambda t: 0.0 if t < 2.0 else -0.4, 4.0)
     (t, text), *_ = [each for each in said if "clock" in each[1]]
     assert t == pytest.approx(2.5, abs=0.03)
@@ -112,7 +112,7 @@ def test_positions_stamped_behind_are_told_of_before_they_are_too_old() -> None:
     assert not any("position is lost" in text for _, text in said)
 
 
-def test_who_waits_for_take_off_says_that_its_positions_are_of_another_clock() -> None:
+def test_waiting_robot_reports_positions_of_another_clock() -> None:
     runtime, _ = flown(lambda _: -3600.0, 0.5)
     assert runtime.robots[0].lifecycle.reason == "no position of its own: positions of T are stamped 3.6e+03 s behind"
 

@@ -31,7 +31,7 @@ def test_what_is_none_is_refused(text):
 
 
 @pytest.mark.parametrize("text", ["udp/127.0.0.1:1", "ws/lab:1", "serial//dev/ttyUSB0", "wss/lab:1"])
-def test_what_is_not_used_is_refused_with_what_is(text):
+def test_unusable_endpoints_are_refused_with_an_example(text):
     with pytest.raises(ValueError, match=r"cannot be used: .*; write it like tcp/"):
         Endpoint.parse(text)
 

@@ -65,7 +65,7 @@ def test_a_session_has_one_identity(folder):
         lab_of([f"tls/127.0.0.1:1#lab={folder}", "tls/127.0.0.1:2"])
 
 
-def test_sessions_of_a_lab_show_certificates_and_ask_for_them(folder):
+def test_lab_sessions_show_certificates_and_demand_them(folder):
     made = config(settings("client", connect=[f"tls/127.0.0.1:7447#lab={folder}"], name="CF01+CF02", identity="CF01"))
     assert made.get_json("connect/endpoints") == '["tls/127.0.0.1:7447"]'
     tls = made.get_json("transport/link/tls")
@@ -83,7 +83,7 @@ RIGHTS = Rights("park", {"CF01": Grant(publish=["park/CF01/**"])}, {})
 
 
 @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447", "tls/lab.example.org:7447"])
-def test_with_a_lab_a_router_listens_anywhere_and_without_nowhere_else(folder, endpoint):
+def test_router_listens_anywhere_only_with_a_lab(folder, endpoint):
     made = config(settings("router", listen=[f"{endpoint}#lab={folder}"], name="router", rights=RIGHTS))
     assert made.get_json("listen/endpoints") == f'["{endpoint}"]'
     assert '"default_permission":"deny"' in made.get_json("access_control")
@@ -91,7 +91,7 @@ def test_with_a_lab_a_router_listens_anywhere_and_without_nowhere_else(folder, e
         config(settings("router", listen=[endpoint], name="router"))
 
 
-def test_a_router_of_a_lab_must_know_who_may_do_what(folder):
+def test_lab_router_must_know_the_rights(folder):
     with pytest.raises(EndpointError, match="name the experiment"):
         config(settings("router", listen=[f"tls/0.0.0.0:7447#lab={folder}"], name="router"))
 

@@ -88,7 +88,7 @@ def test_random_bytes_are_malformed(kind, mime, payload):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @FEW
 @given(messages, st.data())
-def test_a_message_that_was_cut_or_bitten_is_a_message_or_malformed(encoding, message, data):
+def test_damaged_message_is_decoded_or_malformed(encoding, message, data):
     payload = bytearray(wire.encode(message, encoding))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
@@ -100,14 +100,14 @@ def test_a_message_that_was_cut_or_bitten_is_a_message_or_malformed(encoding, me
 
 @FEW
 @given(st.binary(max_size=200), st.sampled_from([JSON, MSGPACK, "zenoh/bytes", "text/plain", ""]))
-def test_any_payload_is_a_stop_with_words_for_a_terminal(payload, mime):
+def test_any_payload_is_a_stop_with_printable_text(payload, mime):
     stop = wire.read_stop(payload, mime)
     assert stop.who
     assert stop.words.isprintable()
 
 
 @pytest.mark.parametrize("mime", [JSON, MSGPACK, "zenoh/bytes"])
-def test_a_stop_of_any_size_and_depth_is_shown_in_few_words(mime):
+def test_stop_of_any_size_is_shown_shortly(mime):
     for payload in (
         b"[" * 50_000,
         b"\x91" * 50_000,
@@ -118,7 +118,7 @@ def test_a_stop_of_any_size_and_depth_is_shown_in_few_words(mime):
 
 
 @pytest.mark.parametrize("mime", ["zenoh/bytes", "application/x-www-form-urlencoded", "text/plain", ""])
-def test_what_is_not_said_to_be_messagepack_is_read_as_json(mime):
+def test_unmarked_payload_is_read_as_json(mime):
     assert wire.decode(b'{"order": "land"}', mime, Order) == Order("land")
     with pytest.raises(Malformed, match="not a Order"):
         wire.decode(b"land", mime, Order)
@@ -218,7 +218,7 @@ def test_unknown_numbers_are_left_out(encoding):
         assert wire.decode(payload, wire.MIME[encoding], type(said)) == said
 
 
-def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
+def test_yaw_stays_within_half_a_turn():
     """Yaw of robots on wheels is counted on; beyond 1000 rad every reader refused the pose (159 turns)."""
     for yaw in (0.0, 3.1, -3.1, 1000.5, -1e6, 1e9):
         poses = (
@@ -235,7 +235,7 @@ def test_a_yaw_is_within_half_a_turn_however_far_a_robot_has_turned():
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize(("heard", "followed"), [(0, 0), (1, 1), (3000, 0), (0, 3000), (1500, 700)])
-def test_telemetry_that_is_too_long_for_a_payload_goes_in_several(encoding, heard, followed):
+def test_long_telemetry_goes_in_several_payloads(encoding, heard, followed):
     state = State(
         "A", 7, 1000.0, "running", (0.1, 0.2, 0.3),
         received=[PoseReceipt("KH01", k, 1000.0 + k, 1000.1 + k, (0.123456,) * 3, (0.0,) * 3) for k in range(heard)],

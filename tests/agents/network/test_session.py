@@ -87,7 +87,7 @@ def test_transports_that_are_not_used_are_refused(endpoint, why):
 
 
 @pytest.mark.parametrize("endpoint", ["t#tcp/localhost:1", "tcp/127.0.0.1:7447\n", "tcp?/x/y"])
-def test_what_zenoh_would_not_understand_is_refused_by_name(endpoint):
+def test_endpoints_unknown_to_zenoh_are_refused_by_name(endpoint):
     with pytest.raises(EndpointError, match=r"write .*tcp/127\.0\.0\.1:7447"):
         config(settings("client", connect=[endpoint]))
 
@@ -201,7 +201,7 @@ def test_a_frozen_router_is_silent_whatever_its_lease(patient_router, eventually
 
 
 @pytest.mark.system
-def test_a_router_that_waits_for_another_is_not_silent(patient_router):
+def test_router_that_waits_for_another_is_not_silent(patient_router):
     linked = zenoh.open(
         config(settings("router", listen=[near := free_endpoint(0)], connect=[patient_router.endpoint]))
     )
@@ -247,7 +247,7 @@ def looks(watch: RouterWatch, begin: float, end: float) -> float:
     return [watch.silent_since(tick / 50) for tick in ticks][-1]
 
 
-def test_one_answer_after_a_silence_may_be_a_link_that_closes():
+def test_one_answer_after_silence_may_be_closing_link():
     session = Asked()
     watch = RouterWatch(session, "park/CF01/alive")
     assert looks(watch, 0.0, ANSWER_S) == inf
@@ -266,7 +266,7 @@ def test_one_answer_after_a_silence_may_be_a_link_that_closes():
     assert watch.silent_since(0.58) == inf
 
 
-def test_a_process_that_gets_no_processor_does_not_blame_the_router():
+def test_starved_process_does_not_blame_the_router():
     session = Asked()
     watch = RouterWatch(session, "park/CF01/alive")
     stalls = [0.0, 5.0, 5.5]
@@ -275,7 +275,7 @@ def test_a_process_that_gets_no_processor_does_not_blame_the_router():
     assert looks(watch, 5.58, 5.7) == pytest.approx(5.3, abs=0.03)
 
 
-def test_a_router_by_which_samples_come_is_not_asked():
+def test_router_that_delivers_samples_is_not_asked():
     session = Asked()
     watch = RouterWatch(session, "park/CF01/alive")
     ticks = [tick / 20 for tick in range(40)]
@@ -289,7 +289,7 @@ def test_a_router_by_which_samples_come_is_not_asked():
     assert watch.silent_since(looked[-1][0] + 0.02, len(ticks) + 1) < inf, "what was on its way is no answer"
 
 
-def test_a_router_that_stays_silent_is_left_only_where_there_is_another(monkeypatch):
+def test_silent_router_is_left_only_for_another(monkeypatch):
     left = []
     monkeypatch.setattr("agents.network.session.hang_up", left.append)
     for endpoints, times in ((["one"], 0), (["one", "other"], 1)):
@@ -307,7 +307,7 @@ def test_a_router_that_stays_silent_is_left_only_where_there_is_another(monkeypa
 
 
 @pytest.mark.system
-def test_at_a_frozen_first_router_with_a_long_lease_all_goes_on_at_the_second(patient_router, eventually):
+def test_second_router_takes_over_from_frozen_long_lease(patient_router, eventually):
     second = RouterProcess(lease_s=60.0)
     ends = [patient_router.endpoint, second.endpoint]
     with open_session(ends, name="CF01") as robot, open_session(ends, name="CF02") as listener:
@@ -496,7 +496,7 @@ def test_a_killed_robot_is_noticed(router, eventually):
 
 @pytest.mark.mechanism("emergency stop before everything else that came")
 @pytest.mark.system
-def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
+def test_alarm_is_obeyed_at_once_and_keeps_orders(router, eventually):
     whole = b'{"who": "ana", "reason": "fire"}'
     said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
         (whole, JSON, "by ana: fire"),
@@ -530,7 +530,7 @@ def test_an_alarm_is_obeyed_at_once_and_keeps_what_came(router, eventually):
         assert alarm.try_recv() is None
 
 
-def test_a_stop_waits_for_the_loop_only_after_it_was_obeyed():
+def test_stop_waits_for_loop_after_being_obeyed():
     """A loop that polls in between would think that its motors are off, and then they are cut for ever."""
     seen = []
     net = Net()

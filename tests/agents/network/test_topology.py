@@ -43,7 +43,7 @@ def test_marks_stand_in_either_order_of_making():
     assert endpoints.from_here("tls/0.0.0.0:7#lab=/l") == "tls/127.0.0.1:7#lab=/l"
 
 
-def test_a_robot_knows_of_its_neighbours_and_of_services():
+def test_robot_knows_its_neighbours_and_services():
     hears = {"A": {"B"}, "B": set(), "C": set(), "D": {"A"}}
     assert endpoints.near(MESH, hears, ["A"]) == MESH  # B is heard, D hears it
     assert endpoints.near(MESH, hears, ["B", "C"]) == [MESH[0], MESH[1], MESH[3]]
@@ -51,7 +51,7 @@ def test_a_robot_knows_of_its_neighbours_and_of_services():
     assert endpoints.near(["tcp/127.0.0.1:1"], hears, ["D"]) == ["tcp/127.0.0.1:1"]
 
 
-def test_whoever_listens_in_a_lab_must_know_the_rights(tmp_path):
+def test_lab_listeners_must_know_the_rights(tmp_path):
     from tools.commands import authority  # noqa: PLC0415
 
     folder = tmp_path / "lab"

@@ -21,7 +21,7 @@ def odd(command: messages.Command) -> None:
         raise messages.Malformed("an even number")
 
 
-def test_an_inbox_passes_on_valid_messages_and_counts_the_others() -> None:
+def test_inbox_passes_valid_messages_and_counts_the_rest() -> None:
     channel = Channel(KEYS.setpoint("*"))
     refused: list[tuple[str, str]] = []
     inbox = pubsub.Inbox(
@@ -50,7 +50,7 @@ def test_an_inbox_passes_on_valid_messages_and_counts_the_others() -> None:
     assert list(inbox.read()) == []
 
 
-def test_messages_of_other_robots_are_left_out_and_not_refused() -> None:
+def test_messages_of_other_robots_are_left_out() -> None:
     channel = Channel(KEYS.setpoint("*"))
     inbox = pubsub.Inbox(channel, messages.Command, keys=KEYS, robots={"A"})
     for robot in "BA":

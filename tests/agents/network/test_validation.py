@@ -127,5 +127,5 @@ def test_a_goal_that_no_robot_can_follow(changes, says):
         (99_999_999, 9, 0.02, 1),
     ],
 )
-def test_a_gap_counts_as_far_as_the_time_allows(last: int, seq: int, since: float, lost: int) -> None:
+def test_gap_counts_at_most_what_time_allows(last: int, seq: int, since: float, lost: int) -> None:
     assert validation.missed(last, seq, since, 50.0) == lost

@@ -64,7 +64,7 @@ def won(talking):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", [0.0, 0.3])
-def test_sum_of_ways_is_within_the_bound_of_the_least(loss):
+def test_auction_total_is_within_bound_of_optimum(loss):
     gaps = []
     for seed in range(100):
         places, tasks, pairs = drawn(seed)

@@ -57,7 +57,7 @@ def findings(name, *changes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["average", "aggregative"])
-def test_gains_beyond_the_bound_are_found_with_their_remedy(name):
+def test_gains_beyond_the_bound_are_found_with_remedy(name):
     assert [severity for severity, *_ in findings(name)] == ["note"]
     ((severity, message, remedy),) = findings(name, "formation.law.integral=9", "formation.law.gain=4")
     assert severity == "error"
@@ -84,7 +84,7 @@ ANGLES = np.arange(6) * np.pi / 3.0
 
 
 @pytest.mark.parametrize(("team", "stable"), [(1.0, True), (3.0, True), (10.0, False)])
-def test_a_descent_that_is_too_quick_for_the_estimators_swings(team, stable):
+def test_descent_too_quick_for_its_estimators_swings(team, stable):
     targets = {f"R{k}": (float(np.cos(a)) + 0.5, float(np.sin(a))) for k, a in enumerate(ANGLES)}
     law = Aggregative(targets=targets, places=dict.fromkeys(targets, (0.0, 0.0)), own=0.1, team=team)
     talking = Talking(law, [(0.0, 0.0)] * 6, RING)

@@ -221,7 +221,7 @@ def test_laws_that_remember_keep_what_they_know(name):
 
 
 @pytest.mark.parametrize("name", REMEMBERING)
-def test_laws_that_remember_do_not_depend_on_the_order_of_arrival(name):
+def test_remembering_laws_ignore_the_order_of_arrival(name):
     ends = []
     for order in (1, -1):
         bench = Bench(replace(assignment(LAWS, name), start=None, starts=()), PLACES["A"])
@@ -231,7 +231,7 @@ def test_laws_that_remember_do_not_depend_on_the_order_of_arrival(name):
 
 
 @pytest.mark.parametrize("name", REMEMBERING)
-def test_laws_that_remember_bear_a_period_of_three_times_the_length(name):
+def test_remembering_laws_bear_a_period_three_times_longer(name):
     given = assignment(LAWS, name)
     given = replace(given, decide_every=3 * given.decide_every, start=None, starts=())
     bench = Bench(given, PLACES["A"])

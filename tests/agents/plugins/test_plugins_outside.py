@@ -105,7 +105,7 @@ def test_every_run_of_the_guide_ends_well(installed, line, tmp_path):
     assert (tmp_path / "run" / "metrics.csv").exists()
 
 
-def test_robots_with_plugins_of_the_guide_need_no_numpy(installed):
+def test_robots_with_guide_plugins_need_no_numpy(installed):
     """Neither does one load anything of experiments but the names (tests/twins/test_body.py: a robot without them)."""
     program = f"""
 import sys, agents.robot, twins.body

@@ -93,7 +93,7 @@ def test_unknown_values_are_allowed():
     assert not Standing().check(battery=NAN, velocity=NOWHERE, attitude=(NAN,) * 4)
 
 
-def test_ground_robots_may_roll_and_stand_on_a_table():
+def test_ground_robots_may_roll_and_stand_high():
     assert not Standing(KHEPERA4).check(velocity=(0.5, 0.0, 0.0), position=(*START, 0.7))
 
 
@@ -118,6 +118,6 @@ def test_router_is_needed_for_take_off():
 
 
 @pytest.mark.parametrize(("separation", "reason"), [(0.3, "it is 0.22 m from G, nearer than 0.3 m"), (0.2, "")])
-def test_robot_too_near_to_another_does_not_take_off(separation, reason):
+def test_robot_too_near_another_does_not_take_off(separation, reason):
     robot = Standing(KHEPERA4, other=(0.3, 0.3), separation=separation)
     assert robot.check() == reason

@@ -32,7 +32,7 @@ def test_rates_that_a_radio_carries_leave_poses_young(monkeypatch, rows, exchang
 
 
 @pytest.mark.slow
-def test_a_take_off_with_a_yaw_leaves_poses_young(monkeypatch):
+def test_take_off_with_yaw_leaves_poses_young(monkeypatch):
     """Seventeen parts of polynomials, one at a time: in a burst their answers made poses 0.2 s old."""
     with Fleet(monkeypatch, 8, 400.0, stream_hz=4.0) as fleet:
         fleet.twin.flock.quadrotor.yaw[:] = 0.5
@@ -40,7 +40,7 @@ def test_a_take_off_with_a_yaw_leaves_poses_young(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_full_queue_makes_poses_old_and_no_take_off_happens(monkeypatch):
+def test_full_queue_ages_poses_and_prevents_take_off(monkeypatch):
     """More logs than polls: the drone says so by its stamps, long before a packet is lost."""
     with Fleet(monkeypatch, 1, 90.0, log_hz=100.0) as fleet:
         (line,) = fleet.twin.lines

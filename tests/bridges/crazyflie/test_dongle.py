@@ -147,7 +147,7 @@ def test_nothing_is_received_any_more(begins):
         assert "connected again" not in process.state.note[2]
 
 
-def test_a_gap_of_the_radio_that_carries_motion_capture():
+def test_radio_gap_with_motion_capture_ends_in_landing():
     """The estimator is blind, and drifts: it is down before it is far away, and stays there with its motors on."""
     with flown(device=RADIO, external=True) as (twin, process):
         tick = process.tick
@@ -171,7 +171,7 @@ def test_a_gap_of_the_radio_that_carries_motion_capture():
         assert descent.fastest.max() < SINKS
 
 
-def test_the_neighbours_of_a_drone_in_a_gap_fly_on():
+def test_neighbours_of_a_silent_drone_fly_on():
     with flown(rows=3, device=RADIO) as (twin, process):
         process.takeoff(HEIGHT)
         descent = Descent(twin, process)
@@ -258,7 +258,7 @@ def test_a_session_that_begins_while_safelink_is_on():
             again.close()
 
 
-def test_a_queue_that_fills_in_the_air_ends_in_a_landing():
+def test_queue_filling_in_the_air_ends_in_landing():
     """Twenty times as many logs as asked for, more than there are polls: answers and the status wait behind them."""
     with flown(device=RADIO, exchanges_hz=300.0) as (twin, process):
         process.takeoff(HEIGHT)

@@ -33,7 +33,7 @@ def toc_cache(monkeypatch, tmp_path_factory):
 
 
 @pytest.mark.system
-def test_each_fails_in_its_own_way_and_the_others_fly_on():
+def test_faulty_drones_fail_differently_while_others_fly_on():
     """In one process: one is well, one loses 5 % of all packets; one falls silent for good, one for a moment, one's
     battery runs empty, and one is killed. Those in reach end on the ground with their motors off; the others count
     as flying, because nothing is seen of their motors.
@@ -142,7 +142,7 @@ def test_reset_in_the_air():
 
 
 @pytest.mark.system
-def test_a_new_link_does_not_move_a_flow_deck():
+def test_new_link_does_not_move_a_flow_deck():
     """Where it has landed it stays, and is not told again to stand at its start; switched off and on, it is."""
     with flown() as (twin, process):
         process.takeoff(0.3)
@@ -161,7 +161,7 @@ def test_a_new_link_does_not_move_a_flow_deck():
 
 @pytest.mark.parametrize("link", ["udp", "radio"])
 @pytest.mark.system
-def test_a_process_that_wakes_from_a_suspension_lifts_no_drone(link):
+def test_process_woken_from_suspension_lifts_no_drone(link):
     """Suspension until the drone has come down: then the loop commands as before, and the drone stays down."""
     asked = request("crazyflie", ["crazyflie-twin"], device={"link": link})
     with Served(CrazyflieTwin, asked) as twin:

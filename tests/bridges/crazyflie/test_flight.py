@@ -83,7 +83,7 @@ def air(monkeypatch):
     return Air(monkeypatch).fly()
 
 
-def test_a_landing_that_is_not_answered_is_ordered_again(air):
+def test_unanswered_landing_is_ordered_again(air):
     air.sent.clear()
     air.flight.land()
     assert air.flight.phase is Phase.LANDING
@@ -97,7 +97,7 @@ def test_a_landing_that_is_not_answered_is_ordered_again(air):
     assert len(air.times("land")) == module.TRIES
 
 
-def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
+def test_constant_setpoint_is_repeated_in_time(air):
     """Before the descent behind it begins; one that changes is sent at the rate of setpoints."""
     air.pass_(2.0)
     assert np.diff(air.times("setpoint")[3:]).max() < 0.5 * HOLD_S
@@ -108,7 +108,7 @@ def test_a_setpoint_that_does_not_change_is_sent_often_enough(air):
     assert 15 < len([at for at in air.times("setpoint") if at > begin]) < 25
 
 
-def test_a_setpoint_that_changes_by_less_than_is_sent_does_not_change(air):
+def test_setpoint_change_below_wire_resolution_is_no_change(air):
     places = iter(np.tile([0.1, 0.1004], 1000))
     setpoint = air.flight.set_target
     air.flight.set_target = lambda now, _: setpoint(now, (next(places), 0.2, 0.5, 0.0))
@@ -117,7 +117,7 @@ def test_a_setpoint_that_changes_by_less_than_is_sent_does_not_change(air):
     assert len([at for at in air.times("setpoint") if at > begin]) < 10
 
 
-def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
+def test_slow_radio_gets_rarer_setpoints_held_longer(air):
     air.flight.scale_setpoints(0.1)
     places = iter(np.linspace(0.2, 0.8, 1000))
     setpoint = air.flight.set_target
@@ -129,7 +129,7 @@ def test_setpoints_of_a_slow_radio_are_rarer_and_held_for_longer(air):
     assert np.diff(sent).max() < 0.5 * air.flight._hold
 
 
-def test_the_end_of_a_climb_is_held_until_the_first_setpoint(monkeypatch):
+def test_end_of_climb_is_held_until_first_setpoint(monkeypatch):
     """By the robot's loop, which may wait for others; without it, the drone is landed."""
     air = Air(monkeypatch)
     air.telemetry.settled, air.telemetry.pose = True, [0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -148,7 +148,7 @@ def test_the_end_of_a_climb_is_held_until_the_first_setpoint(monkeypatch):
     assert air.flight.phase is Phase.LANDING
 
 
-def test_an_emergency_stop_is_said_until_it_is_answered(air):
+def test_emergency_stop_is_repeated_until_answered(air):
     air.flight.stop()
     before = air.now
     air.pass_(10.0)
@@ -166,7 +166,7 @@ def test_an_emergency_stop_is_said_until_it_is_answered(air):
     assert air.sent == []
 
 
-def test_a_firmware_that_does_not_say_that_it_is_locked_says_that_it_does_not_fly(air):
+def test_firmware_without_lock_flag_stops_once_not_flying(air):
     air.flight.stop()
     air.flying = False
     air.pass_(2.2)
@@ -192,7 +192,7 @@ def test_one_that_stands_is_not_locked(monkeypatch):
     assert air.sent == []
 
 
-def test_a_drone_that_flies_without_an_order_is_landed_and_not_cut(monkeypatch):
+def test_drone_flying_unasked_is_landed_and_not_cut(monkeypatch):
     """Its take-off was given up, or another session began it: the flag of the supervisor counts."""
     air = Air(monkeypatch)
     air.telemetry.pose = [0.1, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0]
@@ -255,7 +255,7 @@ def test_landing_lasts_from_the_highest_place(monkeypatch, pose, set_point):
 
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 8.0])
-def test_no_landing_is_faster_than_half_a_metre_per_second(air, height):
+def test_landing_never_exceeds_half_a_metre_per_second(air, height):
     """At the fastest a rest-to-rest polynomial is 35/16 of its mean speed."""
     air.telemetry.pose = [0.0, 0.0, height, *[0.0] * 4]
     air.flight.land()
@@ -365,7 +365,7 @@ def test_no_take_off_with_a_wrong_yaw(air):
     assert "its own yaw is 29° beside" in air.flight.takeoff_refusal()
 
 
-def test_a_process_that_stood_still_sends_no_setpoint_of_before(air):
+def test_stalled_process_sends_no_stale_setpoint(air):
     """Between the choice of a setpoint and its start, too; then the robot's loop has been silent, and it lands."""
     air.sent.clear()
     chosen = air.now
@@ -395,7 +395,7 @@ def test_setpoints_of_old_poses_are_ignored(air):
 
 
 @pytest.mark.parametrize("info", [Info.CRASHED, Info.TUMBLED])
-def test_a_crashed_drone_is_not_recovered_by_a_take_off(monkeypatch, info):
+def test_crashed_drone_is_not_recovered_by_take_off(monkeypatch, info):
     air = Air(monkeypatch)
     air.telemetry.settled, air.flying, air.info = True, False, Info.ARMED | info
     air.pass_(0.1)

@@ -74,7 +74,7 @@ def board(monkeypatch):
 
 @pytest.mark.parametrize("height", [0.2, 0.8, 3.0])
 @pytest.mark.parametrize("yaw", [0.0, 1.2])
-def test_a_setpoint_is_held_and_then_left_for_the_floor(board, height, yaw):
+def test_setpoint_is_held_and_then_left_downwards(board, height, yaw):
     while not board.started:
         board.client.hold((1.5, -2.0, height, yaw), HOLD_S)
     poses = board.flown(30.0)
@@ -108,7 +108,7 @@ def test_a_climb_ends_on_the_floor_too(board, yaw, packets):
     assert z[-1] < 0.0
 
 
-def test_one_part_is_written_at_a_time_and_started_when_all_are_confirmed(board):
+def test_parts_are_written_singly_and_started_when_confirmed(board):
     """Also of a setpoint that changes meanwhile; an answer that does not come is waited for, then asked for again."""
     board.lost = 1
     for x in (1.0, 1.1, 1.2):
@@ -132,7 +132,7 @@ def test_the_trajectory_that_is_flown_is_never_written(board, yaw, numbers, leas
     assert board.hold(0.4, yaw) == 1, "the one before is still there"
 
 
-def test_a_setpoint_of_before_a_gap_is_not_started(board):
+def test_setpoint_from_before_a_gap_is_not_started(board):
     board.lost = 1
     assert board.client.hold((3.0, 2.0, 0.5, 0.0), HOLD_S) == 0
     board.now += START_EXPIRY_S + 0.1

@@ -118,7 +118,7 @@ def test_all_odometries_of_a_robot_agree(steps, yaw):
         assert (odometer.x, odometer.y, odometer.yaw) == pytest.approx(expected, abs=1e-9)
 
 
-def test_odometry_begins_where_the_experiment_says_whatever_the_robot_counted_before():
+def test_odometry_begins_where_the_experiment_says():
     odometer = Odometer(0.5, 0.0, np.pi / 2)
     odometer.pose(7.0, 8.0, 1.0, 0.0)
     assert (odometer.x, odometer.y, odometer.yaw) == (0.5, 0.0, np.pi / 2)
@@ -126,7 +126,7 @@ def test_odometry_begins_where_the_experiment_says_whatever_the_robot_counted_be
     assert (odometer.x, odometer.y) == pytest.approx((0.5, 1.0))
 
 
-def test_a_robot_that_was_switched_on_anew_goes_on_from_where_it_was():
+def test_robot_switched_on_again_continues_where_it_was():
     odometer = Odometer(0.0, 0.0, 0.0)
     odometer.pose(0.0, 0.0, 0.0, 0.0)
     odometer.pose(0.3, 0.0, 0.0, 0.1)
@@ -248,7 +248,7 @@ def test_robots_drive_to_their_goals(served, speaks, bearings):
 
 
 @pytest.mark.system
-def test_a_gap_of_the_link_ends_in_a_stop_and_the_robot_goes_on_over_the_same_connection(served):
+def test_link_gap_stops_robot_and_keeps_the_connection(served):
     """A server that accepts one client in its life, silent for 0.7 s: what is sent meanwhile comes glued together."""
     rows = request("khepera4", ["khepera4-twin"], device=ONCE)
     twins = served(rows, silent_from_s=2.0, silent_for_s=0.7)
@@ -269,7 +269,7 @@ def test_a_gap_of_the_link_ends_in_a_stop_and_the_robot_goes_on_over_the_same_co
 
 
 @pytest.mark.system
-def test_a_position_from_outside_takes_the_place_of_odometry(served):
+def test_external_position_replaces_odometry(served):
     rows = request("khepera4", ["khepera4-twin"], external=True, start=[[0.3, 0.0, 0.0]])
     twins = served(rows)
     lied = reached(request("khepera4", ["-"], external=True, start=[[9.0, 9.0, 0.0]], yaw=2.0), twins.addresses)
@@ -283,7 +283,7 @@ def test_a_position_from_outside_takes_the_place_of_odometry(served):
 
 
 @pytest.mark.system
-def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
+def test_fault_of_one_robot_leaves_others_driving(served):
     one = {speaks["server"]: request("khepera4", ["khepera4-twin"], device=speaks) for speaks in (PARK, KTEAM)}
     good, killed = served(one["2025-05"]), served(one["2025-05"])
     silent = served(one["kteam"], silent_from_s=1.0)
@@ -317,7 +317,7 @@ def test_what_goes_wrong_with_one_leaves_the_others_driving(served):
 
 @pytest.mark.mechanism("Khepera IV bridge: link loss")
 @pytest.mark.system
-def test_a_link_that_was_lost_comes_back_and_goes_on(served):
+def test_lost_link_comes_back_and_goes_on(served):
     rows = request("khepera4", ["khepera4-twin"])
     first = served(rows)
     with opened(KheperaBody(reached(rows, first.addresses))) as body:
@@ -337,7 +337,7 @@ def test_a_link_that_was_lost_comes_back_and_goes_on(served):
 @pytest.mark.parametrize(
     "speaks", [pytest.param(PARK, marks=pytest.mark.mechanism("Khepera IV bridge: no more setpoints")), KTEAM]
 )
-def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
+def test_wheels_stop_without_setpoints_and_at_closing(served, speaks):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
     with opened(KheperaBody(reached(rows, twins.addresses))) as body:
@@ -362,7 +362,7 @@ def test_wheels_stop_without_setpoints_and_when_the_body_closes(served, speaks):
 
 @pytest.mark.system
 @pytest.mark.parametrize("speaks", [PARK, KTEAM])
-def test_a_second_client_is_told_that_it_is_one(served, speaks, impatient, monkeypatch, tmp_path):
+def test_second_client_learns_that_another_holds_server(served, speaks, impatient, monkeypatch, tmp_path):
     rows = request("khepera4", ["khepera4-twin"], device=speaks)
     twins = served(rows)
     with opened(KheperaBody(reached(rows, twins.addresses))) as first:
@@ -423,7 +423,7 @@ def test_park_never_gets_two_commands_at_once():
 
 
 @pytest.mark.system
-def test_wheels_whose_link_breaks_at_the_end_are_stopped_over_another():
+def test_wheels_with_link_broken_at_end_are_stopped():
     """A server that hangs up when it is told to stop, once."""
     lives = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -470,7 +470,7 @@ def test_a_stop_that_is_not_answered_is_said():
 
 
 @pytest.mark.system
-def test_a_serial_line_that_another_process_has_is_left_alone():
+def test_serial_line_in_use_is_left_alone():
     ours, theirs = os.openpty()
     address = Address.parse("KH01", f"kteam://{os.ttyname(theirs)}")
     first = address.connect()
@@ -540,7 +540,7 @@ while True:
 
 
 @pytest.mark.system
-def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before_but_a_stop():
+def test_process_woken_from_suspension_sends_only_a_stop():
     """It drives at 0.10 m/s until a moment at which it is suspended, and at 0.05 m/s when it goes on."""
     reads = []
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -69,7 +69,7 @@ def test_speeds_are_those_that_were_asked_for(lab, server):
 
 
 @pytest.mark.parametrize("server", SERVERS)
-def test_a_gap_of_the_link_ends_in_a_stop_over_the_same_connection(lab, server):
+def test_link_gap_ends_in_stop_over_same_connection(lab, server):
     robot = lab(server)
     for _ in range(25):
         robot.exchange(0.1, 0.0)
@@ -91,7 +91,7 @@ def test_a_gap_of_the_link_ends_in_a_stop_over_the_same_connection(lab, server):
 
 
 @pytest.mark.parametrize("server", SERVERS)
-def test_a_command_that_has_waited_too_long_is_sent_as_a_stop(lab, server):
+def test_command_that_waited_too_long_becomes_a_stop(lab, server):
     robot = lab(server)
     for _ in range(25):
         robot.exchange(0.1, 0.0)
@@ -101,7 +101,7 @@ def test_a_command_that_has_waited_too_long_is_sent_as_a_stop(lab, server):
     assert stands(robot)
 
 
-def test_a_command_is_as_old_as_the_state_on_which_it_was_decided(monkeypatch):
+def test_command_is_as_old_as_its_state(monkeypatch):
     link = Khepera4Link(
         "KH01", Address.parse("KH01", "khepera4://127.0.0.1"), protocol.Khepera4Settings(), (0.0, 0.0, 0.0)
     )
@@ -113,7 +113,7 @@ def test_a_command_is_as_old_as_the_state_on_which_it_was_decided(monkeypatch):
 
 
 @pytest.mark.parametrize("server", SERVERS)
-def test_nothing_is_sent_that_the_server_takes_for_a_goal(lab, server):
+def test_nothing_sent_looks_like_a_goal_to_servers(lab, server):
     robot = lab(server)
     for _ in range(5):
         robot.exchange(0.1, 0.0)
@@ -124,17 +124,17 @@ def test_nothing_is_sent_that_the_server_takes_for_a_goal(lab, server):
 
 
 @pytest.mark.parametrize("server", ["2023-04-10", "2025-05"])
-def test_a_server_that_tells_its_year_is_found_out(lab, server):
+def test_server_that_gives_its_year_is_identified(lab, server):
     assert lab(server, named=False).driver.server == protocol.PARK[server]
 
 
 @pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "fork"])
-def test_a_server_that_several_may_be_is_asked_for_and_not_driven(lab, server):
+def test_ambiguous_server_is_asked_for_and_not_driven(lab, server):
     with pytest.raises(WrongServer, match=r'2023-01-07, 2023-01-15, fork do: .* device = { server = "2023-01-07" }'):
         lab(server, named=False)
 
 
-def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
+def test_server_other_than_the_named_is_refused(lab, monkeypatch):
     robot = lab("2025-05")
     with pytest.raises(WrongServer, match="as the server of 2025-05 does, not that of 2023-01-07"):
         drivers.identify(robot, protocol.Khepera4Settings(server="2023-01-07"), "2023-01-07")
@@ -145,7 +145,7 @@ def test_a_server_that_is_not_the_named_one_is_refused(lab, monkeypatch):
 
 
 @pytest.mark.parametrize("server", SERVERS)
-def test_way_in_a_sleep_of_the_machine_is_counted(lab, server):
+def test_way_during_machine_sleep_is_counted(lab, server):
     """The robot drives on; the machine's monotonic clock leaves the sleep out, its uptime does not."""
     robot = lab(server)
     for _ in range(25):
@@ -197,7 +197,7 @@ def test_way_that_is_reported_late_is_counted_once(lab):
         ("kteam://h:1", {"server": "kteam"}, "kteam"),
     ],
 )
-def test_the_server_is_named_in_the_address_or_in_the_table(address, device, server):
+def test_server_is_named_in_address_or_table(address, device, server):
     assert Address.parse("R0", address).server_of("R0", protocol.Khepera4Settings(**device)) == server
 
 

@@ -38,7 +38,7 @@ def test_sticks_by_hand():
     assert protocol.sticks((9.0, 0.0, -9.0), 9.0, 0.0) == (0, 100, -100, -100)
 
 
-def test_a_take_off_is_said_once_and_answered_when_it_is_up():
+def test_take_off_is_sent_once_and_answered_aloft():
     cockpit = Cockpit()
     cockpit.pass_(0.2)
     cockpit.pilot.position = (1.0, 2.0, 0.0)
@@ -57,7 +57,7 @@ def test_a_take_off_is_said_once_and_answered_when_it_is_up():
     assert cockpit.drone.said == ["takeoff"]
 
 
-def test_it_climbs_to_its_height_and_holds_its_place_until_setpoints_come():
+def test_tello_climbs_and_holds_until_setpoints_come():
     cockpit = Cockpit().fly()
     cockpit.pilot.position, cockpit.pilot.yaw = (0.9, 2.0, 0.8), 0.0
     cockpit.pass_(0.05)
@@ -87,7 +87,7 @@ def test_a_climb_with_markers_on_the_floor_ends():
     assert pilot.trouble == "landing: it is 1.7 m high, and its positions do not rise with it"
 
 
-def test_a_process_that_wakes_from_a_suspension_sends_nothing_from_before():
+def test_process_woken_from_suspension_sends_nothing_stale():
     """Suspended in the middle of a step, which is a stick of before; then it lands, as it does in a take-off."""
     cockpit = Cockpit().fly()
     pilot, drone = cockpit.pilot, cockpit.drone
@@ -188,7 +188,7 @@ def test_lost_answers_and_lost_commands():
     assert not cockpit.pilot.flying
 
 
-def test_a_second_take_off_that_is_refused_means_that_it_flies():
+def test_refused_second_take_off_means_it_flies():
     cockpit = Cockpit()
     cockpit.take_off(0.6)
     cockpit.pass_(2.0, h=80)
@@ -207,7 +207,7 @@ def test_a_drone_that_never_gets_up_is_landed():
     assert "did not take off in 20 s" in cockpit.pilot.note(cockpit.now)
 
 
-def test_it_lands_when_answered_and_only_when_it_is_low():
+def test_landing_ends_when_answered_and_low():
     cockpit = Cockpit().fly()
     cockpit.pilot.land(cockpit.now)
     cockpit.drone.responses.append(b"ok")  # of the sticks: some firmware answers them
@@ -219,7 +219,7 @@ def test_it_lands_when_answered_and_only_when_it_is_low():
     assert cockpit.pilot.duty is Duty.REST
 
 
-def test_the_emergency_stop_is_said_until_the_motors_stand():
+def test_emergency_stop_is_repeated_until_motors_stand():
     cockpit = Cockpit().fly()
     cockpit.drone.said.clear()
     cockpit.pilot.cut(cockpit.now)
@@ -240,7 +240,7 @@ def test_the_emergency_stop_is_said_until_the_motors_stand():
     assert cockpit.drone.said == []
 
 
-def test_a_silent_drone_is_told_to_stop_until_it_must_have_landed():
+def test_silent_drone_is_stopped_until_surely_landed():
     cockpit = Cockpit().fly()
     cockpit.speaks = False
     cockpit.pilot.cut(cockpit.now)
@@ -253,7 +253,7 @@ def test_a_silent_drone_is_told_to_stop_until_it_must_have_landed():
     assert "landed by itself" in cockpit.pilot.note(cockpit.now)
 
 
-def test_a_drone_that_stands_answers_a_stop_at_once():
+def test_standing_drone_answers_a_stop_at_once():
     cockpit = Cockpit()
     cockpit.pass_(2.0)
     cockpit.pilot.cut(cockpit.now)
@@ -262,7 +262,7 @@ def test_a_drone_that_stands_answers_a_stop_at_once():
     assert not cockpit.pilot.flying
 
 
-def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
+def test_stopped_take_off_counts_as_flying_until_standing():
     cockpit = Cockpit()
     cockpit.take_off(0.6, at=(1.0, 2.0, 0.0), rested_s=5.0)
     cockpit.pass_(0.1)
@@ -273,7 +273,7 @@ def test_a_take_off_that_is_stopped_at_once_is_told_until_it_stands():
     assert not cockpit.pilot.flying
 
 
-def test_one_that_cannot_be_driven_keeps_nobody_from_being_stopped():
+def test_undrivable_drone_keeps_no_other_from_stopping():
     body = TelloBody(request("tello", ["tello://10.0.0.2", "tello://10.0.0.3"], external=True))
     lost, good = Cockpit().fly(), Cockpit().fly()
     body._pilots = [lost.pilot, good.pilot]
@@ -307,7 +307,7 @@ def test_a_drone_that_landed_by_itself_is_seen():
     assert cockpit.pilot.note(cockpit.now) == "landed by itself, battery at 80%"
 
 
-def test_a_silent_drone_is_told_to_land_until_it_must_have_landed():
+def test_silent_drone_is_landed_until_surely_down():
     cockpit = Cockpit().fly()
     cockpit.speaks = False
     cockpit.pass_(1.2)
@@ -341,7 +341,7 @@ def test_a_network_that_is_down_is_named():
     assert cockpit.pilot.note(cockpit.now) == ""
 
 
-def test_its_own_yaw_is_counted_from_where_it_was_opened():
+def test_yaw_counts_from_where_it_was_opened():
     cockpit = Cockpit()
     cockpit.pass_(0.2)
     assert cockpit.pilot.turned == 0.0
@@ -352,7 +352,7 @@ def test_its_own_yaw_is_counted_from_where_it_was_opened():
     assert cockpit.pilot.battery == 0.8
 
 
-def test_what_is_left_in_the_air_is_landed_when_the_process_ends():
+def test_drone_left_aloft_lands_when_process_ends():
     cockpit = Cockpit().fly()
     cockpit.drone.said.clear()
     cockpit.pilot.leave()
@@ -444,7 +444,7 @@ def test_the_bridge_flies_two_twins():
 
 @pytest.mark.mechanism("Tello bridge: one of several fails")
 @pytest.mark.system
-def test_what_goes_wrong_with_one_leaves_the_others_flying():
+def test_fault_of_one_drone_leaves_others_flying():
     flown = fly("faults")
     said = flown["said"]
     assert flown["opened"] > 1.0

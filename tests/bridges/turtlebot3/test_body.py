@@ -250,7 +250,7 @@ def test_what_it_sends_is_what_rmw_zenoh_sends(hub, eventually):
 
 
 @pytest.mark.system
-def test_speeds_are_within_the_limits_and_commands_are_repeated(hub):
+def test_speeds_are_limited_and_commands_repeated(hub):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
         stage.run(1.0, stage.constant(9.0))
@@ -338,7 +338,7 @@ def test_external_positions_with_the_speed_of_odometry(hub):
 
 
 @pytest.mark.system
-def test_it_stands_on_its_start_pose_wherever_its_odometry_is(hub):
+def test_robot_stands_on_start_pose_whatever_its_odometry(hub):
     asked = request(hub.endpoint, start=((1.0, 1.0),), yaw=(pi / 2,))
     with Stage(asked) as stage:
         stage.body.open()

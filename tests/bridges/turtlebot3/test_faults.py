@@ -26,7 +26,7 @@ NOWHERE = "tcp/127.0.0.1:9"
 
 @pytest.mark.system
 @pytest.mark.parametrize("style", STYLES)
-def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
+def test_wrong_command_type_moves_nothing_and_is_reported(hub, style):
     asked = request(hub.endpoint, device={"style": style, "stamped": False})
     with Stage(asked) as stage:
         stage.body = TurtleBot3(replace(asked, addresses=stage.twin.addresses, device=({},)))
@@ -40,7 +40,7 @@ def test_the_wrong_type_of_command_moves_nothing_and_is_said(hub, style):
 
 
 @pytest.mark.system
-def test_a_robot_that_does_not_move_is_said_so(hub):
+def test_robot_that_does_not_move_is_reported(hub):
     with Stage(request(hub.endpoint)) as stage:
         stage.body.open()
         stage.twin._robots[0].model._acceleration = 0.0  # as with its motors off
@@ -56,7 +56,7 @@ def test_a_robot_that_does_not_move_is_said_so(hub):
 @pytest.mark.parametrize(
     "watchdog", [None, pytest.param(0.5, marks=pytest.mark.mechanism("TurtleBot3 bridge: silent robot"))]
 )
-def test_a_silent_robot_gets_zeros_until_it_hears_them(hub, watchdog):
+def test_silent_robot_gets_zeros_until_it_receives_them(hub, watchdog):
     device = {"watchdog_s": watchdog} if watchdog else {}
     with Stage(request(hub.endpoint, device=device), faults=Faults(silent_from_s=3.0, silent_for_s=3.0)) as stage:
         stage.body.open()
@@ -88,7 +88,7 @@ def test_a_stop_that_is_not_answered_is_said(hub):
         assert stage.moved(0.5)[0] == 0.0
 
 
-def test_one_that_cannot_be_told_keeps_nobody_from_being_stopped():
+def test_unreachable_robot_keeps_no_other_from_stopping():
     body = TurtleBot3(request("tcp/127.0.0.1:1", start=((0.0, 0.0), (1.0, 0.0)), addresses=("rmw://a", "rmw://b")))
     told = []
 
@@ -183,7 +183,7 @@ def test_an_absent_robot_is_named_in_time(hub, style):
 
 
 @pytest.mark.system
-def test_a_robot_in_another_domain_or_of_another_distribution_is_recognised(hub):
+def test_robot_of_other_domain_or_distribution_is_recognised(hub):
     with Stage(request(hub.endpoint, device={"style": "rmw", "distro": "humble", "domain": 30})) as stage:
         other = TurtleBot3(request(hub.endpoint, addresses=("rmw://TB0?domain=0&distro=humble",)), clock)
         with pytest.raises(BodyError, match=r"published in domain 30: write rmw://TB0\?domain=30"):
@@ -272,7 +272,7 @@ def test_stale_commands_are_followed_by_zeros() -> None:
     assert len(sent) >= 4
 
 
-def test_a_command_from_before_a_suspension_is_sent_as_zeros() -> None:
+def test_command_from_before_suspension_becomes_zeros() -> None:
     robot = Robot(request("tcp/127.0.0.1:1", addresses=("ros2dds://tb3_0",)), 0)
     sent = []
     robot._types, robot._command_type = ros2.types("humble"), ros2.TWIST

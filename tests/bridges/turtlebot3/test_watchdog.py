@@ -37,7 +37,7 @@ def zeros(dog: Watchdog, begin: float, end: float) -> list[float]:
     return [t for t in ticks if dog.zero_due(t)]
 
 
-def test_a_robot_that_moves_is_stopped_after_half_a_second_of_silence() -> None:
+def test_moving_robot_stops_after_half_a_second_silence() -> None:
     dog = Watchdog(0.5)
     dog.hear(10.0, moves=True)
     sent = zeros(dog, 10.0, 14.0)
@@ -47,7 +47,7 @@ def test_a_robot_that_moves_is_stopped_after_half_a_second_of_silence() -> None:
     assert dog.stops == 1
 
 
-def test_a_robot_that_is_commanded_or_stands_is_left_alone() -> None:
+def test_commanded_or_standing_robot_is_left_alone() -> None:
     dog = Watchdog(0.5)
     assert zeros(dog, 0.0, 5.0) == []  # nobody has ever moved it
     for k in range(50):
@@ -112,7 +112,7 @@ class FakeRos:
 
 
 @pytest.mark.parametrize("kind", ["twist", "stamped"])
-def test_the_node_sends_zeros_of_the_type_that_the_robot_takes(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_node_sends_zeros_of_the_robots_type(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     messages = types.ModuleType("geometry_msgs.msg")
     messages.Twist = twist  # type: ignore[attr-defined]
     messages.TwistStamped = lambda: Thing(header=Thing(stamp=None), twist=twist())  # type: ignore[attr-defined]
@@ -129,7 +129,7 @@ def test_the_node_sends_zeros_of_the_type_that_the_robot_takes(monkeypatch: pyte
     assert ros.sent[0] == (twist() if kind == "twist" else Thing(header=Thing(stamp="now"), twist=twist()))
 
 
-def test_the_type_is_that_of_the_robot_not_its_own() -> None:
+def test_type_is_the_robots_not_the_watchdogs() -> None:
     ros = FakeRos().create_node("cmd_vel_watchdog")
     assert type_of_robot(ros, "cmd_vel") == ""
     ros.receivers = [
@@ -215,7 +215,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.mechanism("TurtleBot3: watchdog on the robot")
 @pytest.mark.system
-def test_the_watchdog_is_installed_kept_running_and_removed_over_ssh(robot: Path) -> None:
+def test_watchdog_is_installed_kept_and_removed_over_ssh(robot: Path) -> None:
     for attempt in range(2):  # a second time replaces the first
         said = robot_watchdog.install("robot", namespace="tb3_0", domain=30, silence_s=0.5)
         assert "it is started at each boot (crontab -l)" in said

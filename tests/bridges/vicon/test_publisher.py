@@ -61,7 +61,7 @@ class Frames:
 
 
 @pytest.mark.parametrize("step", [-1.0, 3.0])
-def test_a_step_of_the_wall_clock_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
+def test_wall_clock_step_moves_no_position(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
     Frames.steady, wall = 5.0, 1.8e9
     monkeypatch.setattr(publisher, "Reader", Frames)
     monkeypatch.setattr(time, "clock_gettime", lambda _clock: Frames.steady)
@@ -87,9 +87,7 @@ angle = st.floats(-3.1, 3.1)
 
 
 @given(angle, st.floats(-1.4, 1.4), angle, st.floats(1.01, 3.0))
-def test_the_heading_is_where_the_nose_points_and_only_of_rotations(
-    yaw: float, pitch: float, roll: float, scale: float
-) -> None:
+def test_heading_follows_the_nose_and_only_rotations(yaw: float, pitch: float, roll: float, scale: float) -> None:
     tilt = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
     bank = np.array([[1, 0, 0], [0, math.cos(roll), -math.sin(roll)], [0, math.sin(roll), math.cos(roll)]])
     turned = upright(yaw) @ tilt @ bank
@@ -122,7 +120,7 @@ def test_what_was_not_seen_is_not_said() -> None:
     ]
 
 
-def test_a_jump_is_not_believed_until_it_has_lasted() -> None:
+def test_jump_is_not_believed_until_it_lasts() -> None:
     pose_filter = PoseFilter({"CF01": "CF01"}, lambda _: None)
     believed = []
     for tick in range(200):
@@ -182,7 +180,7 @@ def test_a_frame_that_repeats_its_number_is_none(monkeypatch: pytest.MonkeyPatch
     assert said[-1].startswith("lost nowhere:1: no new frame for 2 s")
 
 
-def test_frames_that_overtake_each_other_and_axes_that_lie_are_left_out() -> None:
+def test_overtaking_frames_and_false_axes_are_left_out() -> None:
     said: list[str] = []
     pose_filter = PoseFilter({"CF01": "CF01"}, said.append)
     assert len(pose_filter.filter_poses(frame(CF01=(0.0, 0.0, 1.0)), 1.00)) == 1
@@ -291,9 +289,7 @@ def session(router: RouterProcess) -> Iterator[network.zenoh.Session]:
 
 
 @pytest.mark.system
-def test_positions_arrive_as_they_were_placed_and_when_they_were_measured(
-    start: Start, session: network.zenoh.Session
-) -> None:
+def test_positions_arrive_as_placed_and_when_measured(start: Start, session: network.zenoh.Session) -> None:
     with Camera(["cf_1", "KH01"], rate_hz=200.0) as camera:
         camera.place("cf_1", [0.123456789, -0.5, 1.0], 0.3)
         camera.place("KH01", [-1.0, 0.25, 0.06], -2.0)
@@ -319,7 +315,7 @@ def test_positions_arrive_as_they_were_placed_and_when_they_were_measured(
 
 
 @pytest.mark.system
-def test_occlusion_is_a_gap_and_never_a_wrong_pose(start: Start, session: network.zenoh.Session) -> None:
+def test_occlusion_is_a_gap_not_a_wrong_pose(start: Start, session: network.zenoh.Session) -> None:
     begin = time.monotonic()
     with Camera(["CF01"], look=lambda: camera.twin.place(0, place(), upright(0.0))) as camera:
 
@@ -346,9 +342,7 @@ def test_occlusion_is_a_gap_and_never_a_wrong_pose(start: Start, session: networ
 
 
 @pytest.mark.system
-def test_a_server_that_goes_and_one_that_talks_nonsense_are_survived(
-    start: Start, session: network.zenoh.Session
-) -> None:
+def test_lost_server_and_nonsense_server_are_survived(start: Start, session: network.zenoh.Session) -> None:
     listener = Listener(session, "CF01")
     with Camera(["CF01"]) as camera:
         camera.place("CF01", [0.0, 0.0, 1.0])
@@ -413,9 +407,7 @@ def test_it_ends_with_its_starter(start: Start) -> None:
 
 @pytest.mark.mechanism("motion capture: occlusion")
 @pytest.mark.system
-def test_a_robot_flies_on_through_a_short_occlusion_and_lands_in_a_long_one(
-    start: Start, router: RouterProcess, tmp_path: Path
-) -> None:
+def test_short_occlusion_is_flown_through_long_one_lands(start: Start, router: RouterProcess, tmp_path: Path) -> None:
     """The whole way round: simulated bodies, a Vicon that sees them, its stream, the bridge, the robots' process."""
     file = tmp_path / "seen.toml"
     text = document.read("triangle").text.replace("hover = 0.6", 'hover = 0.3\nposition = "external"')
