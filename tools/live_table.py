@@ -10,13 +10,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from itertools import accumulate
 from math import inf
 from typing import TYPE_CHECKING, Final
 
 from agents.network.messages import Event, Status
 from experiments.real_time.conductor.run_view import FROZEN_S
+from tools.terminal import printable
 
 if TYPE_CHECKING:
+    from rich.console import Group
     from rich.text import Text
 
 WINDOW_S: Final = 0.9  # shortest time over which CPU and growth are measured
@@ -24,7 +27,7 @@ RECENT_S: Final = 5.0  # a counter that grew within this time is coloured
 LOW_BATTERY: Final = 0.25
 FLAT_BATTERY: Final = 0.1
 EVENTS: Final = 5  # the last so many are shown below the table
-GAP: Final = "  "
+GAP: Final = 2  # between columns [characters]
 NOTE: Final = 10  # least width of the last column
 BAR: Final = 20
 
@@ -184,36 +187,41 @@ def metres(error: float | None) -> str:
     return "–" if error is None else f"{error:.3f}"
 
 
-def _cells(row: Row) -> list[tuple[str, str]]:
-    """Texts and styles of a row, by column."""
+def _cells(row: Row) -> list[Text]:
+    """Texts of a row, by column."""
+    from rich.text import Text
+
     colour = COLOURS.get(row.rank, "")
     counts = [("", "") if value is None else (str(value), "yellow" if word in row.growing else "")
               for word, value in (("late", row.late), ("lost", row.lost))]  # fmt: skip
     charge = ""
     if row.battery is not None and row.battery < LOW_BATTERY:
         charge = "bold red" if row.battery < FLAT_BATTERY else "yellow"
-    return [
-        (_safe(row.name), colour),
-        (_safe(row.phase), colour),
+    cells = (
+        (printable(row.name), colour),
+        (printable(row.phase), colour),
         (metres(row.error), ""),
         (f"{row.rate:.1f}", ""),
         *counts,
         ("" if row.cpu is None else f"{100 * row.cpu:.0f} %", ""),
         ("" if row.battery is None else f"{100 * row.battery:.0f} %", charge),
         ("" if row.sent is None else str(row.sent), "dim"),
-        (_safe(row.note), colour),
-    ]
+        (printable(row.note), colour),
+    )
+    return [Text(text, style) for text, style in cells]
 
 
-def lines(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, height: int) -> list[Text]:
-    """The table as lines, none longer than `width`, no more than `height` of them.
+def drawn(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, height: int) -> Group:
+    """The table with its title and events, no wider than `width`, no more than `height` lines.
 
     Args:
         rows: One a robot, in the order of the experiment.
         events: Below the table, as many of the last as have room.
-        width: Of the terminal [characters]; a name that is longer is shown all the same.
+        width: Of the terminal [characters].
         height: Of the terminal [lines].
     """
+    from rich.console import Group
+    from rich.table import Table
     from rich.text import Text
 
     below = min(EVENTS, len(events), max(0, height // 4 - 1))
@@ -222,27 +230,22 @@ def lines(title: str, rows: Sequence[Row], events: Sequence[Event], width: int, 
     chosen = worst_first(rows, fit=fit)[: room if fit else max(1, room - 1)]
     if not fit:
         chosen.append(totals(rows, len(chosen)))
-    cells = [[(head, "bold") for head in HEADS], *map(_cells, chosen)]
-    widths = [max(len(line[column][0]) for line in cells) for column in range(len(HEADS))]
-    made = [Text(_safe(title)[:width], style="bold")]
-    used, kept = widths[0], 1
-    for column in range(1, len(HEADS) - 1):
-        if used + len(GAP) + widths[column] > width:
-            break
-        used, kept = used + len(GAP) + widths[column], column + 1
-    note = width - used - len(GAP) if kept == len(HEADS) - 1 else 0
+    cells = [_cells(row) for row in chosen]
+    widths = [max(len(HEADS[k]), *(len(line[k].plain) for line in cells)) for k in range(len(HEADS) - 1)]
+    ends = [*accumulate(widths, lambda end, wide: end + GAP + wide), 0]
+    kept = max(1, sum(0 < end <= width for end in ends))
+    noted = kept == len(widths) and width - ends[kept - 1] - GAP >= NOTE
+    table = Table(box=None, padding=(0, GAP, 0, 0), pad_edge=False, header_style="bold", expand=noted)
+    for k, head in enumerate(HEADS[: kept + noted]):
+        table.add_column(
+            head, justify="left" if k in LEFT else "right", no_wrap=True, ratio=int(k == len(widths)) or None
+        )
     for line in cells:
-        text = Text()
-        for column, (word, style) in enumerate(line[:kept]):
-            text.append(GAP if column else "")
-            text.append(word.ljust(widths[column]) if column in LEFT else word.rjust(widths[column]), style or None)
-        if note >= NOTE and line[-1][0]:
-            word, style = line[-1]
-            text.append(GAP + (word if len(word) <= note else word[: note - 1] + "…"), style or None)
-        text.rstrip()
-        made.append(text)
-    said = [_safe(f"  {event.kind} {event.source}: {event.text}") for event in list(events)[len(events) - below :]]
-    return made + [Text(each[:width], style="dim") for each in said]
+        table.add_row(*line[: kept + noted])
+    said = [printable(f"  {event.kind} {event.source}: {event.text}") for event in [*events][len(events) - below :]]
+    return Group(
+        Text(printable(title)[:width], style="bold"), table, *(Text(each[:width], style="dim") for each in said)
+    )
 
 
 def heading(what: str, elapsed: float | None, duration: float | None, name: str = "") -> str:
@@ -253,11 +256,6 @@ def heading(what: str, elapsed: float | None, duration: float | None, name: str 
     elif elapsed is not None:
         what += f"  {elapsed:.1f} s"
     return f"{what}  {name}".rstrip()
-
-
-def _safe(text: str) -> str:
-    """Text of others, without what could steer the terminal."""
-    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def common_phase(phases: Sequence[str]) -> str:

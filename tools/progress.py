@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from experiments.real_time.conductor.run_view import OUTPUT, News, Progress, RobotView, Shown
-from tools.live_table import Row, Trends, heading, lines, metres
+from tools.live_table import Row, Trends, drawn, heading, metres
 from tools.terminal import printable, say
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console, Group
 
     from experiments.report.page import Finding
 
@@ -78,7 +78,7 @@ class Table:
         now = time.monotonic()
         if now >= self._next or progress.phase == "done":
             self._next = now + REFRESH_S
-            self._live.update(_drawn(progress, self._trends, self._live.console), refresh=True)
+            self._live.update(_table(progress, self._trends, self._live.console), refresh=True)
 
 
 def shown(*, quiet: bool) -> Shown:
@@ -86,15 +86,13 @@ def shown(*, quiet: bool) -> Shown:
     return Table() if sys.stderr.isatty() and not quiet else Lines()
 
 
-def _drawn(progress: Progress, trends: Trends, console: Console) -> RenderableType:
-    from rich.console import Group
-
+def _table(progress: Progress, trends: Trends, console: Console) -> Group:
     silence = _silence(progress) and f"; {_silence(progress)}"
     title = heading(f"{progress.case}: {progress.phase}{silence}", progress.elapsed, progress.duration)
     now = progress.clock.utc()
     rows = [_row(trends, name, view, now) for name, view in progress.robots.items()]
     news = [event for event in progress.events if event.kind not in (*QUIET, OUTPUT)]
-    return Group(*lines(title, rows, news, console.width, console.height - 1))
+    return drawn(title, rows, news, console.width, console.height - 1)
 
 
 def _row(trends: Trends, name: str, view: RobotView, now: float) -> Row:

@@ -40,7 +40,6 @@ class Table:
     title: str = ""
     note: str = ""
     words: bool = False  # aligns to the left
-    keys: int = 1  # columns that name a row, the first ones
 
 
 def number(value: float | None, scale: float = 1.0) -> str:

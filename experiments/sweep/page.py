@@ -124,7 +124,7 @@ def table(rows: Sequence[CellRow], title: str = "", chosen: Sequence[str] = ()) 
     note = [f"Ratios are relative to {reference} with the same seed."]
     note += [f"In all cells: {', '.join(f'{head} {cell}' for head, cell in alike.items())}."] if alike else []
     note += [over_seeds(max((row.seeds for row in rows), default=0))] if title else []
-    return Table(("Case", *columns), tuple(lines), title=title, note=" ".join(note), keys=1 + len(parameters))
+    return Table(("Case", *columns), tuple(lines), title=title, note=" ".join(note))
 
 
 def pictures(

@@ -47,7 +47,7 @@ def report(
         float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
     pdf: Annotated[bool, typer.Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
-    as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs) instead.")] = False,
+    as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs, adjustbox) instead.")] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     metrics: Annotated[
         str | None, typer.Option(metavar="NAMES", help="With --latex or --markdown: these alone, as f,iae,itae.")

@@ -17,7 +17,7 @@ from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, exampl
 
 if TYPE_CHECKING:
     import zenoh
-    from rich.text import Text
+    from rich.console import Group
 
     from agents.runtime.run_registry import Run
     from experiments.run import Watch
@@ -115,7 +115,7 @@ class _Top:
         """Draw until it is ended or the run is over; return the exit code."""
         import time
 
-        from rich.console import Console, Group
+        from rich.console import Console
         from rich.live import Live
 
         console = Console()
@@ -128,14 +128,14 @@ class _Top:
                 seen = self._observer
                 print_json({"case": seen.case, "time_s": seen.elapsed, "robots": self._rows()})
             else:
-                console.print(Group(*self._lines(console.width, len(self._observer.robots) + 20)), soft_wrap=True)
+                console.print(self._table(console.width, len(self._observer.robots) + 20), soft_wrap=True)
             return int(not over)
         with Live(console=console, auto_refresh=False, screen=True) as live:
             while not (over or ended.wait(REFRESH_S)):
                 over = self._watched.run is not None and not self._watched.run.alive
                 self._observer.update()
-                live.update(Group(*self._lines(console.width, console.height)), refresh=True)
-        console.print(Group(*self._lines(console.width, console.height - 1)))  # what stood there last stays
+                live.update(self._table(console.width, console.height), refresh=True)
+        console.print(self._table(console.width, console.height - 1))  # what stood there last stays
         return 0
 
     def _all_reported(self) -> bool:
@@ -168,9 +168,9 @@ class _Top:
             )  # fmt: skip
         return rows
 
-    def _lines(self, width: int, height: int) -> list[Text]:
+    def _table(self, width: int, height: int) -> Group:
         from experiments.file.document import UNNAMED
-        from tools.live_table import common_phase, heading, lines
+        from tools.live_table import common_phase, drawn, heading
 
         stage, rows, where = self._observer.stage, self._rows(), self._watched
         title = stage.title or (where.run.title if where.run is not None else f"realm {where.realm}")
@@ -178,7 +178,7 @@ class _Top:
         phase, case = common_phase([row.phase for row in rows]), self._observer.case
         phase = f"{case}: {phase}" if case not in ("", UNNAMED) else phase
         title = heading(phase, self._observer.elapsed, duration, title)
-        return lines(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
+        return drawn(title, rows, [each for each in self._observer.events if each.kind != "robot"], width, height)
 
 
 @app.command(epilog=example("replay runs/first", "replay runs/first --case event --rate 5 --loop"))

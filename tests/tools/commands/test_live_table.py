@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from rich.console import Console
+from rich.segment import Segment
 
 from agents.network.messages import Event, Status
-from tools.live_table import HEADS, Rank, Row, Trends, heading, lines, worst_first
+from tools.live_table import HEADS, Rank, Row, Trends, drawn, heading, worst_first
 
 STATUS = Status(
     "robot-01", 10.0, "running", "", "", 0.9, 100, 300, {"robot-02": 0}, {}, 0, 0, 500, 0, 500, 0, 0, 0.0, 1.0, [],
@@ -23,6 +25,19 @@ def rows(count: int) -> list[Row]:
     ]  # fmt: skip
 
 
+def segments(title: str, rows: list[Row], events: list[Event], width: int, height: int) -> list[list[Segment]]:
+    """The table, line by line."""
+    return Console(width=width, height=height).render_lines(drawn(title, rows, events, width, height), pad=False)
+
+
+def lines(title: str, rows: list[Row], events: list[Event], width: int, height: int) -> list[str]:
+    return ["".join(part.text for part in line).rstrip() for line in segments(title, rows, events, width, height)]
+
+
+def styles(*rows: Row) -> dict[str, str]:
+    return {part.text.strip(): str(part.style) for line in segments("t", [*rows], [], 140, 10) for part in line}
+
+
 @pytest.mark.parametrize("width", [40, 64, 80, 140])
 @pytest.mark.parametrize("height", [8, 14, 24, 50])
 @pytest.mark.parametrize("count", [3, 12, 100])
@@ -30,29 +45,29 @@ def test_the_table_fits_the_terminal_and_names_are_whole(width, height, count):
     held = msgspec.structs.replace(STATUS, hazard="hold: minimum separation: 0.18 m from robot-03 (limit 0.25 m)")
     all_rows = rows(count)
     all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0)
-    drawn = [line.plain for line in lines(heading("event: formation", 5.3, 15.0), all_rows, EVENTS, width, height)]
-    assert max(map(len, drawn)) <= width
-    assert len(drawn) <= height
-    assert drawn[0].startswith("event: formation")
-    columns = drawn[1].split("  ")
+    text = lines(heading("event: formation", 5.3, 15.0), all_rows, EVENTS, width, height)
+    assert max(map(len, text)) <= width
+    assert len(text) <= height
+    assert text[0].startswith("event: formation")
+    columns = text[1].split("  ")
     heads = [word.strip() for word in columns if word.strip()]
     assert heads == [head for head in HEADS if head][: len(heads)], "columns drop from the right"
-    named = [line.split()[0] for line in drawn[2:] if line.startswith("robot-")]
+    named = [line.split()[0] for line in text[2:] if line.startswith("robot-")]
     assert named[0] == f"robot-{count - 1:02}", "what needs attention comes first"
     assert all(len(name) == len("robot-00") for name in named)
-    total = [line for line in drawn if line.startswith(f"all {count}")]
+    total = [line for line in text if line.startswith(f"all {count}")]
     assert bool(total) == (len(named) < count)
     if total:
         assert f"+{count - len(named)} more" in total[0]
 
 
 def test_a_wide_table_has_all_columns_and_totals():
-    drawn = [line.plain for line in lines("t", rows(100), [], 140, 20)]
-    assert all(head in drawn[1] for head in HEADS)
-    assert drawn[-1].split()[:2] == ["all", "100"]
+    text = lines("t", rows(100), [], 140, 20)
+    assert all(head in text[1] for head in HEADS)
+    assert text[-1].split()[:2] == ["all", "100"]
     for figure in ("0.099", "1250.0", "300", "400 %", "80 %", "90000"):
-        assert figure in drawn[-1]
-    assert drawn[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
+        assert figure in text[-1]
+    assert text[2].startswith("robot-99"), "where rows do not fit, the largest error comes first"
 
 
 def test_rows_that_fit_stay_in_their_order():
@@ -72,15 +87,13 @@ def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
     assert (row.cpu, row.rate) == (pytest.approx(0.05), 3.0)
     assert row.growing == {"late", "lost"}
     assert row.rank == Rank.LOW
-    styles = {line.plain[part.start : part.end].strip(): str(part.style) for line in lines("t", [row], [], 140, 10)
-              for part in line.spans}  # fmt: skip
-    assert styles["2"] == styles["5"] == styles["20 %"] == "yellow"
+    seen = styles(row)
+    assert seen["2"] == seen["5"] == seen["20 %"] == "yellow"
     flat = trends.row("robot-01", msgspec.structs.replace(later, battery=0.05), now=12.0, error=0.01)
     held = trends.row("held-one", msgspec.structs.replace(later, hazard="hold: x"), now=12.0, error=0.01)
     gone = trends.row("gone-one", STATUS, now=12.0, error=None, gone="lost", lost=True)
-    styles = {line.plain[part.start : part.end].strip(): str(part.style)
-              for line in lines("t", [flat, held, gone], [], 140, 10) for part in line.spans}  # fmt: skip
-    assert (styles["5 %"], styles["held-one"], styles["gone-one"]) == ("bold red", "yellow", "bold red")
+    seen = styles(flat, held, gone)
+    assert (seen["5 %"], seen["held-one"], seen["gone-one"]) == ("bold red", "yellow", "bold red")
     repeated = msgspec.structs.replace(later, stamp=20.0)
     calm = trends.row("robot-01", repeated, now=20.0, error=0.01)
     assert (calm.growing, calm.cpu) == (frozenset(), 0.0)
@@ -105,5 +118,5 @@ def test_what_a_robot_needs(changed, now, gone, rank, phase):
 
 
 def test_text_of_others_cannot_steer_the_terminal():
-    drawn = lines("t", [Row("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
-    assert all(line.plain.isprintable() for line in drawn)
+    text = lines("t", [Row("a\x1b[2J", "x\ny", note="\x1b]0;z\x07")], [Event(0.0, "k", "s", "\x1b[31m")], 100, 20)
+    assert all(line.isprintable() for line in text)
