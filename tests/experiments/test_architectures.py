@@ -57,7 +57,7 @@ def assert_same_motion(first, second):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ["centralised", HYBRID])
-def test_without_delay_the_reference_experiment_moves_the_same_wherever_it_is_decided(cases, architecture):
+def test_architectures_without_delay_move_the_same(cases, architecture):
     park = cases["periodic"]
     first = simulation.simulate(Plan(with_delay(park, 0.0)), 1)
     assert first.time[-1] > park.duration_s
@@ -76,7 +76,7 @@ def test_motion_is_alike_when_updates_have_events(cases, update, seed):
         np.testing.assert_array_equal(second.updates >= first.updates, True)  # goals are said again now and then
 
 
-def test_what_a_robot_believes_of_itself_is_all_that_differs_with_events(cases):
+def test_centralised_events_differ_only_by_the_robots_belief(cases):
     """Poses are said on events: the centre knows of a robot what its neighbours know."""
     park = short(cases["event"])
     first, second = (simulation.simulate(Plan(with_delay(park, 0.0, a)), 1) for a in ("distributed", "centralised"))
@@ -97,7 +97,7 @@ def test_delay_makes_the_centre_worse_and_itself_known(cases):
     assert far["distributed"].guidance is None
 
 
-def test_goals_come_as_late_as_the_network_and_the_grid_of_decisions_make_them(cases):
+def test_goals_are_delayed_by_network_and_decision_grid(cases):
     park = with_delay(short(cases["periodic"]), 0.031, "centralised")
     log = simulation.simulate(Plan(park), 1)
     delay = Logbook(log, Plan(park), "").trace().goals.delay
@@ -113,7 +113,7 @@ def test_the_default_network_is_one_tick(cases):
 # ---------------------------------------------------------------- losses
 
 
-def test_robots_that_decide_for_themselves_do_not_feel_that_others_are_guided(cases):
+def test_deciding_robots_are_unaffected_by_guided_ones(cases):
     """Who is guided moves as before where it hears at once; what it says is heard as ever."""
     park = short(cases["periodic"], duration_s=3.0, timeline=[])
     first = simulation.simulate(Plan(with_delay(park, 0.0)), 1)

@@ -67,7 +67,7 @@ def test_they_push_each_other_and_neither_arrives(file):
     assert all(robot.short > 0.5 for robot in run.metrics["default"].robots)
 
 
-def test_a_robot_without_links_goes_its_own_way_beside_a_formation(tmp_path):
+def test_unlinked_robot_goes_its_way_beside_a_formation(tmp_path):
     path = tmp_path / "three.toml"
     third = '[robots.KH01]\nkind = "khepera4"\nstart = [-1.0, 0.6]\n[formation.links]\n"TB01 > KH01" = 0.6\n'
     path.write_text(FILE + third)

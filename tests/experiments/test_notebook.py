@@ -84,7 +84,7 @@ CELLS = (
 
 @pytest.mark.system
 @pytest.mark.timeout(200)
-def test_jupyter_shows_a_run_its_figures_and_the_run_read_back(tmp_path, monkeypatch):
+def test_jupyter_shows_run_figures_and_the_reread_run(tmp_path, monkeypatch):
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CHECKOUT), str(CHECKOUT / "face")]))
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])

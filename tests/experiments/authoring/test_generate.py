@@ -72,7 +72,7 @@ def test_starts_do_not_overlap_whatever_the_seed(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_hundred_drones_form_their_hemisphere_from_random_starts(tmp_path, seed):
+def test_hundred_drones_form_hemisphere_from_random_starts(tmp_path, seed):
     experiment = written(tmp_path, "hemisphere", "100", LayoutOptions(duration_s=25.0)).experiment
     log = simulation.simulate(Plan(experiment), seed)
     net = Plan(experiment).links
@@ -123,7 +123,7 @@ def test_what_cannot_be_had(what, size, wanted, said):
         experiment_file(layout(what, size, chosen), chosen)
 
 
-def test_the_command_writes_a_file_and_never_over_another(tmp_path):
+def test_generate_writes_a_file_and_never_overwrites(tmp_path):
     target = tmp_path / "nine.toml"
     path, made = generate("polygon", "9", str(target), LayoutOptions())
     assert (path, len(made.pairs)) == (target, 18)

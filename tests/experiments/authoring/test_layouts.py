@@ -54,7 +54,7 @@ def test_hemispheres_are_rigid_and_keep_their_distances(count):
     assert lengths(made).max() < 2.1 * 0.6  # no link bridges a bay of the rim
 
 
-def test_the_links_of_a_hemisphere_are_those_of_the_convex_hull_of_its_points():
+def test_hemisphere_links_are_edges_of_the_convex_hull():
     scipy_spatial = pytest.importorskip("scipy.spatial")
     made = layouts.hemisphere(60, 0.6, 0.25)
     hull = scipy_spatial.ConvexHull(made.position)

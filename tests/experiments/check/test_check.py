@@ -69,7 +69,7 @@ def test_numbers_of_the_reference(examined):
     assert examined[1]["periodic"].messages_hz == pytest.approx(350.0)
 
 
-def test_the_reference_is_feasible_but_its_leader_is_quick(park):
+def test_reference_is_feasible_with_a_quick_leader(park):
     (found,) = [each for each in park if each.severity != "note"]
     assert (found.code, found.severity) == ("followers-lag", "warning")
     assert "0.095 m/s" in found.message
@@ -81,7 +81,7 @@ def test_the_reference_is_feasible_but_its_leader_is_quick(park):
 
 
 @pytest.mark.parametrize("name", ["triangle", "convoy"])
-def test_the_other_experiments_of_the_catalogue_have_nothing_against_them(name):
+def test_other_catalogue_experiments_have_no_findings(name):
     assert bad(name) == {}
 
 
@@ -153,7 +153,7 @@ class Listing(Steep, frozen=True):
         return abs(link.distance - sum([each * each for each in apart]) ** 0.5)
 
 
-def test_a_law_that_is_not_compiled_is_noted_once(monkeypatch):
+def test_uncompiled_law_is_noted_once(monkeypatch):
     installed = registry._registered
     mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:Listing", registry.LAWS)]}}
     monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
@@ -176,7 +176,7 @@ def test_a_law_that_is_not_compiled_is_noted_once(monkeypatch):
         ("Weak", "not-acquired", "not acquired in time", "raise the law's own parameters (largest)"),
     ],
 )
-def test_the_remedy_of_a_law_of_ones_own_is_in_the_law(monkeypatch, law, code, message, remedy):
+def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, remedy):
     installed = registry._registered
     mine = {registry.LAWS: {"mine": [EntryPoint("mine", f"{__name__}:{law}", registry.LAWS)]}}
     monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | mine.get(group, {}))
@@ -267,7 +267,7 @@ def test_only_the_cases_of_a_run_are_checked():
 
 
 @pytest.mark.usefixtures("unflown")
-def test_the_place_is_in_the_case_that_changes_it(tmp_path):
+def test_place_is_in_the_case_that_changes_it(tmp_path):
     text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
@@ -369,7 +369,7 @@ def experiments(draw: st.DrawFn) -> Experiment:
 
 @settings(max_examples=10)
 @given(experiments())
-def test_every_error_and_warning_has_a_remedy_and_a_place(made):
+def test_errors_and_warnings_have_remedies_and_places(made):
     found, numbers = examine(of(made))
     assert found
     for each in found:
@@ -378,7 +378,7 @@ def test_every_error_and_warning_has_a_remedy_and_a_place(made):
     assert json.loads(msgspec.json.encode(numbers["default"]))["robots"] == len(made.robots)
 
 
-def test_every_battery_that_ends_before_the_run_is_named():
+def test_batteries_ending_before_the_run_are_all_named():
     experiment = document.read(PARK).cases()["event"].experiment
 
     def said(duration_s: float, **safety: float) -> list[str]:

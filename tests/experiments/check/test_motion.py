@@ -61,7 +61,7 @@ def test_wheels_stop_before_weak_formation_is_acquired():
     assert "acquired" in {each.code for each in check(of(strong))}
 
 
-def test_the_remedy_for_weak_links_names_the_key_that_the_law_goes_by(monkeypatch):
+def test_weak_link_remedy_names_the_laws_own_key(monkeypatch):
     monkeypatch.setattr(Distance, "PULLS_BY", "stiffness")
     weak = robots_on_wheels(9.0)
     weak = msgspec.structs.replace(
@@ -143,13 +143,13 @@ def test_soft_formation_is_found_under_hover_jitter():
         robots_on_wheels(1.0),
     ],
 )
-def test_a_formation_that_is_not_shaken_is_not_called_soft(made):
+def test_undisturbed_formation_is_not_called_soft(made):
     codes = {each.code for each in check(of(made))}
     assert "acquired" in codes
     assert "soft" not in codes
 
 
-def test_formations_that_settle_well_within_the_run_are_not_flown_with_noise(monkeypatch):
+def test_formations_that_settle_early_skip_flights_with_noise(monkeypatch):
     monkeypatch.setattr("experiments.check.noise.fly", lambda *_: pytest.fail("flown again"))
     codes = {each.code for each in check(of(document.read("triangle").cases()["event"].experiment))}
     assert "acquired" in codes
@@ -185,7 +185,7 @@ def test_flight_with_noise_counts_messages_alone(monkeypatch):
     assert predict(Plan(noisy)).messages_hz == ideal.transmissions / 5.0
 
 
-def test_an_experiment_whose_robots_do_not_get_under_way_is_told_why(monkeypatch):
+def test_robots_that_never_begin_are_reported_with_reason(monkeypatch):
     def stuck(*_, **__):
         raise conductor.Stuck("not ready after 60 s: KH01 (its law wants something that is not finite)")
 
@@ -285,7 +285,7 @@ def test_a_long_run_is_predicted_in_part():
     assert "predicted-in-part" in {each.code for each in check(of(made))}
 
 
-def test_a_formation_that_is_lost_again_was_acquired_and_names_the_stiffness(tmp_path):
+def test_formation_lost_again_counts_acquired_and_names_stiffness(tmp_path):
     (tmp_path / "lost.toml").write_text(
         'title = "A leader goes"\nduration_s = 17.0\n'
         '[robots.L]\nkind = "turtlebot3"\nstart = [0.0, 0.0]\n[robots.F]\nkind = "khepera4"\nstart = [-0.6, 0.0]\n'

@@ -47,7 +47,7 @@ def said(tmp_path):
     return found
 
 
-def test_a_path_into_an_obstacle_is_found_in_time(said):
+def test_path_into_an_obstacle_is_found_in_time(said):
     found = said(LOW)["hits-obstacle"]
     assert found.severity == "warning"
     assert found.message == "KH01 would run into 'post' at 15.3 s, around (0.34, 0.00)"
@@ -55,7 +55,7 @@ def test_a_path_into_an_obstacle_is_found_in_time(said):
     assert found.where.endswith("one.toml:3:1")
 
 
-def test_the_drone_above_a_low_obstacle_does_not_meet_it_and_one_beside_a_tall_one_does(said):
+def test_drones_pass_over_low_obstacles_and_meet_tall(said):
     assert "CF01" not in said(LOW)["hits-obstacle"].message
     both = said(POST.replace("[0.5, 0.0]", "[0.3, 0.0]"))["hits-obstacle"]
     assert both.message.startswith("KH01, CF01 would run into") or both.message.startswith("KH01 would")
@@ -69,7 +69,7 @@ def test_nobody_meets_what_stands_aside_or_hangs_high(said):
         assert found["obstacles"].severity == "note"
 
 
-def test_an_obstacle_on_a_path_is_met_where_it_is_then(said):
+def test_moved_obstacle_on_a_path_is_met_there(said):
     cart = '[arena.obstacles.cart]\nbox = [0.2, 0.2]\nat = [0.5, 1.0]\nheight = 0.3\nplan = { kind = "line", '
     assert "hits-obstacle" not in said(f"{cart}move_by = [0.0, -2.9], speed = 0.5 }}\n")  # long gone
     found = said(f"{cart}move_by = [0.0, -1.0], speed = 0.1 }}\n")["hits-obstacle"]
@@ -78,7 +78,7 @@ def test_an_obstacle_on_a_path_is_met_where_it_is_then(said):
     assert away.message == "the middle of 'cart' leaves the arena at 2.1 s"
 
 
-def test_with_avoidance_the_same_is_news_and_no_warning(said):
+def test_collision_course_with_avoidance_is_a_note(said):
     found = said(AVOIDS, LOW)
     assert "hits-obstacle" not in found
     assert found["avoidance-acts"].severity == "note"
@@ -91,7 +91,7 @@ def test_who_does_not_avoid_still_runs_into_it(said):
     assert "avoidance-acts" not in found
 
 
-def test_what_can_be_pushed_is_pushed_if_the_engine_can(said):
+def test_movable_obstacle_is_pushed_if_the_engine_can(said):
     crate = LOW + "mass = 1.0\n"
     found = said(crate)
     assert "in the engine 'point-mass' nothing is pushed" in found["not-pushed"].message
@@ -100,7 +100,7 @@ def test_what_can_be_pushed_is_pushed_if_the_engine_can(said):
 
 
 @pytest.mark.usefixtures("unflown")
-def test_a_robot_in_a_wall_is_an_error_where_walls_are_touched(said):
+def test_robot_in_a_touchable_wall_is_an_error(said):
     near = ROBOTS.replace("[-1.5, 0.0]", "[-1.95, 0.0]")
     found = said('[world]\nengine = "pymunk"\n', robots=near)["start-overlap"]
     assert found.severity == "error"
@@ -110,7 +110,7 @@ def test_a_robot_in_a_wall_is_an_error_where_walls_are_touched(said):
 
 
 @pytest.mark.usefixtures("unflown")
-def test_who_has_no_range_sensors_is_told_what_it_cannot_avoid(said):
+def test_robot_without_range_sensors_learns_what_it_misses(said):
     found = said(AVOIDS, POST)["sees-nothing"]
     assert found.message == "CF01 has no range sensors: it cannot avoid 'post'"
     assert 'sensors = ["multiranger"] in [robots.CF01]' in found.remedy
@@ -134,7 +134,7 @@ def test_links_of_avoidance_are_none_of_the_formation(said):
 
 
 @pytest.mark.usefixtures("unflown")
-def test_formations_without_links_between_them_may_share_an_arena_if_they_keep_clear(said):
+def test_unlinked_formations_may_share_an_arena_with_avoidance(said):
     more = ROBOTS + '[robots.A]\nkind = "khepera4"\nstart = [-1.0, -1.0]\n[robots.B]\nkind = "khepera4"\n'
     more = more.replace('CF01" = 1.0\n', 'CF01" = 1.0\n"A > B" = 0.5\n') + "start = [-1.0, -1.5]\n"
     assert said(robots=more)["parts"].severity == "error"

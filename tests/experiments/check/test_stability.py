@@ -60,7 +60,7 @@ def test_stiffest_and_slowest_mode_of_the_reference():
     assert found.radius < 1.0
 
 
-def test_a_rounded_shape_without_a_leader_has_no_modes_of_hours():
+def test_rounded_shape_without_leader_has_no_hour_modes():
     made = layouts.hemisphere(8, 0.6, 0.25)
     net = both_ways(made, 1.5)
     rounded = Links(net.receiver, net.sender, np.round(net.distance, 4), net.gain)
@@ -80,7 +80,7 @@ LINKED = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3), (0, 4), (3, 4))  # one
 
 @pytest.mark.parametrize("digits", [4, 3])
 @pytest.mark.parametrize("led", [False, True])
-def test_rounded_lengths_make_no_slow_mode_of_a_turn(digits, led):
+def test_rounded_lengths_make_no_slow_turning_mode(digits, led):
     shapes = [(layouts.hemisphere(n, 0.6, 0.25).position, layouts.hemisphere(n, 0.6, 0.25).pairs) for n in (5, 8, 12)]
     shapes += [(layouts.grid(3, 3, 0.5).position, layouts.grid(3, 3, 0.5).pairs), (MIXED, LINKED)]
     for position, linked in shapes:
@@ -96,7 +96,7 @@ def test_rounded_lengths_make_no_slow_mode_of_a_turn(digits, led):
         assert found.slowest_s == pytest.approx(exact.slowest_s, rel=10.0**-digits * 300.0)
 
 
-def test_modes_that_are_slower_than_the_run_are_free():
+def test_modes_slower_than_the_run_are_free():
     made = layouts.hemisphere(8, 0.6, 0.25)
     net, share = both_ways(made, 1.5), np.full(8, 0.18)
     every = modes(Distance(), net, made.position, share, 10.0)

@@ -191,7 +191,7 @@ def test_what_would_do_harm_is_denied(who, action, key):
 
 
 @pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
-def test_a_wildcard_that_may_be_asked_reaches_every_robot(who, part):
+def test_queryable_wildcard_reaches_every_robot(who, part):
     made, key = control(experiment({(0, 1)})), f"park/*/{part}"
     assert may(made, who, "ask", key)
     for robot in ("R0", "R3"):
@@ -203,7 +203,7 @@ def test_a_wildcard_that_may_be_asked_reaches_every_robot(who, part):
         assert not permitted(held(made, robot), "egress", "query", "park/*/state")
 
 
-def test_routers_that_are_linked_pass_on_what_either_has_let_in():
+def test_linked_routers_pass_on_what_either_admits():
     alone = experiment({(1, 0)})
     for network in (Network(routers=2), Network(connect=["tls/a:7447", "tls/b:7447"])):
         linked = control(msgspec.structs.replace(alone, network=network))
@@ -226,7 +226,7 @@ def test_avoidance_gives_ears_and_nothing_else():
     assert grants[mates[0]].publish == [f"park/{mate}/**" for mate in mates]
 
 
-def test_whoever_carries_bodies_speaks_of_them_and_of_no_others():
+def test_body_carriers_publish_for_their_own_robots_only():
     four = experiment({(0, 1)})
     robots = {**four.robots, "R1": msgspec.structs.replace(four.robots["R1"], body="world"),
               "R2": msgspec.structs.replace(four.robots["R2"], ranges="world"),
@@ -286,7 +286,7 @@ def test_rights_go_through_a_file():
     assert msgspec.json.decode(msgspec.json.encode(made), type=Rights) == made
 
 
-def test_a_certificate_on_an_earlier_name_gives_no_right():
+def test_certificate_on_an_earlier_name_gives_no_right():
     four = experiment({(0, 1)})
     known = register(four.robots)
     moved = msgspec.structs.replace(known.identities["R0"], common_name="R0.2")
@@ -295,7 +295,7 @@ def test_a_certificate_on_an_earlier_name_gives_no_right():
     assert may(made, "R0.2", "put", "park/R0/pose")
 
 
-def test_a_robot_cannot_take_the_name_of_an_office():
+def test_robot_cannot_take_the_name_of_an_office():
     four = experiment(set())
     known = register(four.robots)
     clash = Register({**known.identities, "R0": Identity("operator", "R0", "1", "2100-01-01")})
@@ -303,7 +303,7 @@ def test_a_robot_cannot_take_the_name_of_an_office():
         rules(access_rights.rights([Plan(four)]), clash)
 
 
-def test_sizes_bound_what_robots_say_and_not_the_experiment():
+def test_size_limits_bind_robots_but_not_the_experiment():
     (limit,) = sizes(access_rights.rights([Plan(experiment(set()))]))
     assert limit["size_limit"] == 65536
     assert "park/R0/**" in limit["key_exprs"]

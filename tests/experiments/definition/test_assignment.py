@@ -104,7 +104,7 @@ def test_starts_are_on_the_floor_with_a_yaw():
     assert yaws == [1.5, 0.0, 0.0]
 
 
-def test_limits_are_the_arena_and_the_safety_of_the_file():
+def test_limits_are_arena_and_safety_of_the_file():
     given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
     made = Plan(given).limits("A")
     assert (made.low, made.high) == ((-1.0, -1.5, 0.0), (1.0, 1.5, 4.0))

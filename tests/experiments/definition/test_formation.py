@@ -95,7 +95,7 @@ def codes(given):
 # ---------------------------------------------------------------- from the file
 
 
-def test_both_ends_of_a_link_are_asked_for_the_same(written):
+def test_both_ends_of_a_link_want_the_same(written):
     experiment = written(SQUARE).experiment
     asked = {(link.receiver, link.sender): link.wanted for link in Plan(experiment).one_way_links}
     assert asked["B", "A"].relative == (0.6, 0.0, 0.0)  # B stands 0.6 m along x from A
@@ -105,7 +105,7 @@ def test_both_ends_of_a_link_are_asked_for_the_same(written):
     assert {link.gain for link in Plan(experiment).one_way_links} == {0.5}  # the stiffness, not the gain of distances
 
 
-def test_each_link_has_the_gain_of_what_it_asks_for(written):
+def test_each_link_has_the_gain_of_its_target(written):
     links = Plan(written(MIXED).experiment).one_way_links
     assert {(link.receiver, link.sender): link.gain for link in links} == {
         ("B", "A"): 0.5, ("B", "C"): 3.0, ("C", "B"): 3.0, ("C", "A"): 3.0, ("C", "D"): 3.0, ("D", "C"): 3.0,
@@ -189,7 +189,7 @@ def test_links_by_range_and_by_the_clock(written):
 
 
 @pytest.mark.usefixtures("unflown")  # it is flown beside the check
-def test_a_leader_that_listens_holds_its_plan_and_the_others_back(written):
+def test_dominant_leader_that_receives_holds_its_plan(written):
     """Dominance: the leader hears the others; heavier links from it draw them along (paper, section III)."""
     text = '[formation]\ngain = 1.3\nleader = "A"\ntracking_gain = 24.0\n[formation.links]\n'
     text += '"A > B" = { distance = 0.6, gain = 4.0 }\n'
@@ -255,7 +255,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_makes_no_sense_is_refused_where_it_stands(written, name):
+def test_nonsense_is_refused_where_it_stands(written, name):
     text, said = REFUSED[name]
     with pytest.raises(document.DocumentError) as refused:
         written(f"[formation.links]\n{text}\n")
@@ -284,7 +284,7 @@ def test_offsets_that_do_not_add_up(written):
 
 
 @pytest.mark.usefixtures("unflown")
-def test_offsets_of_a_law_that_remembers_that_do_not_add_up(written):
+def test_averaging_offsets_that_do_not_add_up(written):
     square = SQUARE.replace("displacement", "leader-observer")
     assert "offsets-contradict" not in codes(written(square))
     found = codes(written(square.replace("[0.0, -0.6]", "[0.0, -0.7]")))["offsets-contradict"]

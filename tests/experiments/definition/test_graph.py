@@ -108,7 +108,7 @@ def held_heights(rows):
     return moves
 
 
-def test_the_reference_formation_is_rigid_only_with_its_heights_held():
+def test_reference_formation_is_rigid_only_with_heights_held():
     pairs = edges(network(REFERENCE))
     held, free = rigidity(PLACES, pairs, held_heights(7)), rigidity(PLACES, pairs)
     assert (held.rank, held.needed, held.rigid) == (2 * 7 - 3, 11, True)
@@ -117,7 +117,7 @@ def test_the_reference_formation_is_rigid_only_with_its_heights_held():
     assert free.smallest == 0.0
 
 
-def test_the_rows_of_the_matrix_are_half_the_gradients_of_squared_lengths():
+def test_rigidity_rows_are_half_gradients_of_squared_lengths():
     pairs = edges(network(REFERENCE))
     matrix = rigidity_matrix(PLACES, pairs)
     motion = np.random.default_rng(3).normal(size=PLACES.shape)
@@ -141,7 +141,7 @@ def triangulation(rng, rows, dimension):
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(4, 12), st.sampled_from([2, 3]))
-def test_a_triangulation_is_rigid_and_without_any_edge_it_is_not(seed, rows, dimension):
+def test_triangulation_is_rigid_only_with_all_edges(seed, rows, dimension):
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1, 1, (rows, 3))
     moves = None

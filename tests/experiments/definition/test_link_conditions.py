@@ -31,7 +31,7 @@ def conditions(channel, seed=1, **how):
     return link_conditions.conditions_of(Plan(experiment(channel)), ENDS, seed, **how)
 
 
-def test_the_default_is_a_millisecond_and_nothing_at_a_real_listener():
+def test_default_delay_is_a_millisecond_or_nothing_really():
     assert [link.delay for link in conditions(Channel())] == [0.001] * 4
     assert [link.delay for link in conditions(Channel(), real=True)] == [0.0] * 4
     assert [link.delay for link in conditions(Channel(delay_s=0.02), real=True)] == [0.02] * 4

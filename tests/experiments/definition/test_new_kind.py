@@ -36,7 +36,7 @@ def known(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, ALPHABOT)
 
 
-def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
+def test_kind_without_twin_is_refused_at_its_place():
     with pytest.raises(DocumentError) as caught:
         loads(ROVERS)
     first = caught.value.problems[0]
@@ -44,7 +44,7 @@ def test_a_kind_without_a_twin_is_refused_at_its_place_in_the_file():
     assert "give the kind a `motion`" in first.hint
 
 
-def test_a_kind_whose_motion_no_model_has_is_refused_too(monkeypatch):
+def test_kind_without_motion_model_is_refused_too(monkeypatch):
     """On the floor with velocities, not with a twist: an omnidirectional robot."""
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     assert loads(ROVERS)
@@ -54,14 +54,14 @@ def test_a_kind_whose_motion_no_model_has_is_refused_too(monkeypatch):
     assert caught.value.problems[0].message == f"no twin of '{KIND}'"
 
 
-def test_a_kind_without_a_protocol_twin_is_refused_by_name(monkeypatch):
+def test_kind_without_protocol_twin_is_refused_by_name(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     with pytest.raises(BodyError, match=f"--bodies protocol: no protocol twin of '{KIND}', only of crazyflie"):
         choose_bodies(loads(ROVERS).plan, "protocol")
     assert choose_bodies(load("triangle").plan, "protocol")
 
 
-def test_many_robots_of_a_kind_without_a_colour_are_drawn(monkeypatch):
+def test_many_robots_of_an_uncoloured_kind_are_drawn(monkeypatch):
     monkeypatch.setitem(KINDS.loaded, KIND, MOVING)
     cases = loads(ROVERS).cases()
     figure = trajectories.expected_motion({name: analyse(case, predict(case)) for name, case in cases.items()})

@@ -116,7 +116,7 @@ def order(**more: object) -> messages.RunOrder:
     return messages.RunOrder("replace", ["A"], **more)  # type: ignore[arg-type]
 
 
-def test_a_spare_brings_its_body_and_keeps_the_rest() -> None:
+def test_spare_brings_its_body_and_keeps_the_rest() -> None:
     spare = msgspec.structs.replace(BOT, start=[0.2, 0.3, 1.0], body="khepera4://192.0.2.1", avoids=False)
     spares = Spares(Plan(experiment(spares={"F": FLY, "S": spare})))
     old = msgspec.structs.replace(BOT, ranges="world")

@@ -83,7 +83,7 @@ def test_own_keys_win_and_obstacles_merge_by_name(lab):
     assert list(arena.starts) == ["west", "east"]
 
 
-def test_a_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
+def test_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
     (tmp_path / "hall.toml").write_text("[arena]\nsize = [9.0, 9.0, 3.0]\n[arena.obstacles.pillar]\nradius = 0.4\n")
     cases = '[cases.lab.arena.obstacles.post]\nradius = 0.2\n[cases.hall.arena]\nfile = "hall.toml"\n'
     given = read(lab(ONE + cases))
@@ -97,7 +97,7 @@ def test_a_case_changes_the_arena_or_takes_another_file(lab, tmp_path):
     }  # fmt: skip
 
 
-def test_changes_of_the_command_line_find_what_the_file_holds(lab, tmp_path):
+def test_command_line_changes_find_what_the_file_holds(lab, tmp_path):
     file = lab()
     found = read(file, ["arena.obstacles.cart.plan.speed=0.2", "arena.obstacles.post.at=[0.5, 0.5]"]).experiment.arena
     assert found.obstacles["cart"].plan == {"kind": "line", "move_by": [1.0, 0.0], "speed": 0.2}
@@ -119,7 +119,7 @@ def test_what_processes_read_needs_no_arena_file(lab, tmp_path):
     assert "file" not in msgspec.json.decode(file.read_bytes())["arena"]
 
 
-def test_a_run_keeps_what_it_needs_to_be_done_again(lab, tmp_path):
+def test_run_keeps_what_repeating_it_needs(lab, tmp_path):
     given = read(lab())
     kept = tmp_path / "run"
     kept.mkdir()
@@ -148,7 +148,7 @@ def test_a_run_keeps_what_it_needs_to_be_done_again(lab, tmp_path):
         ("arena = " + "[" * 5000 + "]" * 5000, 0, 0, "nested too deeply"),
     ],
 )
-def test_a_wrong_arena_file_is_refused_where_it_is_wrong(lab, arena, line, column, message):
+def test_wrong_arena_file_is_refused_where_wrong(lab, arena, line, column, message):
     file = lab(arena=arena)
     (where, *place, said) = refused(file)[0]
     assert where == str(file.parent / "lab.toml")
@@ -164,7 +164,7 @@ def test_an_arena_file_is_told_what_belongs_elsewhere(lab):
     assert hints[1].startswith("'robots' belongs in the experiment file")
 
 
-def test_what_the_experiment_makes_wrong_of_it_points_into_both_files(lab):
+def test_conflicts_with_the_arena_point_into_both_files(lab):
     file = lab()
     found = refused(lab(ONE.replace('"lab.toml"\n', '"lab.toml"\nsize = [2.0, 3.0, 2.0]\n')))
     assert [(where, line) for where, line, _, _ in found] == [
@@ -177,7 +177,7 @@ def test_what_the_experiment_makes_wrong_of_it_points_into_both_files(lab):
 
 
 @pytest.mark.slow
-def test_findings_of_the_check_point_into_the_arena_file(lab):
+def test_check_findings_point_into_the_arena_file(lab):
     plan = '[[timeline]]\nat_s = 2.0\nrobot = "KH01"\nplan = { kind = "line", move_by = [2.6, 0.0], speed = 0.2 }\n'
     file = lab(ONE + plan)
     (found,) = [each for each in check(read(file)) if each.code == "hits-obstacle"]
@@ -185,7 +185,7 @@ def test_findings_of_the_check_point_into_the_arena_file(lab):
     assert "KH01 would run into 'post' at 14.7 s" in found.message
 
 
-def test_the_catalogue_has_arena_files_that_are_no_experiments(tmp_path):
+def test_catalogue_arena_files_are_no_experiments(tmp_path):
     assert index.arenas() == ["gate.arena.toml"]
     assert "obstacle-course" in index.names()
     assert not any("arena" in name for name in index.names())
@@ -207,6 +207,6 @@ def test_names_of_a_runs_own_files_are_refused(name, lab, tmp_path):
         read(lab(ONE.replace("lab.toml", name)))
 
 
-def test_an_arena_of_the_catalogue_needs_not_stand_beside(lab):
+def test_catalogue_arena_need_not_stand_beside(lab):
     arena = read(lab(ONE.replace("lab.toml", "gate.arena.toml"))).experiment.arena
     assert list(arena.obstacles) == ["left", "right"]

@@ -67,7 +67,7 @@ def test_the_triangle_can_be_reached():
     assert sum(reach) > base > abs(reach[0] - reach[1])
 
 
-def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
+def test_convoy_leader_stays_inside_and_below_top_speed():
     experiment = read("convoy").experiment
     plan, start = experiment.timeline[0].plan, experiment.robots["TB01"].start
     assert 2 * math.pi * plan["radius"] / plan["period_s"] < 0.5 * KINDS["turtlebot3"].speed
@@ -76,7 +76,7 @@ def test_the_leader_of_the_convoy_stays_inside_and_below_its_top_speed():
     assert plan["radius"] < min(experiment.arena.size[:2]) / 2 - experiment.safety.margin
 
 
-def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
+def test_copy_gives_a_readable_experiment_and_never_overwrites(tmp_path):
     target = entries.copy_entry("triangle", tmp_path / "mine.toml")
     assert read(target).experiment == read("triangle").experiment
     assert json.loads((tmp_path / index.SCHEMA).read_bytes()) == json_schema.schema()
@@ -93,12 +93,12 @@ def test_copy_gives_an_experiment_that_reads_and_never_overwrites(tmp_path):
 # The schema
 
 
-def test_every_entry_of_the_catalogue_shows_the_schema_to_editors():
+def test_catalogue_entries_show_the_schema_to_editors():
     for name in index.names():
         assert entries.path(name).read_text("utf-8").startswith(f"#:schema ./{index.SCHEMA}\n")
 
 
-def test_the_schema_is_draft_7_and_knows_the_plugins():
+def test_schema_is_draft_7_and_knows_the_plugins():
     schema = json_schema.schema()
     text = msgspec.json.encode(schema).decode()
     assert schema["$schema"] == "http://json-schema.org/draft-07/schema#"
@@ -181,7 +181,7 @@ class Undescribed(msgspec.Struct, frozen=True):
 
 
 @pytest.mark.parametrize("foreign", [[], [metadata.EntryPoint("clamped", f"{__name__}:Undescribed", registry.LAWS)]])
-def test_every_field_of_zenpark_in_the_schema_is_described(monkeypatch, foreign):
+def test_schema_describes_every_field_of_zenpark(monkeypatch, foreign):
     installed = registry._registered
     more = {registry.LAWS: {entry.name: [entry] for entry in foreign}}
     monkeypatch.setattr(registry, "_registered", lambda group: installed(group) | more.get(group, {}))

@@ -136,7 +136,7 @@ def write(tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted({name for name, *_ in EXPECTED}))
-def test_a_malformed_file_is_refused_where_it_is_wrong_with_a_remedy(name):
+def test_malformed_file_is_refused_in_place_with_remedy(name):
     error = refused(MALFORMED / f"{name}.toml")
     expected = [row[1:] for row in EXPECTED if row[0] == name]
     assert [(p.line, p.column) for p in error.problems] == [(line, column) for line, column, *_ in expected]
@@ -157,7 +157,7 @@ def test_every_malformed_file_is_expected_and_there():
     assert {file.stem for file in MALFORMED.glob("*.toml")} == {name for name, *_ in EXPECTED}
 
 
-def test_a_problem_shows_the_line_and_points_to_the_column(write):
+def test_problem_shows_the_line_and_the_column(write):
     file = write(MINIMAL + "\n[formation]\n\tgian = 2.0\n")
     assert str(refused(file)) == (
         f"{file}:8:2: unknown key 'gian' in 'formation'\n"
@@ -174,7 +174,7 @@ def test_a_long_line_is_cut_around_the_place(write):
     assert source[caret.index("^") :].startswith('"no"')
 
 
-def test_problems_of_the_file_and_of_its_cases_come_together_in_the_order_of_the_file(write):
+def test_problems_of_file_and_cases_come_in_order(write):
     text = (
         MINIMAL
         + "[channel]\nlos = 0.1\ndelay_s = -1.0\n[safety]\nmargin = true\n"
@@ -225,7 +225,7 @@ def test_every_misspelt_key_is_found_in_its_line(write):
 # Files that are not what they should be
 
 
-def test_a_file_that_is_not_there_names_the_nearest_of_the_catalogue():
+def test_absent_file_names_the_nearest_of_the_catalogue():
     (problem,) = refused("robotic-prk").problems
     assert "neither a file nor an experiment of the catalogue" in problem.message
     assert "did you mean 'robotic-park'?" in problem.hint
@@ -261,7 +261,7 @@ def test_names_that_no_file_can_have(name):
     assert len(refused(name).problems) == 1
 
 
-def test_line_ends_and_byte_order_mark_of_other_systems_are_read(write):
+def test_foreign_line_ends_and_byte_order_marks_work(write):
     assert read(write("\ufeff" + MINIMAL.replace("\n", "\r\n"))).experiment.title == "One"
 
 
@@ -272,7 +272,7 @@ def experiments(read):
     return {name: plan.experiment for name, plan in read.cases().items()}
 
 
-def test_each_case_is_an_experiment_of_its_own_in_the_order_of_the_file():
+def test_cases_are_experiments_in_the_files_order():
     cases = experiments(read("robotic-park"))
     assert list(cases) == ["periodic", "event"]
     assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
@@ -285,7 +285,7 @@ def test_without_cases_there_is_one_called_default(write):
     assert found.cases() == {"default": found.plan}
 
 
-def test_a_case_merges_tables_and_replaces_a_choice_of_another_kind(write):
+def test_case_merges_tables_and_replaces_choices_between_kinds(write):
     text = (
         MINIMAL
         + '[robots.KH02]\nkind = "khepera4"\nstart = [1.0, 0.0]\n[formation.links]\n"KH01 - KH02" = 1.0\n'
@@ -316,18 +316,18 @@ def test_set_changes_every_case():
     assert [case.title for case in set_on_park('title="12"').values()] == ["12"] * 2
 
 
-def test_set_of_a_parameter_reaches_the_cases_that_have_it():
+def test_set_of_a_parameter_reaches_cases_having_it():
     cases = set_on_park("trigger.threshold=0.02")
     assert cases["event"].trigger == {"kind": "send-on-delta", "threshold": 0.02}
     assert cases["periodic"].trigger == {"kind": "periodic", "period_s": 0.02}
 
 
-def test_set_of_a_whole_choice_wins_over_the_cases():
+def test_set_of_a_whole_choice_beats_the_cases():
     cases = set_on_park("trigger.kind=periodic")
     assert [case.trigger["kind"] for case in cases.values()] == ["periodic"] * 2
 
 
-def test_set_of_one_case_wins_over_set_of_all_whatever_their_order():
+def test_set_of_one_case_beats_set_of_all():
     for flags in itertools.permutations(["cases.event.trigger.threshold=0.05", "trigger.threshold=0.02"]):
         assert set_on_park(*flags)["event"].trigger["threshold"] == 0.05
     assert set_on_park("cases.event.seed=9")["event"].seed == 9
@@ -343,7 +343,7 @@ def test_set_of_a_link_however_it_is_written(key):
     assert len(experiment.formation.links) == 12
 
 
-def test_set_gives_a_link_a_gain_and_keeps_its_distance():
+def test_set_gives_a_link_gain_and_keeps_distance():
     assert ("KH01", "TB01", 0.6, 9.0) in parse_links(set_on_park("formation.links.TB01 > KH01.gain=9")["event"])
 
 
@@ -392,7 +392,7 @@ def test_a_leg_has_a_number_and_no_name():
     )
 
 
-def test_set_does_not_hide_what_is_wrong_in_the_file(write):
+def test_set_hides_no_fault_of_the_file(write):
     file = write(MINIMAL + "[formation]\ngian = 2.0\n")
     problems = refused(file, "formation.gain=x").problems
     assert [(p.file, p.line) for p in problems] == [("--set formation.gain=x", 0), (str(file), 7)]
@@ -435,7 +435,7 @@ def test_a_fault_in_json_is_located(write):
     assert problem.column == problem.source.index("7.5") + 1
 
 
-def test_a_case_comes_over_the_network_with_its_name():
+def test_case_crosses_the_network_with_its_name():
     for name, cases in (("event", read("triangle").cases()), ("default", read("convoy", ["cases={}"]).cases())):
         sent = document.case_document(cases[name], name).decode()
         assert document.received(sent, "network").cases() == {name: cases[name]}

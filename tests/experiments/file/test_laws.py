@@ -23,7 +23,7 @@ AVERAGE = index.find_file("average")
         ("formation.law=mixed", "give a distance, an offset or a bearing"),
     ],
 )
-def test_what_a_law_that_remembers_does_not_go_with(change, said):
+def test_averaging_law_refuses_what_it_does_not_support(change, said):
     with pytest.raises(DocumentError, match=said):
         document.read(AVERAGE, [change])
 

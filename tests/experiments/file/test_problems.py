@@ -35,7 +35,7 @@ def paths_of(value, path=()):
 
 
 @pytest.mark.parametrize("text", [FORMS, *(f.read_text("utf-8") for f in sorted(index.FOLDER.glob("*.toml")))])
-def test_every_path_of_a_document_has_its_place_and_no_other_has(text):
+def test_document_paths_and_no_others_have_a_place(text):
     assert set(places(text)) == set(paths_of(tomllib.loads(text))) - {()}
 
 
@@ -76,7 +76,7 @@ def test_json():
     assert len(found) == 6
 
 
-def test_the_nearest_place_of_a_path_that_is_not_there():
+def test_absent_path_has_the_nearest_place():
     found = places(FORMS)
     assert nearest(found, ("l", 1, "sub", "missing"))[0] == ("l", 1, "sub")
     assert nearest(found, ("missing", "a")) == ((), nearest(found, ())[1])

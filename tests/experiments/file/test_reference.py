@@ -62,7 +62,7 @@ GROUPS = {
 
 
 @pytest.mark.parametrize("entry", [each for each in reference.entries() if "(" in each.key], ids=lambda each: each.key)
-def test_an_example_of_a_plug_in_has_all_that_it_needs(entry):
+def test_plugin_example_has_all_that_it_needs(entry):
     *tables, choice = entry.example.split("\n")
     ((owner, parameters),) = tomllib.loads(choice).items()
     registry.build(GROUPS[owner], parameters)
@@ -79,7 +79,7 @@ def test_a_pipe_receives_the_whole_texts():
     assert not any(line.endswith("...") for line in said.output.splitlines())
 
 
-def test_without_a_key_all_at_the_top_are_listed():
+def test_explain_without_a_key_lists_the_top_level():
     lines = CliRunner().invoke(app, ["explain"]).output.splitlines()
     assert [line.partition(" ")[0] for line in lines] == list(reference.described()["properties"])
 
@@ -129,7 +129,7 @@ def test_a_metric_is_explained(metric):
         ("gust", "disturbance.KIND.hover_jitter"),
     ],
 )
-def test_a_word_that_is_no_key_finds_the_keys_about_it(word, key):
+def test_word_that_is_no_key_finds_related_keys(word, key):
     assert key in [entry.key for entry in reference.about(word)]
     said = CliRunner().invoke(app, ["explain", word])
     assert said.exit_code == 2
@@ -154,7 +154,7 @@ def broken(monkeypatch):
 @pytest.mark.parametrize(
     "words", [["explain", "formation.law"], ["schema"], ["new", "triangle", "mine.toml"]], ids=lambda words: words[0]
 )
-def test_a_plug_in_that_fails_to_import_stops_no_command_that_can_do_without(broken, words, tmp_path, monkeypatch):
+def test_broken_plugin_stops_no_command_that_needs_none(broken, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = CliRunner().invoke(app, words)
     assert said.exit_code == 0
@@ -163,7 +163,7 @@ def test_a_plug_in_that_fails_to_import_stops_no_command_that_can_do_without(bro
     assert "broken" not in said.stdout
 
 
-def test_a_file_that_uses_such_a_plug_in_is_refused_with_place_and_reason(broken):
+def test_file_with_a_broken_plugin_is_refused_there(broken):
     with pytest.raises(DocumentError) as caught:
         loads('title = "A"\nduration_s = 5.0\n[robots.A]\nkind = "khepera4"\nstart = [0.0, 0.0]\n'
               '[formation]\nlaw = "broken"\n')  # fmt: skip

@@ -37,7 +37,7 @@ def links(text, *changes, case="default"):
     return document.loads(text, *changes).cases()[case].experiment.formation.links
 
 
-def test_lengths_are_those_between_the_places_at_the_heights_that_robots_hold():
+def test_lengths_hold_between_places_at_robots_heights():
     found = links(FILE)
     assert found["TB01 > KH01"] == Link(distance=pytest.approx(0.5))
     assert found["KH01 - CF01"] == Link(distance=pytest.approx(math.hypot(0.3, 0.4, 0.6)), gain=2.0)
@@ -58,7 +58,7 @@ def test_every_law_takes_a_shape(law):
     assert len(read.experiment.formation.links) == 3
 
 
-def test_a_case_and_the_command_line_may_move_a_place():
+def test_case_and_command_line_may_move_a_place():
     text = FILE + "[cases.near]\nformation.shape.KH01 = [0.7, 1.0]\n[cases.far]\nformation.shape.KH01 = [0.0, 1.0]\n"
     assert links(text, case="near")["TB01 > KH01"].distance == pytest.approx(0.3)
     assert links(text, case="far")["TB01 > KH01"].distance == pytest.approx(1.0)

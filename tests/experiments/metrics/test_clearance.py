@@ -40,7 +40,7 @@ def alone(way, arena, kind="khepera4"):
     return trace(experiment({"A": kind}, {}, arena=arena), np.asarray(way, dtype=float).reshape(-1, 1, 3))
 
 
-def test_the_closest_approach_is_between_surfaces_with_time_and_who():
+def test_closest_approach_of_surfaces_has_time_and_names():
     found = Clearance.of_trace(pair(along_x(0.3 + 0.2 * np.cos(T))))
     closest = pytest.approx(0.1 - 2.0 * R, abs=1e-5)
     at = pytest.approx(math.pi, abs=STEP)
@@ -48,7 +48,7 @@ def test_the_closest_approach_is_between_surfaces_with_time_and_who():
     assert found.arena == (None, None)
 
 
-def test_every_time_together_is_one_collision_as_deep_as_it_became():
+def test_each_contact_is_one_collision_with_greatest_depth():
     found = Clearance.of_trace(pair(along_x(0.14 + 0.05 * np.cos(2.0 * np.pi * T))))
     assert [each.time_s for each in found.overlaps] == [pytest.approx(at + 0.26) for at in range(4)]
     for each in found.overlaps:
@@ -58,7 +58,7 @@ def test_every_time_together_is_one_collision_as_deep_as_it_became():
     assert apart.overlaps == ()  # they stand side by side
 
 
-def test_a_drone_over_a_ground_robot_is_as_far_off_as_it_is_high():
+def test_drone_over_ground_robot_is_its_height_away():
     above = pair(along_x(np.full(50, 0.02), 0.5), ("turtlebot3", "crazyflie"))
     gap = 0.5 - TURTLEBOT3.height
     assert Clearance.of_trace(above).robots[0].gap == pytest.approx(gap)
@@ -149,12 +149,12 @@ def test_what_an_engine_saw_stands_for_what_overlaps():
 
 
 @pytest.mark.parametrize(("bodies", "count"), [({}, 1), ({"A": "world"}, 0), ({"A": "world", "B": "world"}, 0)])
-def test_robots_that_no_world_carries_are_watched_by_their_positions(bodies, count):
+def test_robots_without_a_world_are_watched_by_position(bodies, count):
     known = with_contacts(pair(along_x(np.full_like(T, 0.1))), clock="real", **bodies)
     assert len(collisions(known, Clearance.of_trace(known))) == count
 
 
-def test_what_was_pushed_away_is_no_longer_where_it_stood():
+def test_pushed_obstacle_is_no_longer_where_it_stood():
     box = obstacles(box=Obstacle(radius=0.2, at=(0.1, 0.0), mass=0.5))
     known = alone(np.zeros((5, 3)), box)
     assert len(Clearance.of_trace(known).overlaps) == 1  # nothing can push it without an engine that sees contacts

@@ -38,7 +38,7 @@ def test_integrals_of_a_decaying_error():
     assert measured.duration_s == pytest.approx(20.0)
 
 
-def test_error_is_the_sum_over_the_links_on_which_a_robot_listens():
+def test_error_sums_over_links_that_a_robot_receives():
     what = experiment({"A": "tello", "B": "tello", "C": "tello"}, {"A > B": 1.0, "B - C": 1.0})
     place = np.zeros((2, 3, 3))
     place[:, 1, 0], place[:, 2, 1] = 1.25, 3.0
@@ -87,7 +87,7 @@ def test_never_acquired_is_none_also_in_the_mean():
     assert follower(measured).residual == pytest.approx(0.06)
 
 
-def test_an_error_that_jitters_about_zero_does_not_hide_in_its_mean():
+def test_jitter_about_zero_does_not_hide_in_mean():
     measured = measure.measure(pair(1.0 + 0.08 * np.where(np.arange(len(T)) % 2, 1.0, -1.0)))
     assert follower(measured).acquired_s is None
 
@@ -104,11 +104,11 @@ def test_each_phase_is_measured_from_its_leg():
     assert robot.by_the_end == (robot.phases[0].residual, "L")
 
 
-def test_legs_at_the_start_or_after_the_end_are_no_phases():
+def test_legs_at_start_or_after_end_are_ignored():
     assert measure.measure(pair(np.ones_like(T), legs=[0.0, 20.0, 30.0])).starts_s == (0.0,)
 
 
-def test_residual_is_the_last_second_of_each_phase_on_the_worst_link():
+def test_residual_is_worst_link_in_phases_last_second():
     what = experiment({"A": "tello", "B": "tello", "C": "tello"}, {"A > C": 1.0, "B > C": 1.0}, legs=[10.0])
     place = np.zeros((len(T), 3, 3))
     place[:, 0, 0] = np.where(T < 9.0, -3.0, np.where(T < 10.0, -1.02, -1.3))
@@ -129,7 +129,7 @@ def test_net_rotation_finds_the_rate_whatever_else_moves(rate: float, drift: flo
     assert net_rotation(place, T) == pytest.approx(rate, abs=1e-9)
 
 
-def test_net_rotation_after_acquisition_counts_beyond_a_full_turn():
+def test_net_rotation_after_acquisition_counts_beyond_full_turn():
     angle = 2.0 * np.pi * np.arange(3) / 3 + 0.5 * T[:, None]
     place = np.zeros((len(T), 4, 3))
     place[:, 1:, 0], place[:, 1:, 1] = np.cos(angle), np.sin(angle)
@@ -148,7 +148,7 @@ def moving(**rest: object) -> Trace:
     return trace(what, place, sent={"L": np.arange(0.0, 20.0, 1.0).tolist()}, **rest)
 
 
-def test_belief_error_of_a_pose_held_for_a_second():
+def test_belief_error_of_pose_held_for_a_second():
     belief = measure.measure(moving()).belief[0]
     assert (belief.receiver, belief.sender) == ("F", "L")
     assert belief.rms == pytest.approx(0.1 / math.sqrt(3.0), rel=0.03)
@@ -173,7 +173,7 @@ def test_transmissions_rates_and_gaps():
     assert (other.messages, other.gap_median_s) == (0, None)
 
 
-def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
+def test_recorder_losses_are_counted_by_sequence_numbers():
     known = moving()
     kept = known.sent.take(np.arange(20) % 3 == 0)
     leader = measure.measure(dataclasses.replace(known, sent=kept)).robots[0]
@@ -188,7 +188,7 @@ def test_what_the_recorder_lost_is_counted_by_the_running_numbers():
         ([*range(1, 10), 300_000_000, *range(10, 20)], 22),  # a forged number: two more fit into the time beside it
     ],
 )
-def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_number(seq: list[int], messages: int):
+def test_transmissions_of_a_restarted_and_a_forging_robot(seq: list[int], messages: int):
     known = moving()
     time = 0.02 * np.arange(len(seq))
     place = np.zeros((len(seq), 3))
@@ -198,7 +198,7 @@ def test_transmissions_of_a_robot_that_began_anew_and_of_one_with_a_forged_numbe
     assert (leader.messages, leader.recorded) == (messages, len(seq))
 
 
-def test_settling_time_is_that_of_two_percent_of_the_largest_error():
+def test_settling_time_is_two_percent_of_largest_error():
     settle = round(math.log(50.0) / STEP + 0.5) * STEP
     assert measure.measure(pair(1.0 + np.exp(-T))).robots[1].settle_s == pytest.approx(settle)
 
@@ -218,7 +218,7 @@ def test_benchmark_cost_by_hand(anchored: bool):
     assert measure.measure(known).j2 == pytest.approx(expected, rel=1e-5)
 
 
-def test_benchmark_cost_of_a_robot_that_is_never_off_is_nothing():
+def test_benchmark_cost_without_deviation_is_zero():
     assert measure.measure(pair(np.ones_like(T), sent={"F": [1.0]})).j2 == 0.0
 
 
@@ -231,7 +231,7 @@ def test_closest_approach_and_excursion():
     assert (inside.excursion, inside.excursion_robot) == (0.0, "")
 
 
-def test_a_robot_that_died_does_not_poison_the_others():
+def test_dead_robot_does_not_poison_the_others():
     whole = park(duration=20.0)
     place = whole.true_position.copy()
     place[500:, whole.robots.index("CF03")] = np.nan
@@ -251,7 +251,7 @@ def test_a_robot_that_died_does_not_poison_the_others():
     assert msgspec.json.encode(after).find(b"NaN") == -1
 
 
-def test_a_robot_that_was_never_seen_has_no_errors():
+def test_robot_never_seen_has_no_errors():
     known = pair(np.full_like(T, np.nan))
     robot = follower(measure.measure(known))
     assert (robot.iae, robot.rmse, robot.coverage, robot.known) == (None, None, 0.0, 0.0)
@@ -290,7 +290,7 @@ def test_document_has_the_shape_for_scripts():
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_is_measured_by_its_own_length():
+def test_interrupted_run_is_measured_by_its_own_length():
     measured = measure.measure(cut(park(), 8.0))
     whole = measure.measure(park())
     assert (measured.duration_s, measured.planned_s, measured.interrupted) == (8.0, 45.0, True)
@@ -314,14 +314,14 @@ def test_who_died_before_the_interruption_died():
     assert measured.died == ("CF03",)
 
 
-def test_what_grows_with_time_is_not_compared_with_an_interrupted_run():
+def test_growing_metrics_are_not_compared_with_interrupted_runs():
     whole, half = measure.measure(park("a")), measure.measure(cut(park("b"), 20.0))
     for index in ("iae", "messages", "f_hz", "rmse"):  # what fades depends on the length, too
         assert statistics.ratios([half], [whole], index) == [None]
     assert metrics_files.document("x", 1, [whole, half])["cases"]["b"]["ratio"]["itae"] is None
 
 
-def test_a_whole_run_may_end_one_sample_before_its_time():
+def test_whole_run_may_end_one_sample_early():
     assert not measure.measure(pair(np.ones(16), step=1.0, planned=15.5)).interrupted
     assert measure.measure(pair(np.ones(14), step=1.0, planned=15.5)).interrupted
 
@@ -367,7 +367,7 @@ def test_ratios_pair_seeds_or_divide_by_the_mean():
     assert statistics.ratios(runs, runs[:1], "iae") == [1.0, pytest.approx(iae[1] / iae[0])]
 
 
-def test_csv_has_a_row_per_robot_and_a_mean(tmp_path):
+def test_csv_has_a_row_per_robot_and_mean(tmp_path):
     measured = measure.measure(park())
     metrics_files.write_csv(tmp_path / "metrics.csv", [measured])
     with (tmp_path / "metrics.csv").open(newline="") as file:
@@ -387,7 +387,7 @@ def test_json_holds_everything(tmp_path):
 
 @settings(max_examples=20)
 @given(turn=st.floats(-3.0, 3.0), x=st.floats(-5.0, 5.0), y=st.floats(-5.0, 5.0))
-def test_errors_do_not_depend_on_where_the_formation_stands(turn: float, x: float, y: float):
+def test_errors_do_not_depend_on_where_formation_stands(turn: float, x: float, y: float):
     known = park(duration=3.0)
     c, s = math.cos(turn), math.sin(turn)
     place = known.true_position @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + [x, y, 0.0]
@@ -451,7 +451,7 @@ def test_who_does_not_come_back_has_died(gone: list[int]):
         ([("lost", "its process ended (exit code 1)")], ("F at 3.0 s: was lost: its process ended (exit code 1)",)),
     ],
 )  # fmt: skip
-def test_robots_that_did_not_do_their_part_are_named_first(events: list[tuple[str, str]], expected: tuple[str, ...]):
+def test_robots_that_failed_their_part_are_named_first(events: list[tuple[str, str]], expected: tuple[str, ...]):
     made = [Event(3.0 + k, kind, "F", text) for k, (kind, text) in enumerate(events)]
     measured = measure.measure(dataclasses.replace(pair(1.0 + np.exp(-T)), events=tuple(made)))
     assert measured.failures == expected
@@ -477,7 +477,7 @@ BLIND = "hold: its own position is lost: the last is 0.51 s old"
         ),
     ],
 )
-def test_a_body_that_repeats_an_old_position_has_none(events: list[tuple[float, str]], known: float, failed: str):
+def test_body_that_repeats_an_old_position_has_none(events: list[tuple[float, str]], known: float, failed: str):
     made = tuple(Event(at, "hazard", "F", text) for at, text in events)
     measured = measure.measure(dataclasses.replace(pair(1.0 + np.exp(-T)), events=made))
     robot = measured.robots[1]
@@ -489,7 +489,7 @@ def test_a_body_that_repeats_an_old_position_has_none(events: list[tuple[float, 
     assert failed in "".join(measured.failures)
 
 
-def test_a_robot_without_a_position_for_a_fifth_of_the_run_did_not_do_its_part():
+def test_robot_without_position_for_a_fifth_failed():
     known = pair(1.0 + np.exp(-T))
     place = known.true_position.copy()
     place[T > 15.0, 1] = np.nan
@@ -497,7 +497,7 @@ def test_a_robot_without_a_position_for_a_fifth_of_the_run_did_not_do_its_part()
     assert measured.failures == ("F: its position was known for 75% of the time only",)
 
 
-def test_a_time_without_a_position_is_neither_inside_nor_outside():
+def test_time_without_position_is_neither_inside_nor_outside():
     """The process of one robot stood still for 0.6 s, after it had acquired."""
     known = pair(1.0 + np.exp(-T))
     whole = measure.measure(known)

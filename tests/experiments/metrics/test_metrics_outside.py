@@ -246,7 +246,7 @@ def certain(mean):
     return Spread(mean, 0.0, 0.01, 9)
 
 
-def test_more_is_better_on_the_front_and_in_the_search(known):
+def test_metric_to_maximise_leads_front_and_search(known):
     known(height=Height())
     low, high = swept(0.5, 0.9), swept(0.5, 1.2)
     assert front([low, high], "height") == [high]

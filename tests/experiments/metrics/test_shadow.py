@@ -61,7 +61,7 @@ def test_a_lag_is_a_bias_along_the_way():
     assert mine.correlation_speed is None  # nor is either ever faster
 
 
-def test_a_lag_behind_a_swing_shows_in_the_correlation():
+def test_lag_behind_a_swing_shows_in_correlation():
     frequency, lag = math.pi, 0.1  # whole periods
     swing = np.column_stack([0.2 * np.sin(frequency * T), 0.0 * T, 0.0 * T])
     late = np.column_stack([0.2 * np.sin(frequency * (T - lag)), 0.0 * T, 0.0 * T])
@@ -72,7 +72,7 @@ def test_a_lag_behind_a_swing_shows_in_the_correlation():
     assert mine.horizon_s is None
 
 
-def test_a_twin_that_is_put_back_has_the_error_of_its_horizon_and_its_own_speed():
+def test_reset_twin_has_its_horizons_error_and_speed():
     speed = 0.1 + 0.05 * np.sin(T)
     way = np.concatenate([[0.0], np.cumsum(speed[:-1]) * STEP])
     since = np.mod(T + 1e-9, 5.0)
@@ -109,7 +109,7 @@ def test_without_a_shadow_there_is_none():
     assert "shadows" not in figures.every([], [plain])
 
 
-def test_the_figure_has_a_row_for_each_robot_with_a_twin():
+def test_figure_has_a_row_for_each_shadowed_robot():
     known = shadowed(winding(T), winding(T) + np.array([0.02, 0.0, 0.0]))
     figure = figures.every([], [known, dataclasses.replace(known, case="other")])["shadows"]
     assert len(figure.axes) == 4

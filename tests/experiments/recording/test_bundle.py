@@ -50,7 +50,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_run_says_how_where_and_with_what_it_was_made(flown: Path) -> None:
+def test_run_records_how_where_and_with_what(flown: Path) -> None:
     origin = run_folder.read_origin(flown / "run")
     assert origin is not None
     assert origin.command.startswith(
@@ -71,7 +71,7 @@ def test_a_run_says_how_where_and_with_what_it_was_made(flown: Path) -> None:
     assert f"Python {made.python}, numpy {made.packages['numpy']}" in foot
 
 
-def test_a_bundle_repeats_its_run_to_the_last_bit(flown: Path, tmp_path: Path) -> None:
+def test_bundle_repeats_its_run_bit_by_bit(flown: Path, tmp_path: Path) -> None:
     done = zenpark("run", str(flown / "run.zip"), "--no-report", "--out", str(tmp_path / "again"))
     assert done.exit_code == 0, done.output
     assert done.stdout.endswith("the same as in the bundle, to the last bit: figures and recordings\n")
@@ -130,7 +130,7 @@ def test_what_is_no_bundle_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "outside.txt").exists()
 
 
-def test_links_stay_out_and_large_files_go_in_pieces(flown: Path, tmp_path: Path, monkeypatch) -> None:
+def test_links_stay_out_and_large_files_are_chunked(flown: Path, tmp_path: Path, monkeypatch) -> None:
     folder = shutil.copytree(flown / "run", tmp_path / "run")
     (tmp_path / "secret").write_text("of the user")
     (folder / "notes.txt").symlink_to(tmp_path / "secret")
@@ -193,7 +193,7 @@ def test_a_bundle_takes_no_options_of_its_run(flown: Path) -> None:
     assert "a bundle repeats its own run" in str(done.exception)
 
 
-def test_a_folder_that_does_not_say_how_it_was_made(tmp_path: Path) -> None:
+def test_folder_without_provenance_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"has no run\.json"):
         bundle.write(tmp_path, tmp_path / "run.zip", [])
 

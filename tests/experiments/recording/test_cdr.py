@@ -349,7 +349,7 @@ def test_an_attitude_stands_for_the_yaw():
     assert (turn.w, turn.x, turn.y, turn.z) == (0.1, 0.2, 0.4, 0.8)
 
 
-def test_the_schema_of_pose_stamped_is_the_standard_one():
+def test_schema_of_pose_stamped_is_the_standard():
     own = get_types_from_msg(viewers.POSE_SCHEMA, viewers.POSE)
     store = get_typestore(Stores.ROS2_HUMBLE)
     empty = get_typestore(Stores.EMPTY)

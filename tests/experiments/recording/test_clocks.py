@@ -12,7 +12,7 @@ SMALL = st.floats(0.0, 0.5)
 
 
 @given(st.floats(-10.0, 10.0), st.lists(st.tuples(SMALL, SMALL), min_size=1, max_size=20))
-def test_the_offset_is_within_its_uncertainty_however_unlike_both_ways_are(true, ways):
+def test_offset_is_within_uncertainty_despite_unequal_ways(true, ways):
     samples = [
         Sample(100.0 + k, 100.0 + k + there + true, 100.0 + k + there + back) for k, (there, back) in enumerate(ways)
     ]
@@ -30,7 +30,7 @@ def measured(host, stamp, lies, robots=("CF01",)):
     return HostClock(host, stamp, lies, 1e-4, list(robots))
 
 
-def test_drift_is_taken_off_and_the_offset_was_before():
+def test_drift_is_removed_after_the_initial_offset():
     begin, drift = 1.7e9, 50e-6
     said = [measured("lab2", begin, 0.2), measured("lab1", begin, 0.0, ["KH01"]), measured("lab2", begin + 600.0, 0.23)]
     right = Correction(said)
@@ -46,7 +46,7 @@ def test_drift_is_taken_off_and_the_offset_was_before():
     assert lab1.drift is None
 
 
-def test_goals_on_the_way_are_as_late_as_they_were():
+def test_goals_in_transit_keep_their_delay():
     drift, true = 50e-6, 300.0
     right = Correction([measured("lab2", 0.0, 0.2), measured("lab2", 600.0, 0.23)])
     pose, acted = true * (1 + drift), (true + 0.1) * (1 + drift)

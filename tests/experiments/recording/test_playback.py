@@ -98,12 +98,12 @@ def test_what_the_world_said_is_read_back(path):
     ("said", "contacts"),
     [([], None), ([world(0.5, "point-mass")], None), ([world(0.5, "nobody-has-it")], None), ([world(0.5)], ())],
 )
-def test_no_contacts_and_nobody_who_looked_are_not_the_same(path, said, contacts):
+def test_no_contacts_differ_from_no_contact_detection(path, said, contacts):
     write(path, *whole_run(), *said)
     assert read(path).trace.contacts == contacts
 
 
-def test_what_kept_robots_off_is_counted_until_the_end(path):
+def test_avoidance_interventions_are_counted_until_the_end(path):
     counted = [
         msgspec.structs.replace(status(at=at), interventions=5 * k, avoided=2 * k)
         for k, at in enumerate((-0.5, 0.5, 1.5, 2.5))
@@ -113,7 +113,7 @@ def test_what_kept_robots_off_is_counted_until_the_end(path):
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([8, 0], [3, 0])
 
 
-def test_attitude_is_interpolated_the_short_way_on_the_side_it_was_recorded_on(path):
+def test_attitude_interpolates_the_short_way_on_recorded_side(path):
     angle = [0.2 * k for k in range(12)]
     sign = [-1.0 if k in {3, 4, 5} else 1.0 for k in range(12)]
     turned = [
@@ -292,7 +292,7 @@ def test_the_start_is_the_conductors_else_the_robots(path, tmp_path):
     assert read(both).trace.events[0].stamp == 0.0
 
 
-def test_the_trace_of_an_interrupted_run_ends_with_the_interruption(path):
+def test_trace_of_an_interrupted_run_ends_there(path):
     sends = [pose(seq=k + 1, at=k / 10, x=k / 10) for k in range(11)]
     said = [status(at=0.6, sent=7, ticks=60, decisions=6), status(at=2.5, sent=11, ticks=250, decisions=25)]
     write(path, begun(), *seconds(11), *sends, *said, landed(0.75, "landing (interrupted)"))
@@ -305,23 +305,23 @@ def test_the_trace_of_an_interrupted_run_ends_with_the_interruption(path):
     assert trace.events[-1].stamp == pytest.approx(0.75)
 
 
-def test_a_run_that_the_user_ended_after_its_end_is_whole(path):
+def test_run_stopped_by_user_after_end_is_whole(path):
     write(path, begun(), *seconds(11), landed(1.3, "landing (interrupted)"))
     assert read(path).trace.time[-1] == 1.0
 
 
-def test_a_run_in_which_all_came_down_ends_there(path):
+def test_run_in_which_all_landed_ends_there(path):
     long = msgspec.structs.replace(PAIR, duration_s=5.0)
     write(path, begun(), *seconds(31), landed(3.0), experiment=long)
     assert read(path).trace.time[-1] == 3.0
 
 
-def test_robots_land_a_little_early_by_their_own_clocks(path):
+def test_robots_land_slightly_early_by_their_own_clocks(path):
     write(path, begun(), *seconds(11), landed(0.98))
     assert read(path).trace.time[-1] == 1.0
 
 
-def test_without_a_word_of_the_conductor_the_run_ends_with_the_robots(path):
+def test_run_without_conductor_events_ends_with_the_robots(path):
     long = msgspec.structs.replace(PAIR, duration_s=20.0)
     down = [state("TB01", k, k / 10, phase="landing") for k in range(41, 60)]
     more = [state("TB01", k, k / 10, phase="running") for k in range(31, 36)]
@@ -331,7 +331,7 @@ def test_without_a_word_of_the_conductor_the_run_ends_with_the_robots(path):
     assert np.isfinite(trace.position).all()
 
 
-def test_a_robot_that_fell_silent_long_before_does_not_end_the_run(path):
+def test_robot_silent_long_before_does_not_end_run(path):
     long = msgspec.structs.replace(PAIR, duration_s=20.0)
     more = [state("TB01", k, k / 10, phase="running") for k in range(31, 100)]
     write(path, begun(), *seconds(31), *more, experiment=long)
@@ -366,7 +366,7 @@ def test_a_run_without_any_message_of_a_robot(path):
     assert (len(trace.sent.stamp), len(trace.received.arrival), trace.lost.tolist()) == (0, 0, [0, 0])
 
 
-def test_what_cannot_be_a_message_is_counted_and_left_out(path):
+def test_impossible_messages_are_counted_and_left_out(path):
     wrong = [state(seq=2**63), state(position="here"), state(phase="\ud800"), pose(seq=2**70), status(sent=2**64)]
     recording = write(path, begun(), *wrong, Event(None, "k", "s", "t"))
     assert recording.refused == 6
@@ -374,7 +374,7 @@ def test_what_cannot_be_a_message_is_counted_and_left_out(path):
 
 
 @pytest.mark.parametrize("stamp", [math.nan, math.inf, -1.0, 1e19])
-def test_a_broken_clock_does_not_stretch_the_time_line(path, stamp):
+def test_broken_clock_does_not_stretch_the_timeline(path, stamp):
     write(path, begun(), landed(), msgspec.structs.replace(state(), stamp=stamp))
     with path.open("rb") as file:
         statistics = make_reader(file).get_summary().statistics

@@ -203,7 +203,7 @@ def test_a_file_damaged_anywhere(tmp_path_factory, recorded, data):
     survives(folder / "run.mcap", folder / "target.mcap")
 
 
-def test_of_schemas_that_contradict_each_other_the_first_holds(path, tmp_path, recorded):
+def test_first_of_contradicting_schemas_holds(path, tmp_path, recorded):
     """The summary at the end repeats them, and may be damaged."""
     text = b"string robot"
     content = bytearray(recorded)

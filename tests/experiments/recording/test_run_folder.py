@@ -22,9 +22,7 @@ from tests.agents.few import pair
 from tools.main import app
 
 
-def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_of_the_same_second_have_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     read = document.load("triangle")
     with ThreadPoolExecutor(8) as pool:
@@ -33,7 +31,7 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
     assert all(folder.is_dir() for folder in folders)
 
 
-def test_a_folder_in_which_nothing_was_run_is_removed(tmp_path: Path) -> None:
+def test_folder_without_a_run_is_removed(tmp_path: Path) -> None:
     read = document.load("triangle")
     empty, failed, flown = (run_folder.new_folder(read, str(tmp_path / name)) for name in ("empty", "failed", "flown"))
     for folder in (empty, failed, flown):
@@ -62,7 +60,7 @@ def test_numbers_that_no_run_can_have(change: str, says: str) -> None:
         document.load("triangle", change)
 
 
-def test_a_run_in_virtual_time_must_fit_into_memory() -> None:
+def test_virtual_run_must_fit_into_memory() -> None:
     with pytest.raises(DocumentError, match="fit into memory"):
         run.simulate_seeds(document.load("triangle"), range(100_000))
 
@@ -111,7 +109,7 @@ def test_past_runs_with_their_figures_sizes_and_tags(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_folder_whose_files_are_damaged_is_listed_without_figures(tmp_path: Path) -> None:
+def test_folder_with_damaged_files_is_listed_without_figures(tmp_path: Path) -> None:
     folder = kept(tmp_path / "damaged")
     for name in ("run.json", "metrics.json"):
         (folder / name).write_text("[1, 2")
@@ -155,7 +153,7 @@ def test_past_runs_on_the_command_line(tmp_path: Path) -> None:
     assert "name two or more" in str(alone.exception)
 
 
-def test_clean_removes_what_is_named_and_nothing_with_a_tag(tmp_path: Path) -> None:
+def test_clean_removes_the_named_but_nothing_tagged(tmp_path: Path) -> None:
     a, b, c = kept(tmp_path / "a", tags=["paper"]), kept(tmp_path / "b"), kept(tmp_path / "c")
     (tmp_path / "mine").mkdir()
     where = ["--in", str(tmp_path)]

@@ -99,7 +99,7 @@ def test_closed_twice_and_used_after(path):
         recording.write(state())
 
 
-def test_an_error_of_the_caller_leaves_a_finished_file(path):
+def test_callers_error_leaves_a_finished_file(path):
     def fails():
         with Recording(path, Plan(PAIR), case="only", seed=4, clock="real") as recording:
             put(recording, whole_run())
@@ -143,7 +143,7 @@ def test_after_a_write_error_nothing_more_is_written(path):
     assert path.stat().st_size == 40_000
 
 
-def test_after_an_interrupt_inside_a_write_nothing_more_is_written(path, monkeypatch):
+def test_interrupt_inside_a_write_ends_all_writing(path, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 
@@ -156,7 +156,7 @@ def test_after_an_interrupt_inside_a_write_nothing_more_is_written(path, monkeyp
     recording.close()
 
 
-def test_a_file_is_the_same_as_the_librarys_own():
+def test_file_equals_the_librarys_own():
     files = []
     for chunk_of in (writer.Chunk, lambda _: None):
         file = io.BytesIO()
@@ -213,7 +213,7 @@ def drawn_scene(path):
                 recording.write(Event(clock[0] - 0.5, "robot", "CF01", "said late"))
 
 
-def test_viewers_find_frames_and_a_scene_in_standard_types(path):
+def test_viewers_find_frames_and_scene_in_standard_types(path):
     drawn_scene(path)
     with AnyReader([path]) as reader:
         types = {c.topic: c.msgtype for c in reader.connections}

@@ -34,7 +34,7 @@ def flown(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_film_shows_the_run_from_its_start_to_its_end(flown):
+def test_film_shows_the_run_from_start_to_end(flown):
     file = flown[0] / "film.gif"
     commands.export(str(flown[0]), video=file, speed=8.0)
     with Image.open(file) as film:
@@ -100,7 +100,7 @@ def test_metrics_are_those_of_the_report(flown, mat):
     assert read["f_hz"] == pytest.approx(by_hand)
 
 
-def test_a_struct_is_a_cell_array_and_columns_as_matlab_has_them(flown, mat):
+def test_struct_is_a_cell_array_with_matlab_columns(flown, mat):
     raw = scipy_io.loadmat(flown[0] / "run.mat")["event"][0, 0]
     assert raw["robots"].shape == (3, 1)
     assert raw["robots"].dtype == object
@@ -137,7 +137,7 @@ def test_what_links_ask_for_besides_distances_is_told():
     assert made["adjacency"].tolist() == [[0.0, 0.0], [1.0, 0.0]]
 
 
-def test_the_table_has_a_line_for_each_robot_and_time(flown, tmp_path):
+def test_table_has_a_line_per_robot_and_time(flown, tmp_path):
     commands.export(str(flown[0]), str(tmp_path / "way.csv"), as_csv=False)
     with (tmp_path / "way.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))

@@ -80,7 +80,7 @@ def test_rates_far_apart_are_on_a_logarithmic_axis():
     assert figures.robot_bars(measured[:1]).axes[0].get_yscale() == "linear"
 
 
-def test_the_plan_shows_what_is_near_the_robots_with_a_few_cases_upon_each_other():
+def test_plan_shows_surroundings_with_few_cases_overlaid():
     traces = [park(f"case {k}", duration=3.0) for k in range(4)]
     hall = traces[0].plan.changed(arena=Arena(size=(30.0, 30.0, 3.0)))
     wide = [dataclasses.replace(trace, plan=hall) for trace in traces]
@@ -118,7 +118,8 @@ def test_several_seeds_become_one_bar_with_its_interval():
     assert np.ptp(segments[0][:, 1]) == pytest.approx(2.0 * half, rel=1e-4)
 
 
-def test_errors_of_all_cases_share_a_logarithmic_axis_with_tolerance_and_acquisition():
+def test_errors_of_cases_share_a_marked_logarithmic_axis():
+    """Tolerance and acquisition are marked on it."""
     traces = [park(), park("event", 0.01)]
     cases = [measure(each) for each in traces]
     (axes,) = figures.errors(traces, cases).axes
@@ -199,7 +200,7 @@ def test_every_figure_and_motions_of_the_first_seed():
     assert "formation" not in figures.every([], [flat])
 
 
-def test_cases_are_overlaid_in_space_each_with_the_links_of_its_end():
+def test_cases_are_overlaid_in_space_with_final_links():
     traces = [park(), park("event", 0.01)]
     (axes,) = figures.formation(traces).axes
     for known, links in zip(traces, axes.collections, strict=False):
@@ -210,7 +211,7 @@ def test_cases_are_overlaid_in_space_each_with_the_links_of_its_end():
 
 
 @pytest.mark.parametrize("draw", OF_TRACES, ids=lambda draw: draw.__name__)
-def test_a_robot_that_died_or_never_spoke_can_be_drawn(draw):
+def test_dead_or_silent_robot_can_be_drawn(draw):
     known = park(duration=3.0)
     place = known.true_position.copy()
     place[50:, 6] = np.nan
@@ -270,7 +271,7 @@ def test_whatever_is_unknown_can_be_drawn(draw):
         assert "<svg" in figures.svg(draw([unknown(known, rows)]))
 
 
-def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path):
+def test_saved_files_are_reproducible_vectors_with_real_fonts(tmp_path):
     figure = figures.intervals([park(duration=3.0)])
     page, drawing = tmp_path / "figures" / "intervals.pdf", tmp_path / "figures" / "intervals.svg"
     text = style.save(figure, tmp_path / "figures", "intervals", pdf=True)
@@ -286,7 +287,7 @@ def test_saved_files_are_vector_with_real_fonts_and_the_same_every_time(tmp_path
     assert b"/CreationDate" not in content
 
 
-def test_pdf_is_written_where_asked_and_kept_up_to_date(tmp_path):
+def test_pdf_is_written_on_request_and_kept_current(tmp_path):
     page = tmp_path / "intervals.pdf"
     style.save(figures.intervals([park(duration=3.0)]), tmp_path, "intervals")
     assert not page.exists()
@@ -310,7 +311,7 @@ def test_figure_is_laid_out_once_for_both_files(draw, tmp_path, monkeypatch):
     assert figure.get_layout_engine() is engine
 
 
-def test_a_picture_of_space_is_as_high_as_what_it_shows():
+def test_picture_of_space_is_as_high_as_content():
     for width in (3.5, 7.16):
         figure = figures.formation([park(duration=5.0)], width)
         canvas = FigureCanvasAgg(figure)

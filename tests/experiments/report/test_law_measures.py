@@ -34,7 +34,7 @@ def test_indices_of_links_are_unknown_without_errors(measured):
     assert "fewer transmissions than periodic" in texts
 
 
-def test_measures_are_means_over_the_run_and_its_end(traces, measured):
+def test_measures_are_means_over_run_and_end(traces, measured):
     values = traces["periodic"].measures["disagreement"]
     found = measured[0].robots[2].measures["disagreement"]
     assert found.mean == pytest.approx(np.nanmean(values[:, 2]))

@@ -28,7 +28,7 @@ def film_of(page):
     return json.loads(re.search(r'getElementById\("film"\), (\{.*\})\);', page)[1])
 
 
-def test_positions_are_those_of_the_run_within_a_millimetre(traces):
+def test_positions_match_the_run_within_a_millimetre(traces):
     page = replay.embedded(traces)
     film = film_of(page)
     assert [case["name"] for case in film["cases"]] == CASES
@@ -56,7 +56,7 @@ def test_the_still_picture_is_that_of_the_replay(traces):
         assert drawn == pytest.approx(trace.true_position[last])
 
 
-def test_it_asks_no_other_machine_and_no_text_ends_its_script(traces):
+def test_replay_needs_no_network_and_escapes_script_ends(traces):
     page = replay.embedded(traces)
     assert "http" not in page
     assert page.count("</script>") == 1
@@ -65,7 +65,7 @@ def test_it_asks_no_other_machine_and_no_text_ends_its_script(traces):
 
 @needs_chromium
 @pytest.mark.system
-def test_the_slider_moves_robots_and_a_still_picture_is_printed(traces, tmp_path):
+def test_slider_moves_robots_and_still_picture_is_printed(traces, tmp_path):
     api = pytest.importorskip("playwright.sync_api")
     file = tmp_path / "page.html"
     file.write_text(f"<!doctype html><meta charset=utf-8>{replay.embedded(traces)}", "utf-8")

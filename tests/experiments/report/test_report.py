@@ -115,7 +115,7 @@ def test_report_of_a_run_stands_alone(tmp_path, run):
     assert path.stat().st_size < 1_500_000
 
 
-def test_contents_lead_to_every_section_and_details_are_folded(tmp_path, run):
+def test_contents_link_every_section_and_details_are_folded(tmp_path, run):
     html = report.write(tmp_path, run).read_text(encoding="utf-8")
     contents = html[html.index("<nav") : html.index("</nav>")]
     links = re.findall(r'href="#([^"]*)"', contents)
@@ -147,7 +147,7 @@ def test_an_event_of_all_cases_is_one_row():
     assert [row.cells[:2] for row in short.rows] == [("all", "5.00"), ("a", "9.00"), ("b", "7.00")]
 
 
-def test_tables_that_do_not_fit_into_half_a_page_are_not_packed():
+def test_tables_wider_than_half_a_page_stand_alone():
     narrow, wide = Table(("Mean", "a"), (Row(("IAE", "1.0")),)), Table(("Mean", "a"), (Row(("IAE", "1.0 ± " * 20)),))
     assert Section("Results", tables=(narrow,) * 3).packed
     assert not Section("Results", tables=(narrow, narrow, wide)).packed
@@ -161,7 +161,7 @@ def test_report_is_the_same_every_time(tmp_path, run):
     assert texts[0] == texts[1]
 
 
-def test_report_of_one_case_leaves_out_the_figure_of_ratios(tmp_path):
+def test_report_of_one_case_has_no_ratio_figure(tmp_path):
     page = checked(
         report.write(tmp_path, [crowd(3, duration=3.0)], text="[file]\nx = '<b>'").read_text(encoding="utf-8")
     )
@@ -195,7 +195,7 @@ def test_report_over_seeds_gives_intervals(tmp_path):
     assert re.fullmatch(r"× \d\.\d+ ± 0\.\d+", cells[2][1])
 
 
-def test_report_of_a_run_in_which_a_robot_died_and_samples_were_lost(tmp_path):
+def test_report_of_run_with_dead_robot_and_losses(tmp_path):
     known = park(duration=10.0)
     place = known.true_position.copy()
     place[100:, 6] = np.nan
@@ -336,7 +336,7 @@ def test_verdict_says_what_was_measured(run):
     )
 
 
-def test_verdict_of_a_formation_that_never_came_to_be():
+def test_verdict_of_a_formation_never_acquired():
     what = experiment({"L": "turtlebot3", "F": "khepera4"}, {"L > F": 1.0})
     place = np.zeros((200, 2, 3))
     place[:, 1, 0] = 1.5
@@ -358,7 +358,7 @@ def said_of(*traces):
     return {finding.text: finding.mark for finding in findings([measure(each) for each in traces])}
 
 
-def test_verdict_says_how_near_it_came_if_nothing_touched():
+def test_verdict_gives_nearest_distance_if_nothing_touched():
     text = "No robot touched another or the arena; the closest approach was 36.0 cm between robots (A–B at 0.0 s)."
     assert said_of(side_by_side())[text] == "good"
     walled = park("a"), park("b")
@@ -398,7 +398,7 @@ def test_verdict_on_a_world_that_fell_behind():
     assert not any("world" in said for said in said_of(paced(0.5, clock="virtual")))
 
 
-def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
+def test_report_shows_avoidance_and_shadow_twins(tmp_path):
     plain = side_by_side()
     given = plain.plan.experiment.robots
     robots = {name: msgspec.structs.replace(robot, shadow=Shadow()) for name, robot in given.items()}
@@ -437,7 +437,7 @@ def test_avoidance_and_twins_beside_robots_are_in_the_report(tmp_path):
     assert (float(row["shadow_bias_y"]), float(row["intervened_share"])) == (pytest.approx(0.012), 0.1)
 
 
-def test_tables_have_one_unit_and_no_rows_of_what_did_not_occur(run):
+def test_tables_have_one_unit_and_no_empty_rows(run):
     tables = {table.head[0]: [row.cells[0] for row in table.rows] for table in whole_tables([measure(e) for e in run])}
     assert tables["Acquired by all followers [s]"] == ["from the start", "after 21 s"]
     assert tables["Distances [cm]"][:2] == ["Worst link before 21 s", "Worst link at the end"]
@@ -504,7 +504,7 @@ def test_experiment_is_shown_even_without_its_file(tmp_path):
     assert '"duration_s": 2.0' in page.words
 
 
-def test_losses_are_sums_over_all_robots_and_seeds_everywhere():
+def test_losses_sum_over_robots_and_seeds_everywhere():
     ones = [dataclasses.replace(park(case, seed=seed, duration=2.0), clock="real") for case in "ab" for seed in (1, 2)]
     runs = measured([dataclasses.replace(each, lost=each.lost + 1, missed_deadlines=each.lost + 2) for each in ones])
     robots = len(ones[0].robots)

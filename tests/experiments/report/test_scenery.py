@@ -91,7 +91,7 @@ def solids(axes):
     return [each for each in axes.collections if isinstance(each, Poly3DCollection)]
 
 
-def test_in_space_obstacles_reach_from_bottom_to_top_as_far_as_is_shown(short):
+def test_spatial_obstacles_reach_over_the_shown_height(short):
     axes = trajectories.formation([within(short, FULL)]).axes[0]
     low, high = axes.get_zlim()
     assert low == 0.0
@@ -102,7 +102,7 @@ def test_in_space_obstacles_reach_from_bottom_to_top_as_far_as_is_shown(short):
     assert (fence.min(), fence.max()) == pytest.approx((0.0, 0.2))
 
 
-def test_space_shows_the_arena_whole_unless_it_is_far_larger(short):
+def test_space_shows_whole_arena_unless_far_larger(short):
     near = trajectories.formation([within(short, EMPTY)]).axes[0]
     assert near.get_xlim() == pytest.approx((-1.08 * 1.1, 1.08 * 1.1))
     far = trajectories.formation([within(short, Arena(size=(30.0, 30.0, 3.0)))]).axes[0]

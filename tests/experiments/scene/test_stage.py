@@ -100,7 +100,7 @@ def test_links_that_are_not_there_have_no_error():
     assert tracker.errors(4.0, place) == pytest.approx([0.1])
 
 
-def test_a_link_is_lit_while_its_sender_has_just_transmitted(park):
+def test_link_is_lit_after_its_sender_transmits(park):
     moment = at_start(park)
     moment.silent_for[park.names.index("TB01")] = 0.05
     senders = {park.names[row] for row in park.links.sender[stage.lit(park, moment)]}
@@ -115,14 +115,14 @@ def test_unknown_robots_are_out_of_sight(park):
     assert len(stage.dashes(ends)) == 0
 
 
-def test_dashes_lie_on_the_link_and_leave_half_of_it_free():
+def test_dashes_lie_on_link_and_leave_half_free():
     made = stage.dashes(np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]))
     assert np.linalg.norm(made[:, 1] - made[:, 0], axis=1).sum() == pytest.approx(0.5)
     assert made[..., 0].min() >= 0.0
     assert made[..., 0].max() <= 1.0
 
 
-def test_robots_that_need_attention_have_a_ring_and_a_word(park):
+def test_robots_needing_attention_have_ring_and_word(park):
     moment = at_start(park)
     row = park.names.index("CF02")
     moment.condition[:] = Condition.ACTIVE
@@ -134,7 +134,7 @@ def test_robots_that_need_attention_have_a_ring_and_a_word(park):
     assert (stage.accents(park, moment)[row] != park.colours[row]).any()
 
 
-def test_a_trail_has_a_point_each_fifth_of_a_second_and_fades(park):
+def test_trail_has_five_fading_points_a_second(park):
     trail = Trail(2)
     kept = [trail.add(0.1 * k, np.full((2, 3), 0.1 * k)) for k in range(9)]
     assert kept == [True, False, True, False, True, False, True, False, True]
@@ -145,7 +145,7 @@ def test_a_trail_has_a_point_each_fifth_of_a_second_and_fades(park):
     assert colours[58, 1].tolist() == [204, 226, 239]  # nearly that of the background
 
 
-def test_ranges_reach_from_the_robot_to_what_it_sees(park):
+def test_ranges_reach_from_robot_to_what_it_sees(park):
     moment = at_start(park)
     moment.yaw[:] = np.pi / 2
     scan = messages.Ranges("KH01", 0.0, [0.0, 1.0], [0.0, 0.0], [0.5, None])
@@ -184,7 +184,7 @@ def test_obstacles_stand_where_the_file_says():
     assert moments.unknown(course).obstacles == pytest.approx(scene.pose)
 
 
-def test_an_obstacle_that_hangs_has_a_height_in_recordings():
+def test_hanging_obstacle_has_a_height_in_recordings():
     triangle = next(iter(load("triangle").cases().values())).experiment
     lamp = Obstacle(radius=0.2, at=(0.5, 0.0), bottom=1.4, height=0.3)
     arena = msgspec.structs.replace(triangle.arena, obstacles={"lamp": lamp})
@@ -194,7 +194,7 @@ def test_an_obstacle_that_hangs_has_a_height_in_recordings():
     assert marker.position[2] == pytest.approx(1.55)
 
 
-def test_a_case_with_a_plug_in_that_is_not_here_is_drawn_without_errors(park):
+def test_case_with_absent_plugin_is_drawn_without_errors(park):
     assert park.plan is not None
     formation = msgspec.structs.replace(park.plan.experiment.formation, law="not-here")
     other = Stage.of_plan(park.plan.changed(formation=formation, avoidance="not-here"))

@@ -46,7 +46,7 @@ def test_what_is_wrong_with_a_wish(text, message, hint):
     assert hint in problem.hint
 
 
-def test_limits_come_before_messages_and_count_with_their_interval():
+def test_limits_precede_messages_and_count_with_their_interval():
     wish = wish_of("messages, iae<=1.05")
     assert wish.rank(row(messages=0.2, iae=1.03)) == 0.2
     assert wish.rank(row(messages=0.1, iae=1.045)) > BROKEN  # 1.045 ± 0.01
@@ -55,7 +55,7 @@ def test_limits_come_before_messages_and_count_with_their_interval():
     assert not wish.kept(row(iae=1.06))
 
 
-def test_a_third_of_the_tuning_seeds_serves_the_search():
+def test_third_of_the_tuning_seeds_serves_the_search():
     assert searched(range(1001, 1061)) == tuple(range(1001, 1021))
 
 
@@ -68,7 +68,7 @@ def tuned(tmp_path_factory):
 
 
 @pytest.mark.nightly
-def test_the_search_finds_the_fewest_messages_within_the_limit(tuned):
+def test_search_finds_fewest_messages_within_the_limit(tuned):
     found, given, options = tuned
     reference, best = found.rows
     assert (reference.case, reference.reference, best.case, best.seeds) == ("periodic", True, "event", 6)

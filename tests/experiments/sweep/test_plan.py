@@ -20,7 +20,7 @@ def planned(read, *given_axes, cases=(), settings=()):
     return cells(read, str(read.path), settings, arguments(given_axes)[0], cases)
 
 
-def test_a_logarithmic_range_has_equal_ratios_and_both_ends():
+def test_logarithmic_range_has_equal_ratios_and_both_ends():
     (axis,), _ = arguments(["trigger.threshold=0.002:0.05:log12"])
     values = [float(value) for value in axis.values]
     assert (len(values), values[0], values[-1]) == (12, 0.002, 0.05)
@@ -62,20 +62,20 @@ def test_a_case_without_the_parameter_is_one_cell(triangle):
     assert plan[2].plan.experiment.trigger == {"kind": "send-on-delta", "threshold": 0.02}
 
 
-def test_the_reference_has_the_same_values_as_what_is_compared_with_it(triangle):
+def test_reference_shares_values_with_what_it_is_compared(triangle):
     plan = planned(triangle, "formation.gain=2,3", "trigger.threshold=0.01,0.02")
     assert len(plan) == 2 + 4
     reference = {cell.digest: cell.parameters["formation.gain"] for cell in plan if cell.case == "periodic"}
     assert all(reference[cell.reference] == cell.parameters["formation.gain"] for cell in plan)
 
 
-def test_a_value_of_one_case_and_a_chosen_case(triangle):
+def test_value_of_one_case_and_a_chosen_case(triangle):
     plan = planned(triangle, "cases.event.trigger.threshold=0.01,0.02", cases=["event"])
     assert [cell.case for cell in plan] == ["periodic", "event", "event"]
     assert planned(triangle, "trigger.threshold=0.01,0.02", cases=["periodic"])[0].parameters == {}
 
 
-def test_the_trigger_of_the_reference_stays_as_the_file_has_it(triangle):
+def test_trigger_of_the_reference_stays_as_written(triangle):
     """Also what the file leaves at its default is swept; the first case becomes one of those that are compared."""
     plan = planned(triangle, "trigger.minimum_interval_s=0.05,0.1", "formation.gain=2,3")
     references = [cell for cell in plan if cell.digest == cell.reference]
@@ -88,7 +88,7 @@ def test_the_trigger_of_the_reference_stays_as_the_file_has_it(triangle):
     assert len([cell for cell in plan if cell.case == "event"]) == 4
 
 
-def test_a_case_that_is_named_is_changed_even_if_it_is_the_reference(triangle):
+def test_named_case_is_changed_even_as_the_reference(triangle):
     plan = planned(triangle, "cases.periodic.trigger.period_s=0.02,0.1", cases=["event"])
     assert [cell.parameters.get("cases.periodic.trigger.period_s") for cell in plan] == [0.02, 0.1, None]
 
@@ -139,7 +139,7 @@ def test_too_many_cells_and_the_same_axis_twice(triangle):
         arguments(["formation.gain=1", "formation.gain=2"])
 
 
-def test_a_file_without_cases_has_nothing_to_compare_with(tmp_path, triangle):
+def test_file_without_cases_has_nothing_to_compare(tmp_path, triangle):
     file = tmp_path / "alone.toml"
     file.write_text(triangle.text.partition("[cases.")[0])
     with pytest.raises(DocumentError, match=r"no case in it to compare with\n.*\[cases.periodic\]"):

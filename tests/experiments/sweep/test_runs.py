@@ -85,7 +85,7 @@ def test_work_for_other_code_is_refused(park):
     assert answer.stranger.endswith("not of another version")
 
 
-def test_what_does_not_change_a_run_does_not_change_its_digest(park):
+def test_digest_ignores_what_does_not_change_a_run(park):
     same = msgspec.structs.replace(park, title="Another", source="", seed=99, cases={"a": {}})
     assert digest(Plan(same)) == digest(Plan(park))
     other = msgspec.structs.replace(park, duration_s=6.02)

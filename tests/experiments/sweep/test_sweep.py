@@ -117,7 +117,7 @@ def test_a_sweep_that_was_interrupted_goes_on(done, tmp_path, monkeypatch):
     assert quiet.ran == 0
 
 
-def test_a_changed_file_is_noticed_and_runs_anew_what_it_changes(tmp_path):
+def test_changed_file_is_noticed_and_reruns_affected_runs(tmp_path):
     file = tmp_path / "mine.toml"
     text = load("triangle").text.replace("duration_s = 15.0", "duration_s = 3.0")
     file.write_text(text)
@@ -161,14 +161,14 @@ def test_two_sweeps_do_not_share_a_folder(tmp_path):
     swept(tmp_path, "seeds=1", progress=meanwhile)
 
 
-def test_a_tuning_word_and_a_range_without_a_number_are_for_the_search(tmp_path):
+def test_tuning_word_and_open_range_belong_to_search(tmp_path):
     with pytest.raises(DocumentError, match="there is nothing to tune"):
         swept(tmp_path, "tuning=5")
     with pytest.raises(DocumentError, match="how many values"):
         swept(tmp_path, "trigger.threshold=0.01:0.02:log")
 
 
-def test_how_many_fly_side_by_side_depends_on_their_number():
+def test_number_of_parallel_flights_depends_on_robots():
     triangle = load("triangle").experiment
     assert side_by_side(Plan(triangle)) == 100
     many = {f"R{k}": triangle.robots["KH01"] for k in range(1000)}
@@ -212,7 +212,7 @@ def test_curves_go_along_the_first_parameter(tmp_path):
     assert "In all cells: " in page.note
 
 
-def test_cells_that_tie_are_all_on_the_front_and_share_a_column_of_parameters(done):
+def test_tied_cells_share_front_and_parameter_columns(done):
     (row, *_) = [row for row in done.rows if not row.reference]
     other = msgspec.structs.replace(row, case="other", parameters={"cases.other.trigger.threshold": 0.3}, units={})
     assert front([row, other]) == [row, other]
@@ -221,7 +221,7 @@ def test_cells_that_tie_are_all_on_the_front_and_share_a_column_of_parameters(do
     assert list(parameter_columns([row, both])) == ["trigger.threshold [m]", "cases.other.trigger.threshold"]
 
 
-def test_figures_of_a_search_are_drawn_at_any_width(done, tmp_path):
+def test_search_figures_are_drawn_at_any_width(done, tmp_path):
     tried = [msgspec.to_builtins(row) for row in done.rows if not row.reference]
     file = tmp_path / "sweep.json"
     sweep_table.write_json(file, sweep_table.document("t", [1], done.rows[:1], tuning=[7], tried=tried))
@@ -232,7 +232,7 @@ def test_figures_of_a_search_are_drawn_at_any_width(done, tmp_path):
         report([str(tmp_path)])
 
 
-def test_a_long_name_of_a_folder_is_cut_and_stays_its_own():
+def test_long_folder_name_is_cut_and_stays_unique():
     read, paths = load("triangle"), ["trigger.threshold", "cases.event.trigger.minimum_interval_s"]
     axes = [Axis(f"{path}=1", path, ("1",), None) for path in paths]
     names = [folder_of(read, some, "sweep").name for some in (axes[:1], axes, axes[::-1])]
@@ -266,7 +266,7 @@ def test_the_command_writes_table_figures_and_page(done, capsys):
     assert json.loads(capsys.readouterr().out)["cells"] == table["cells"]
 
 
-def test_without_a_cell_within_the_levels_the_nearest_is_named(done):
+def test_nearest_cell_is_named_without_any_within_levels(done):
     far = [msgspec.structs.replace(row, ratio={**row.ratio, "iae": spread([1.2 + k])}) if not row.reference else row
            for k, row in enumerate(done.rows)]  # fmt: skip
     (finding,) = sweep_page._fewest(far)

@@ -30,7 +30,7 @@ def test_only_an_operator_of_a_lab_gives_orders(tmp_path):
     assert not may_act(Watched(lab.secured(["tls/127.0.0.1:7447"], tmp_path / "no"), "park", "operator"))
 
 
-def test_numbers_of_the_trigger_and_the_law_have_sliders():
+def test_trigger_and_law_numbers_have_sliders():
     park = Stage.of_plan(load("robotic-park").cases()["event"])
     assert [(each.label, each.value) for each in parameters(park)] == [
         ("trigger.threshold [m]", 0.01), ("clamp [m]", 0.1), ("tracking_gain [1/(m²·decision)]", 3.0),
@@ -38,7 +38,7 @@ def test_numbers_of_the_trigger_and_the_law_have_sliders():
 
 
 @pytest.mark.slow
-def test_a_watched_run_in_virtual_time_is_the_same_to_the_last_bit(monkeypatch):
+def test_watched_virtual_run_is_unchanged_bit_by_bit(monkeypatch):
     pytest.importorskip("viser", reason="needs viser")
     from experiments.view import paced  # noqa: PLC0415
     from experiments.view.serving import served  # noqa: PLC0415

@@ -35,7 +35,7 @@ def recording(tmp_path_factory):
         (KEYS.life(KEYS.alive("KH01"), "f00d"), ""),  # its own
     ],
 )
-def test_the_replay_ends_when_another_process_owns_a_name(token, shown, recording, monkeypatch):
+def test_replay_ends_when_another_process_owns_a_name(token, shown, recording, monkeypatch):
     sent: list[bytes] = []
 
     class Counted(Mute):

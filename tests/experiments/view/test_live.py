@@ -12,7 +12,7 @@ from experiments.view import live
 
 @pytest.mark.parametrize("size", [(2.0, 2.0, 0.95), (12.0, 12.0, 1.1), (4.3, 2.0, 0.95), (0.5, 6.0, 2.0)])
 @pytest.mark.parametrize("aspect", [0.46, 0.85, 1.24, 3.0])
-def test_the_whole_arena_is_in_sight_and_fills_the_page(size, aspect):
+def test_whole_arena_is_in_sight_and_fills_page(size, aspect):
     place, at = live.standpoint(size, aspect)
     ahead = (at - place) / np.linalg.norm(at - place)
     right = np.cross(ahead, [0.0, 0.0, 1.0])

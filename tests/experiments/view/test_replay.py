@@ -54,7 +54,7 @@ def test_transmissions_are_those_of_the_recording(flown):
     assert [event.kind for event in read.events if event.kind in ("start", "phase")]
 
 
-def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(flown, tmp_path):
+def test_truncated_recording_is_replayed_to_its_end(flown, tmp_path):
     _, file = flown
     whole = tracks.read(file)
     cut = tmp_path / "cut.mcap"
@@ -73,7 +73,7 @@ def test_conditions_follow_the_phases(flown):
     assert set(film.moment(film.tracks.end).condition.tolist()) <= {Condition.LANDING, Condition.DONE}
 
 
-def test_history_has_errors_and_rates_of_the_whole_case(flown):
+def test_history_has_errors_and_rates_of_whole_case(flown):
     film = Film(tracks.read(flown[1]))
     history = film.history()
     k = int(np.searchsorted(history.time, 2.0))
@@ -106,7 +106,7 @@ def test_phases_stand_on_the_slider(flown):
     assert "landing" in worded
 
 
-def test_the_table_has_what_the_recording_has_and_no_empty_columns(flown):
+def test_table_has_recorded_content_and_no_empty_columns(flown):
     read = tracks.read(flown[1])
     film = Film(read)
     assert {(row.battery, row.missed) for t in (0.0, read.end) for row in film.rows(t)} == {(None, None)}
@@ -140,7 +140,7 @@ def test_curves_of_many_robots_are_three():
     assert (most[0], median[0], least[0]) == (39.0, 19.5, 0.0)
 
 
-def test_the_table_shows_the_worst_first_and_escapes_names(flown):
+def test_table_shows_the_worst_first_and_escapes_names(flown):
     stage = Film(tracks.read(flown[1])).stage
     rows = [Row(f"R{k}", Condition.ACTIVE, error=0.001 * k) for k in range(30)]
     rows[3] = Row("<b>", Condition.DEAD, note="<script>")

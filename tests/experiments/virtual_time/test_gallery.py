@@ -64,7 +64,7 @@ def test_events_save_messages():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 1e-3), ("event", 3e-3), ("event-loss", 0.01)])
-def test_a_team_descends_linearly_to_the_optimum_of_its_sum(case, most):
+def test_aggregative_team_descends_linearly_to_its_optimum(case, most):
     """Both ends of a link compare what was said: by events the averages keep no error but the threshold's ripple.
 
     A lost message lets the two ends believe different values, of some thresholds of 1 cm, until the next one.
@@ -110,7 +110,7 @@ def test_robots_fly_to_the_tasks_that_they_won(case):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_consensus_meets_at_the_mean_at_the_rate_of_the_graph(case):
+def test_consensus_meets_mean_at_the_graphs_rate(case):
     known = trace("consensus", case)
     offset = np.array([*known.plan.experiment.formation.law["offset"].values()])
     place = known.true_position[..., :2] - offset
@@ -138,7 +138,7 @@ def apart_from_mean(known):
 @pytest.mark.parametrize(
     ("case", "floor", "extra"), [("event", 0.01, 0.0), ("event-decaying", 0.005, 0.05), ("event-loss", 0.01, 0.0)]
 )
-def test_consensus_by_events_stays_in_its_bound_and_keeps_events_apart(case, floor, extra):
+def test_event_consensus_stays_bounded_and_keeps_events_apart(case, floor, extra):
     """Seyboth, Dimarogonas, Johansson, Automatica 49(1), 2013: thresholds c₀ + c₁ exp(−α t), α below k λ₂."""
     known = trace("consensus", case, NOISELESS)
     spectrum, alpha, root = np.linalg.eigvalsh(RING), 0.25, np.sqrt(5.0)
@@ -165,7 +165,7 @@ def test_consensus_by_events_stays_in_its_bound_and_keeps_events_apart(case, flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("loss", "silence"), [(0.0, ""), (0.2, ", maximum_silence_s = 1.0")])
-def test_consensus_by_a_share_of_the_error_keeps_its_rate_and_has_no_floor(loss, silence):
+def test_relative_event_consensus_keeps_rate_without_floor(loss, silence):
     """Dimarogonas, Frazzoli, Johansson, TAC 57(5), 2012, with the sum of a robot's errors for that of its law."""
     head, _, tail = index.find_file("consensus").read_text().partition("[formation.law]")
     places = tail.partition("[formation.law.offset]")[2].partition("[formation.links]")
@@ -230,7 +230,7 @@ def lag(known):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.001), ("event", 0.005), ("event-loss", 0.008)])
-def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
+def test_followers_of_a_constant_leader_do_not_lag(case, most):
     known = trace("leader-observer", case)
     window = (known.time > 20.0) & (known.time < 38.0)
     assert np.abs(known.memory["v"][window] - [0.12, 0.0]).max() < 1e-3
@@ -239,7 +239,7 @@ def test_followers_of_a_leader_at_constant_speed_do_not_lag(case, most):
 
 
 @pytest.mark.slow
-def test_followers_that_do_not_know_the_velocity_lag_by_speed_over_gain():
+def test_followers_without_velocity_lag_by_speed_over_gain():
     known = trace("leader-observer", "periodic", "formation.law.observer=1e-9", "duration_s=20")
     assert lag(known)[-1, 1:3] == pytest.approx(0.12 / 0.5, rel=0.05)
 
@@ -288,7 +288,7 @@ def five_alone():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_coverage_makes_up_for_a_robot_that_lands_in_mid_flight(case):
+def test_coverage_makes_up_for_a_robot_landing_midflight(case):
     """The battery of CF06, a Crazyflie among Tellos, is low first."""
     others = tuple(f'robots.CF0{number}.kind="tello"' for number in range(1, 6))
     known = trace("coverage", case, *others, "safety.battery_low=0.975", "duration_s=16")
@@ -304,7 +304,7 @@ def test_coverage_makes_up_for_a_robot_that_lands_in_mid_flight(case):
     assert known.measures["mass"][-1, :5].sum() == pytest.approx(WEIGHT.sum(), rel=0.005)
 
 
-def test_cells_share_the_area_and_make_up_for_a_lost_robot():
+def test_cells_share_area_and_replace_a_lost_robot():
     law, places = Coverage(), {"A": (-1.0, 0.5), "B": (0.3, -1.2), "C": (0.8, 0.9), "D": (0.1, 0.2)}
     for names in ("ABCD", "ABC", "A"):
         total = 0.0
@@ -340,7 +340,7 @@ def test_followers_without_any_leader_stop():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 0.04), ("event", 0.05), ("event-loss", 0.08)])
-def test_a_flock_keeps_spacing_and_velocity_and_its_mean_obeys_the_rendezvous(case, most):
+def test_flock_keeps_spacing_velocity_and_rendezvous_of_mean(case, most):
     known = trace("flocking", case)
     place = known.true_position[..., :2]
     apart = np.linalg.norm(place[:, :, None] - place[:, None], axis=3)[:, *np.triu_indices(7, 1)]
@@ -430,7 +430,7 @@ def test_displacement_keeps_an_error_in_a_wind(case):
     assert out_of_place(known)[late].mean(axis=0) == pytest.approx(expected, abs=0.01)
 
 
-def test_an_integral_stops_at_its_limit_and_while_its_robot_is_held():
+def test_integral_stops_at_limit_and_for_held_robots():
     law = Integral(most=0.1)
     heard = NeighbourView(1, "B", (1.0, 0.0, 0.0), ZERO, 0.0, 0.0, {}, Link(relative=(0.0, 0.0, 0.0)))
     view = View(RobotFacts("A", 0, 2, flies=True, speed=1.0, step_s=0.1), {}, [heard])
@@ -446,7 +446,7 @@ def test_an_integral_stops_at_its_limit_and_while_its_robot_is_held():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_robots_enclose_a_target_that_two_of_them_see(case):
+def test_robots_enclose_a_target_that_two_see(case):
     known = trace("enclosing", case)
     place = known.true_position[..., :2]
     assert known.memory["links"][-1, :, 0].tolist() == [0.0, 1.0, 2.0, 1.0, 2.0, 2.0]
@@ -463,7 +463,7 @@ def test_robots_enclose_a_target_that_two_of_them_see(case):
         assert turned.mean() == pytest.approx(0.2 * 2.0 * np.pi / 5.0, rel=0.01)
 
 
-def test_robots_that_hear_of_no_target_any_more_stay():
+def test_robots_stay_once_nobody_reports_the_target():
     law, places = Enclosing(), [(0.5, 0.0, 0.0), (-0.5, 0.0, 0.0)]
     facts = [RobotFacts(name, number, 4, flies=True, speed=1.0, step_s=0.1) for number, name in enumerate("AB")]
     memory = [{"target": (0.0, 0.0), "speed": (0.1, 0.0), "links": (1.0,)}] * 2  # as when both saw it

@@ -42,7 +42,7 @@ def test_robots_that_come_too_near_hold(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_drone_lands_when_its_battery_is_low_and_says_so():
+def test_drone_with_low_battery_lands_and_reports_it():
     robots = {
         "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.5), "G": Robot(kind="khepera4", start=[0.9, 0.1])
     }  # fmt: skip
@@ -61,7 +61,7 @@ def test_a_drone_lands_when_its_battery_is_low_and_says_so():
 
 
 @pytest.mark.parametrize("architecture", ["distributed", "centralised"])
-def test_a_drone_that_lands_is_lost_to_the_formation(architecture):
+def test_drone_that_lands_is_lost_to_the_formation(architecture):
     robots = {
         "F": Robot(kind="crazyflie", start=[0.0, 0.0], hover=0.3),
         "G": Robot(kind="khepera4", start=[1.3, 0.1]),

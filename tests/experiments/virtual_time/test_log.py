@@ -73,7 +73,7 @@ def equal(one, other, name):
         assert one == other, name
 
 
-def test_what_is_logged_and_what_is_played_back_are_the_same(log, tmp_path):
+def test_logged_and_played_back_runs_are_the_same(log, tmp_path):
     book = Logbook(log, Plan(experiment()), "only")
     book.record(tmp_path / "run.mcap", "")
     played = playback.read(tmp_path / "run.mcap")
@@ -96,7 +96,7 @@ def test_a_trace_has_the_contacts_of_the_run(log):
     assert (trace.interventions.tolist(), trace.avoided.tolist()) == ([4, 3], [2, 1])
 
 
-def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
+def test_world_is_logged_each_second_with_moving_things(log):
     world = Logbook(log, Plan(experiment()), "only").trace().world
     assert [round(said.stamp, 6) for said in world] == [0.0, 1.0, 2.0, 3.0]
     assert [[standing.name for standing in said.obstacles] for said in world] == [["post", "cart"]] * 4
@@ -107,7 +107,7 @@ def test_the_world_is_said_once_a_second_with_what_moves_in_it(log):
 
 
 @pytest.mark.parametrize(("engine", "contacts"), [("point-mass", None), ("pymunk", ())])
-def test_no_contacts_of_an_engine_that_looks_for_them_are_none(log, engine, contacts):
+def test_engine_without_contacts_found_reports_none(log, engine, contacts):
     quiet = replace(log, touches=())
     assert Logbook(quiet, Plan(experiment(engine)), "only").trace().contacts == contacts
 

@@ -171,7 +171,7 @@ def test_a_robot_plans_around_what_another_says(meeting):
     assert y.min() < -0.2  # to its right: the other does so as well
 
 
-def test_a_lost_robot_is_no_longer_avoided_by_what_it_said(meeting):
+def test_lost_robots_transmitted_path_is_no_longer_avoided(meeting):
     meeting.step(0.8)
     assert plan_of(meeting)[0] == 1.0  # what was said is old, and still counts
     meeting.neighbours.mark_lost(0, meeting.t)
@@ -199,7 +199,7 @@ def standing(place):
     return NeighbourView(1, "B", (*place, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, {"path": (nan,) * 32}, None)
 
 
-def test_a_path_is_read_at_the_time_of_its_reader():
+def test_path_is_read_at_its_readers_time():
     path = tuple(number for k in range(16) for number in (0.1 * k, 1.0))
     later = horizon(15, 0.2, 0.1).later(path, 0.3)
     assert later[:3, 0] == pytest.approx([0.25, 0.35, 0.45])
@@ -214,7 +214,7 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch):
         Stepping(replace(Plan(triangle()).assignment("A"), law=Mpc()))
 
 
-def test_check_warns_of_goals_that_cannot_be_had_together():
+def test_check_warns_of_goals_that_exclude_each_other():
     plan = Plan(triangle())
     assert list(Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 1.0)}).analyse(plan)) == []
     (near,) = Mpc(goal={"A": (0.0, 0.0), "B": (0.0, 0.3)}).analyse(plan)

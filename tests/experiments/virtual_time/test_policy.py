@@ -131,7 +131,7 @@ def test_what_is_no_model_is_refused(tmp_path):
         policy.load("")
 
 
-def test_a_file_that_is_not_there_is_a_fault_of_its_line(tmp_path):
+def test_absent_file_is_a_fault_of_its_line(tmp_path):
     with pytest.raises(DocumentError, match=r"own\.onnx cannot be read"):
         own(tmp_path)
     with pytest.raises(DocumentError, match="is no name of a file"):

@@ -53,7 +53,7 @@ def same(a: Log, b: Log):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bits_and_another_seed_others(park):
+def test_same_seed_gives_same_bits_and_another_others(park):
     first = simulate(Plan(park), 7)
     same(first, simulate(Plan(park), 7))
     other = simulate(Plan(park), 8)
@@ -104,7 +104,7 @@ def test_periodic_poses_are_all_sent_and_all_heard():
     assert not log.lost.any()
 
 
-def test_losses_are_counted_from_the_start_to_the_landing():
+def test_losses_are_counted_from_start_to_landing():
     experiment = ground(channel=Channel(loss=0.25), duration_s=10.0)
     log = simulate(Plan(experiment), 1)
     time, row = log.sent.stamp, log.sent.link
@@ -184,7 +184,7 @@ def test_who_cannot_get_up_is_named(monkeypatch):
         simulate(Plan(Experiment(title="Stuck", duration_s=1.0, robots=robots)), 1)
 
 
-def test_going_on_without_a_neighbour_that_is_never_heard():
+def test_robot_goes_on_without_a_never_received_neighbour():
     log = simulate(Plan(ground(channel=Channel(delay_s=100.0), start=Start(deadline_s=1.0, missing="go-on"))), 1)
     run = (log.time >= 0.0) & (log.time <= 2.0)
     np.testing.assert_allclose(log.true_position[run], np.tile(log.true_position[0], (run.sum(), 1, 1)), atol=1e-9)
@@ -192,7 +192,7 @@ def test_going_on_without_a_neighbour_that_is_never_heard():
     assert log.time[0] == pytest.approx(-1.5 - 0.5 - LEAD_S)  # ready after 1 s, sent off at 1.5 s, up, started at 2 s
 
 
-def test_nothing_is_lost_before_the_start_and_after_the_end_and_everything_between():
+def test_all_is_lost_inside_run_and_nothing_outside():
     log = simulate(Plan(ground(channel=Channel(loss=1.0))), 1)
     stamp = log.received.stamp
     assert not ((stamp > -1e-9) & (stamp < 2.0 - 1e-9)).any()

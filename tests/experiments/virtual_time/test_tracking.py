@@ -55,7 +55,7 @@ def track(case, seed, *changes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "most"), [("periodic", 1.1), ("event", 1.15), ("event-loss", 1.15)])
-def test_tracking_is_as_accurate_as_a_central_filter_and_consistent(case, most):
+def test_tracking_is_consistent_and_as_accurate_as_central(case, most):
     runs = [track(case, seed) for seed in (1, 2, 3)]
     own, central = (sum(run[k] for run in runs) / len(runs) for k in (0, 1))
     assert central < own < most**2 * central
@@ -73,7 +73,7 @@ def test_tracking_by_directions():
 
 
 @pytest.mark.slow
-def test_robots_that_do_not_see_the_target_know_it_from_the_others():
+def test_robots_without_sight_know_target_from_others():
     text = index.find_file("tracking").read_text("utf-8")
     bare = "\n".join(line for line in text.splitlines() if not line.startswith(('"TB01 > KH01"', '"TB01 > KH04"')))
     plan = document.loads(bare).cases()["event"]

@@ -38,7 +38,7 @@ def mean(cases, index):
 # ---------------------------------------------------------------- what is chosen
 
 
-def test_prediction_is_what_the_trigger_needs_unless_it_is_said(park):
+def test_prediction_defaults_to_what_the_trigger_needs(park):
     assert Plan(park).predictor is HOLD
     assert Plan(changed(park, trigger="predictive")).predictor == ConstantVelocity()
     assert Plan(changed(park, trigger=CHOSEN)).predictor == ConstantVelocity()
@@ -101,7 +101,7 @@ def flown(park):
     return log, Logbook(log, Plan(experiment), "predictive").trace()
 
 
-def test_what_is_heard_is_what_was_said_velocity_and_all(flown):
+def test_received_poses_equal_sent_ones_with_velocity(flown):
     _, trace = flown
     sent = {
         (robot, seq): (*place, *moves)
@@ -169,7 +169,7 @@ def whole(park):
 
 
 @pytest.mark.slow
-def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_little(park, whole):
+def test_smoothed_prediction_saves_97_percent_and_costs_little(park, whole):
     periodic, predictive = whole, measured(changed(park, trigger=CHOSEN), SEEDS)
     assert mean(predictive, "f_hz") <= 0.03 * mean(periodic, "f_hz")
     assert mean(predictive, "iae") <= 1.02 * mean(periodic, "iae")
@@ -178,14 +178,14 @@ def test_prediction_on_a_smoothed_value_saves_97_percent_and_costs_little(park, 
 
 
 @pytest.mark.slow
-def test_a_maximum_silence_keeps_prediction_from_running_away_on_a_bad_network(park, whole):
+def test_maximum_silence_stops_runaway_prediction_on_bad_network(park, whole):
     bad = changed(park, trigger={**CHOSEN, "maximum_silence_s": 2.0}, channel=Channel(delay_s=0.05, loss=0.1))
     cases = measured(bad, SEEDS)
     assert all(None not in case.acquired_s for case in cases)
     assert mean(cases, "iae") < 1.03 * mean(whole, "iae")
 
 
-def test_a_formation_without_links_has_no_law_to_gate(park):
+def test_formation_without_links_has_no_law_to_gate(park):
     alone = changed(
         park,
         robots={"KH01": park.robots["KH01"]},

@@ -68,7 +68,7 @@ def test_a_distance_task(tmp_path):
     assert {robot.body for robot in experiment.robots.values()} == {"twin"}
 
 
-def test_a_hybrid_one_keeps_addresses_and_shares_the_radio(tmp_path):
+def test_hybrid_file_keeps_addresses_and_shares_the_radio(tmp_path):
     read, notes = converted(tmp_path, FILES[8]())
     robots = read.experiment.robots
     assert [name for name, each in robots.items() if each.body != "twin"] == ["dron02", "dron03", "dron06"]
@@ -165,7 +165,7 @@ def test_places(tmp_path, relation, anchor, note):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("architecture", "theirs"), [("distributed", True), ("centralized", False)])
-def test_the_origin_of_real_crazyflies_is_that_of_their_driver(tmp_path, architecture, theirs):
+def test_origin_of_real_crazyflies_follows_their_driver(tmp_path, architecture, theirs):
     relations = [[*each, "origin_0.4726"] for each in TRIANGLE]  # √(0.8²/3 + 0.1²): at 0.7 m, from (0, 0, 0.8)
     text = file(three(relations, place="physical"), "physical", architecture).replace("khepera", "dron")
     text = text.replace("pose: 0.00, 0.00, 0.00", "pose: 0.01, 0.00, 0.00")
@@ -178,7 +178,7 @@ def test_the_origin_of_real_crazyflies_is_that_of_their_driver(tmp_path, archite
     assert any("the origin: lifted" in note for note in notes) != theirs  # the central controller's is at 0
 
 
-def test_an_origin_that_contradicts_the_distances_is_left_out(tmp_path):
+def test_origin_contradicting_distances_is_left_out(tmp_path):
     relations = [[*each, "origin_2.0"] for each in TRIANGLE]
     read, notes = converted(tmp_path, file(three(relations)))
     assert not read.experiment.formation.anchors
@@ -208,7 +208,7 @@ def test_everything_that_is_left_behind_is_told(tmp_path):
 
 
 @pytest.mark.parametrize(("spelt", "noted"), [("centralized", False), ("Centralized", True)])
-def test_a_central_controller_reads_the_relations_of_robots_whose_own_task_is_off(tmp_path, spelt, noted):
+def test_central_controller_reads_relations_of_disabled_tasks(tmp_path, spelt, noted):
     text = file(three([[*each, "origin_0.4619"] for each in TRIANGLE]), architecture=spelt)
     text = text.replace("enable: True\n      T: 100", "enable: False\n      T: 100")
     read, notes = converted(tmp_path, text)
@@ -237,7 +237,7 @@ def test_tasks_that_are_off_are_counted(tmp_path):
         ("physical", "dron", True, (0.5, 2.0)),
     ],
 )
-def test_gains_by_the_driver_that_the_file_is_for(tmp_path, place, name, recent, expected):
+def test_gains_follow_the_driver_of_the_file(tmp_path, place, name, recent, expected):
     gain, weight = expected
     radius = 0.8 / np.sqrt(3.0)
     relations = [[*each, f"sphere_{radius:.4f}-0.4-0.2309-0.7"] for each in TRIANGLE]
@@ -283,7 +283,7 @@ def test_import_of_toml_names_the_check():
         convert_text('title = "park"\n', "park.toml", 20.0)
 
 
-def test_a_law_that_gives_a_velocity_becomes_a_step(tmp_path):
+def test_velocity_law_becomes_a_step(tmp_path):
     text = file(three(TRIANGLE)).replace("type: gradient", "type: gradient_v").replace("period: 0.1\n", "period: 0.2\n")
     formation = converted(tmp_path, text)[0].experiment.formation
     assert (formation.gain, formation.clamp) == (pytest.approx(0.1), pytest.approx(0.02))
@@ -319,7 +319,7 @@ def test_pyramid_is_not_folded(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_flat_formation_stays_flat_whatever_the_origin_says(tmp_path):
+def test_flat_formation_stays_flat_whatever_the_origin(tmp_path):
     place = [(0.8, 0.0), (0.25, 0.76), (-0.65, 0.47), (-0.65, -0.47), (0.25, -0.76)]
     names = [f"dron0{k + 1}" for k in range(5)]
     robots = []
@@ -335,7 +335,7 @@ def test_a_flat_formation_stays_flat_whatever_the_origin_says(tmp_path):
     assert not any("climb" in note for note in notes)
 
 
-def test_the_tools_that_are_switched_on_are_told_and_no_others(tmp_path):
+def test_enabled_tools_are_reported_and_no_others(tmp_path):
     off = "  Agent00:\n    enable: False\n  Agent01:\n    enable: True\n  Reconfiguration:\n    enable: True\n"
     notes = converted(tmp_path, file(three(TRIANGLE)) + off)[1]
     told = " | ".join(notes)
@@ -416,7 +416,7 @@ def test_the_command(tmp_path):
         convert(str(source), None, 20.0)
 
 
-def test_a_flat_file_of_2023_with_starts_from_an_index(tmp_path):
+def test_flat_2023_file_starts_from_an_index(tmp_path):
     marker = "dron09:\n  name: khepera01\n  control_mode: None\n  task:\n    enable: False\n    relationship: Null\n"
     poses = tmp_path / "poses.yaml"
     places = {"dron01": "0.1 0.5", "khepera01": "-0.4, 0.0", "khepera02": "0.5 0.1 3.1"}
@@ -462,7 +462,7 @@ def index(tmp_path, **settings):
     return "\n".join(lines)
 
 
-def test_an_index_of_2023_follows_the_files_that_it_names(tmp_path):
+def test_index_of_2023_follows_the_files_it_names(tmp_path):
     made, _ = convert_text(index(tmp_path), str(tmp_path / "AC.yaml"), 20.0)
     (tmp_path / "ac.toml").write_text(made)
     experiment = document.read(tmp_path / "ac.toml").experiment
@@ -491,7 +491,7 @@ def test_an_index_of_2023_follows_the_files_that_it_names(tmp_path):
         (lambda folder: (folder / "AC_dron01.yaml").write_text(flat("dron01", relations="dron07_1.0")), "dron07", ""),
     ],
 )
-def test_what_is_wrong_in_an_index_is_said_with_its_file(tmp_path, broken, said, where):
+def test_faults_of_an_index_name_their_file(tmp_path, broken, said, where):
     text = index(tmp_path)
     broken(tmp_path)
     with pytest.raises(DocumentError) as raised:
@@ -500,7 +500,7 @@ def test_what_is_wrong_in_an_index_is_said_with_its_file(tmp_path, broken, said,
     assert raised.value.problems[0].file.endswith(where)
 
 
-def test_one_robot_of_an_experiment_names_what_to_import(tmp_path):
+def test_one_robot_names_what_to_import(tmp_path):
     with pytest.raises(DocumentError, match="import the file that lists all robots"):
         convert_text(flat("dron01"), "AC_dron01.yaml", 20.0)
 
@@ -546,7 +546,7 @@ def test_starts_that_cannot_be_read(tmp_path, name, text, said):
         starts_from(str(tmp_path / name))
 
 
-def test_axes_of_a_pose_are_named_in_any_order(tmp_path):
+def test_pose_axes_come_in_any_order(tmp_path):
     made, *_ = converted(tmp_path, file(three(TRIANGLE)).replace("pose: 0.90, 0.00, 0.00", "pose: {y: 0.0, x: 0.9}"))
     assert made.experiment.robots["khepera02"].start[:2] == [0.9, 0.0]
 
@@ -563,7 +563,7 @@ def test_errors_of_a_key_have_a_remedy():
         assert raised.value.problems[0].hint.startswith(hint)
 
 
-def test_a_threshold_of_nothing_is_refused_and_co_goes_before_threshold():
+def test_zero_threshold_is_refused_and_co_precedes_threshold():
     assert Trigger("EventBased", _Threshold(co=0.02, threshold=0.5)).event == (0.02, 0.0)
     assert Trigger("EventBased", _Threshold(threshold=0.5)).event == (0.5, 0.0)
     assert Trigger("EventBased").event == (0.01, 0.0)
@@ -571,6 +571,6 @@ def test_a_threshold_of_nothing_is_refused_and_co_goes_before_threshold():
         _ = Trigger("EventBased", _Threshold(threshold=0)).event
 
 
-def test_a_task_that_is_switched_off_may_hold_anything(tmp_path):
+def test_disabled_task_may_hold_anything(tmp_path):
     text = file(three(TRIANGLE)).replace("enable: True\n      T: 100", "enable: False\n      T: -5", 1)
     assert converted(tmp_path, text)[0].experiment.robots

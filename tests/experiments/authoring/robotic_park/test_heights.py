@@ -37,7 +37,7 @@ def test_a_shape_is_found_again_from_nearby(seed, rows, relative):
     assert found.worst < ENOUGH
 
 
-def test_drones_from_one_plane_find_their_dome_and_robots_stay_on_the_floor():
+def test_coplanar_drones_find_their_dome_above_ground_robots():
     ring = np.array([(np.cos(a), np.sin(a), 0.0) for a in 2.0 * np.pi * np.arange(5) / 5])
     shape = np.concatenate([ring, [[0.0, 0.0, 1.0]]])
     climbs = np.arange(6) == 5
@@ -55,7 +55,7 @@ def test_what_contradicts_itself_is_measured():
     assert found.worst == pytest.approx(0.1, abs=1e-3)  # 0.3 m, shared by three
 
 
-def test_a_shape_that_is_met_at_the_heights_of_the_starts_is_not_folded():
+def test_shape_met_at_start_heights_is_not_folded():
     ring = np.array([(np.cos(a), np.sin(a), 0.7) for a in 2.0 * np.pi * np.arange(6) / 6])
     found = find_shape(asked(ring).take(np.arange(0, 15, 2)), (), ring * [1.3, 0.8, 1.0], np.ones(6, dtype=bool))
     assert found.worst < ENOUGH
@@ -63,7 +63,7 @@ def test_a_shape_that_is_met_at_the_heights_of_the_starts_is_not_folded():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_shapes_in_space_are_found_from_starts_in_one_plane(seed):
+def test_space_shapes_are_found_from_coplanar_starts(seed):
     """Twelve drones on a hemisphere, linked to their nearest: a single beginning misses most of them."""
     made = layouts.hemisphere(12, 0.6, 0.25)
     shape = made.position

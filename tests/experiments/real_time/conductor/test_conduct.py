@@ -30,7 +30,7 @@ def run(robots: dict[str, str], title: str = "here", born: str | None = None) ->
     return made if born is None else msgspec.structs.replace(made, born=born)
 
 
-def test_hardware_is_known_by_its_address_its_settings_and_its_host() -> None:
+def test_hardware_is_known_by_address_settings_and_host() -> None:
     away = msgspec.structs.replace(REAL, hosts={"lab2": Host(address="ana@lab2", robots=["TE01"])})
     assert hardware([Plan(REAL), Plan(away)]) == {
         "CF01": RADIO,

@@ -20,7 +20,7 @@ def endpoint(monkeypatch):
     return free_endpoint(preferred_port=0)
 
 
-def test_a_router_that_was_started_just_now_is_waited_for(endpoint):
+def test_router_that_just_started_is_waited_for(endpoint):
     over = threading.Event()
     late = threading.Timer(0.6, serve_router, ([endpoint], over))
     late.start()

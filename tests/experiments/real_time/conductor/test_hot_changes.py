@@ -207,7 +207,7 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     return Stage(monkeypatch)
 
 
-def test_a_restart_lands_starts_and_joins_by_the_common_clock(stage: Stage) -> None:
+def test_restart_lands_starts_and_joins_by_common_clock(stage: Stage) -> None:
     reply = stage.after(stage.ask("restart", "CF01"), 5.0)
     assert set(reply.done) == {"CF01"}
     assert stage.view.given == [("CF01", "leave"), ("CF01", "takeoff"), ("CF01", "start")]
@@ -215,7 +215,7 @@ def test_a_restart_lands_starts_and_joins_by_the_common_clock(stage: Stage) -> N
     assert (stage.robots["CF01"].phase, stage.robots["CF01"].left_because) == ("running", "")
 
 
-def test_one_order_for_several_is_answered_when_all_are_done(stage: Stage) -> None:
+def test_order_for_several_is_answered_when_all_finish(stage: Stage) -> None:
     stage.hung.add("KH02")
     query = stage.ask("remove", "KH01", "KH02", "KH01")
     stage.go_on(2.0)
@@ -236,7 +236,7 @@ def test_a_place_is_free_or_not(stage: Stage, away: float) -> None:
     assert bool(stage.view.given) == bool(reply.done), "who is refused is left alone"
 
 
-def test_what_lies_where_it_was_lost_counts_unless_it_was_a_twin(stage: Stage) -> None:
+def test_body_lying_where_lost_counts_unless_a_twin(stage: Stage) -> None:
     x, y = stage.experiment.robots["CF01"].start[:2]
     stage.robots["KH01"].place = (x, y, 0.0)
     stage.end("KH01")
@@ -304,7 +304,7 @@ def test_a_spare_takes_over_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no spare crazyflie left" in text
 
 
-def test_a_process_that_ends_while_it_joins_is_told(stage: Stage) -> None:
+def test_process_that_ends_while_joining_is_reported(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
     stage.crew.start_again = lambda names, bodies=None: stage.end("KH01")  # type: ignore[method-assign]
     reply = stage.after(query, 5.0)
@@ -313,7 +313,7 @@ def test_a_process_that_ends_while_it_joins_is_told(stage: Stage) -> None:
     assert stage.changes.under_way == set()
 
 
-def test_orders_that_get_lost_are_repeated_and_time_is_limited(stage: Stage) -> None:
+def test_lost_orders_are_repeated_within_limited_time(stage: Stage) -> None:
     query = stage.ask("restart", "KH01")
     start = stage.crew.start_again
 

@@ -25,7 +25,7 @@ KEYS = Keys()
 
 @pytest.mark.mechanism("orders to several robots at once")
 @pytest.mark.system
-def test_an_order_reaches_all_before_one_of_them_has_answered(router: RouterProcess) -> None:
+def test_order_reaches_all_before_one_has_answered(router: RouterProcess) -> None:
     """The first answers only when the last has the order: whoever is asked one after the other waits in vain.
 
     A storage of the network, nearer and complete, answers with what was put there by mistake.
@@ -94,7 +94,7 @@ def test_replies_of_another_key_or_robot_are_none() -> None:
     assert orders.send_order(session, KEYS, ["A"], messages.Order("hold")) == {"A": good}  # type: ignore[arg-type]
 
 
-def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
+def test_robots_beginning_is_its_first_status_within_experiment() -> None:
     view = NetworkView.__new__(NetworkView)
     view.clock = Clock()
     view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})
@@ -126,9 +126,7 @@ def test_when_a_robot_began_is_its_first_status_of_the_experiment() -> None:
         ("emergency stop by a test", (), False),
     ],
 )
-def test_a_landing_that_nobody_asked_for_is_a_hazard_with_its_reason_once(
-    reason: str, incidents: tuple[str, ...], fault: bool
-) -> None:
+def test_unasked_landing_is_a_hazard_with_reason_once(reason: str, incidents: tuple[str, ...], fault: bool) -> None:
     view = NetworkView.__new__(NetworkView)
     view.clock = Clock()
     view._progress = Progress("case", "running", None, 1.0, {"TB01": RobotView()})

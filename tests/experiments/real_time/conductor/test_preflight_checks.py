@@ -141,20 +141,20 @@ def test_a_position_that_moves_at_rest(noise, verdict):
     assert found(each, "position").verdict == verdict
 
 
-def test_a_robot_without_a_position_is_not_known_to_be_anywhere():
+def test_robot_without_position_is_not_placed_anywhere():
     each = standing()
     each.states = []
     assert [found(each, check).verdict for check in ("position", "start pose")] == ["bad", "unknown"]
 
 
-def test_a_robot_that_does_not_answer_has_one_red_line_with_a_remedy():
+def test_unresponsive_robot_has_one_red_line_with_remedy():
     silent = Observed(DRONE, ended="no answer at radio://0/80/2M/E7E7E7E701")
     (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]
     assert (made.check, made.verdict, made.found) == ("address", "bad", silent.ended)
     assert made.remedy.startswith("switch it on")
 
 
-def test_one_of_several_drones_of_a_process_that_never_answered():
+def test_one_drone_of_a_process_that_never_answered():
     said = status(battery=None, phase="idle", reason="no position of its own", body="no answer at radio://0/80/...")
     each = Observed(DRONE, said, "", states(None), [Inspection()], 0.001)
     assert found(each, "address").verdict == found(each, "ready").verdict == "bad"
@@ -196,7 +196,7 @@ def test_stops(tried, verdict):
     assert (made.verdict, "locked" in made.found) == (verdict, verdict == "ok")
 
 
-def test_a_robot_on_wheels_that_rolls_on_after_the_stop():
+def test_wheeled_robot_that_rolls_on_after_the_stop():
     rolled = Tried(stopped_s=0.5, states=states((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)))
     assert checks.stop_in_motion(standing(WHEELS), rolled).verdict == "bad"
     assert checks.stop_in_motion(standing(WHEELS), Tried(stopped_s=0.5)).verdict == "ok"
@@ -241,7 +241,7 @@ def test_a_tello_takes_off_to_its_own_height():
     assert {name: robot.hover for name, robot in case.experiment.robots.items()} == {"T1": 0.8, "CF01": checks.HOP_M}
 
 
-def test_what_a_bridge_says_of_a_robot_that_answers_is_a_warning():
+def test_bridge_note_on_an_answering_robot_is_warning():
     each = standing()
     each.status = status(body="3 positions refused")
     made = found(each, "address")
@@ -291,7 +291,7 @@ def test_sticks_that_could_not_be_measured():
     assert checks.sticks(each, Tried(states=pushed(0.2, 0.2)[:20])).verdict == "bad"
 
 
-def test_a_robot_behind_a_body_of_ones_own_has_no_remedy_of_another_device():
+def test_users_body_gets_no_remedy_of_another_device():
     own = msgspec.structs.replace(DRONE, body="quad://127.0.0.1:6001")
     silent = Observed(own, ended="CF01: no pose within 3 s")
     (made,) = checks.at_rest({"CF01": silent}, Safety(), TODAY)["CF01"]

@@ -30,7 +30,7 @@ class Starts:
         self.told.append(words)
 
 
-def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_path):
+def test_dead_router_listens_again_where_machines_expect_it(tmp_path):
     launcher = Starts()
     here, everywhere = "tcp/127.0.0.1:7447", "tcp/0.0.0.0:7447"
     experiment = document.read("triangle").experiment
@@ -51,7 +51,7 @@ def test_a_router_that_died_listens_again_where_other_machines_look_for_it(tmp_p
 
 
 @pytest.mark.system
-def test_a_router_whose_port_was_taken_meanwhile_listens_at_another(tmp_path, monkeypatch):
+def test_router_with_port_taken_meanwhile_listens_elsewhere(tmp_path, monkeypatch):
     taken = free_endpoint(preferred_port=0)
     with socket.create_server(("127.0.0.1", Endpoint.parse(taken).port)):
         free = [[taken], [taken], [free_endpoint(preferred_port=0)]]
@@ -67,7 +67,7 @@ def test_a_router_whose_port_was_taken_meanwhile_listens_at_another(tmp_path, mo
             up.enter_context(staged(read, embody(read, RunOptions()), tmp_path, RunOptions(), user))
 
 
-def test_a_launcher_that_stood_still_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
+def test_suspended_launcher_knows_when_its_robots_have_landed(tmp_path, monkeypatch):
     launcher, zero = Launcher(tmp_path), time.monotonic()
     for since, silence in ((3.0, -math.inf), (3.7, zero + 3.7), (40.0, zero + 40.0)):
         with monkeypatch.context() as patched:

@@ -86,7 +86,7 @@ def test_what_no_longer_counts_is_told_apart(lab, there, tmp_path):
     assert said(there, other)[0].startswith("its certificates are of another lab")
 
 
-def test_what_has_ended_and_clocks_for_which_it_has(lab, there):
+def test_expired_certificates_and_clocks_outside_validity_are_reported(lab, there):
     authority.renew(lab, ["KH01"], days=-0.01)
     for end in ("pem", "key"):
         shutil.copy(lab / f"KH01.{end}", there)
@@ -102,7 +102,7 @@ def test_what_has_ended_and_clocks_for_which_it_has(lab, there):
     assert "CF01" in second
 
 
-def test_who_is_not_in_the_lab_cannot_be_sent(lab, there):
+def test_robot_outside_the_lab_cannot_be_sent(lab, there):
     found = Holding(held(there, ROBOTS).authority, held(there, ["TB01"]).held)
     assert next(faults(found, lab, time.time())).startswith(f"TB01 is not in the lab {lab}; `./zenpark cert issue")
     assert next(ended(lab, ["TB01"])).startswith("TB01 is not in the lab")
@@ -120,7 +120,7 @@ def test_keys_of_others_do_not_belong_there(lab, there):
     )
 
 
-def test_a_router_is_believed_under_the_names_in_its_certificate(lab):
+def test_router_is_trusted_under_its_certificates_names(lab):
     assert list(unnamed(["tls/127.0.0.1:7447", "quic/localhost:1"], lab)) == []
     (only,) = unnamed(["tls/192.0.2.7:7447", "quic/192.0.2.7:7448"], lab)
     assert f"`./zenpark cert renew {lab} router --host 192.0.2.7`" in only

@@ -37,7 +37,7 @@ def simulated(ppm, seconds, *, follows):
 
 
 @pytest.mark.parametrize(("ppm", "most"), [(50, 0.9e-3), (-50, 0.9e-3), (500, 2.5e-3), (2000, 3.5e-3)])
-def test_what_is_left_stays_small_however_long_the_run(ppm, most):
+def test_remaining_drift_stays_small_whatever_the_runs_length(ppm, most):
     true, _, left, measured = simulated(ppm, 600.0, follows=True)
     assert np.abs(left).max() < most
     _, _, without, _ = simulated(ppm, 600.0, follows=False)
@@ -96,7 +96,7 @@ def test_robots_are_told_drift_and_no_jump(monkeypatch):
     assert "says nothing; its clock is not corrected any more" in trouble[1]
 
 
-def test_the_end_waits_for_the_host_that_is_asked_and_for_no_other(monkeypatch):
+def test_end_waits_only_for_the_host_being_asked(monkeypatch):
     monkeypatch.setattr(clock_drift, "PERIOD_S", 0.01)
     asked = []
 

@@ -39,7 +39,7 @@ def test_a_digest_is_that_of_names_and_contents(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_router_that_is_not_there_is_not_reached():
+def test_absent_router_is_not_reached():
     (found,) = answer(Question("reach", endpoints=["tcp/127.0.0.1:9"]), 0.0).found
     assert not found.well
     assert "no router answers" in found.text
@@ -110,7 +110,7 @@ def test_it_sweeps_up_its_own_run_only():
 
 @pytest.mark.mechanism("station: way out on a host")
 @pytest.mark.system
-def test_it_waits_for_robots_that_land_and_kills_those_that_do_not():
+def test_station_awaits_landing_robots_and_kills_frozen_ones():
     started, frozen = Started("run.lab1"), sleeper("run.lab1")
     try:
         started.ask(Question("clock"))

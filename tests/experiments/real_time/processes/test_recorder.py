@@ -32,13 +32,13 @@ class Taken:
         kept[type(message)].append(message)  # type: ignore[attr-defined, index]
 
 
-def test_whoever_serves_robots_or_records_them_waits_for_the_longest_way_down() -> None:
+def test_servers_and_recorders_wait_for_the_longest_descent() -> None:
     assert shutdown.AFTER_S == AFTER_S
     assert AFTER_S > 2.0 * loop.FAREWELL_S + loop.STOPPED_S
 
 
 @pytest.mark.system
-def test_what_the_world_says_is_taken_down_if_it_can_be_true(
+def test_recorder_keeps_plausible_messages_of_the_world(
     router: RouterProcess, eventually: Callable[[Callable[[], object]], None]
 ) -> None:
     said: list[tuple[str, messages.Message]] = [
@@ -81,7 +81,7 @@ def test_what_the_world_says_is_taken_down_if_it_can_be_true(
     assert (recorder.unread, len(taken.events)) == (before, 2)  # nothing new
 
 
-def test_the_truth_of_a_state_is_on_the_line_between_those_beside_it() -> None:
+def test_truth_at_a_state_is_interpolated_between_neighbours() -> None:
     """At 0.5 m/s the newest of 50 truths a second is up to 1 cm away."""
     truths = [
         messages.Position("TB01", START + 0.02 * k, (0.01 * k, 0.0, 0.0), messages.heading(math.pi - 0.05 + 0.02 * k))

@@ -22,7 +22,7 @@ HZ, KEYS = 100.0, Keys("park")
 
 @pytest.mark.parametrize("asleep", [False, True])
 @pytest.mark.parametrize(("stands_s", "lost", "forgiven"), [(0.05, 0, False), (0.255, 19, False), (2.0, 194, True)])
-def test_lateness_is_caught_up_and_a_standstill_is_lost(stands_s, lost, forgiven, asleep, monkeypatch):
+def test_lateness_is_caught_up_and_standstill_lost(stands_s, lost, forgiven, asleep, monkeypatch):
     now, simulated, slept = [1000.0], [], []
     over = threading.Event()
     lost += asleep and lost > 0  # it begins when a tick is due, not after one
