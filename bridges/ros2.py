@@ -292,7 +292,7 @@ def diagnosis(types: Types, status: messages.Status) -> Message:
         "battery": "" if status.battery is None else f"{status.battery:.3f}",
         "missing": " ".join(status.missing),
         "sent": str(status.sent),
-        "heard": str(status.received),
+        "received": str(status.received),
         "lost": str(sum(status.lost.values())),
         "malformed": str(status.malformed),
         "refused": str(status.refused),

@@ -30,7 +30,7 @@ TRIGGERS: Final[dict[str, dict[str, Any]]] = {
 
 def flown(plan: Plan, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, float, float]:
     """Metrics of each seed; of a run, on average: messages of the network, deliveries, and the delay of goals [s]."""
-    listeners = np.bincount(plan.pose_links.sender, minlength=len(plan.names))
+    receivers = np.bincount(plan.pose_links.sender, minlength=len(plan.names))
     found: list[RunMetrics] = []
     messages, deliveries, delay = [], [], []
     for seed in seeds:
@@ -44,7 +44,7 @@ def flown(plan: Plan, seeds: Sequence[int]) -> tuple[list[RunMetrics], float, fl
             told, received = len(seen.sent), int(seen.received.sum())
             delay.append(float(seen.delay.mean()))
         messages.append(int(sent.sum()) + told)
-        deliveries.append(int(sent @ listeners) + received + told)
+        deliveries.append(int(sent @ receivers) + received + told)
     return found, fmean(messages), fmean(deliveries), fmean(delay) if delay else 0.0
 
 

@@ -97,8 +97,22 @@ class BodyState:
     """State of the body of one robot; unknown numbers are NaN."""
 
     __slots__ = (
-        "ahead", "attitude", "battery", "flying", "heard", "note", "position", "refusal", "scan", "shadow_position",
-        "shadow_yaw", "time", "true_position", "true_yaw", "velocity", "yaw",
+        "ahead",
+        "attitude",
+        "battery",
+        "flying",
+        "note",
+        "position",
+        "received",
+        "refusal",
+        "scan",
+        "shadow_position",
+        "shadow_yaw",
+        "time",
+        "true_position",
+        "true_yaw",
+        "velocity",
+        "yaw",
     )  # fmt: skip
 
     time: float  # when the pose was measured, on the clock of `Body.read` [s]
@@ -113,7 +127,7 @@ class BodyState:
     shadow_position: Vector  # of the twin that runs beside the robot [m] (`agents.body.shadow_twin`)
     shadow_yaw: float  # of that twin [rad]
     ahead: float  # stamp of the last external position less the time of its arrival [s]
-    heard: float  # when the device was heard last, on the clock of `Body.read` [s]
+    received: float  # newest answer of the device, on the clock of `Body.read` [s]
     note: str  # report of the hardware (supervisor, link), for people
     refusal: str  # why the device would refuse to take off now; empty if it would not, or does not tell
     scan: RangeScan | None  # the newest sweep of its range sensors
@@ -131,14 +145,14 @@ class BodyState:
         flying: bool = False,
         attitude: Attitude = NO_ATTITUDE,
         ahead: float = nan,
-        heard: float = nan,
+        received: float = nan,
         note: str = "",
         refusal: str = "",
         scan: RangeScan | None = None,
     ) -> None:
         self.time, self.position, self.velocity, self.yaw = time, position, velocity, yaw
         self.true_position, self.true_yaw, self.battery, self.flying = true_position, true_yaw, battery, flying
-        self.attitude, self.ahead, self.heard = attitude, ahead, heard
+        self.attitude, self.ahead, self.received = attitude, ahead, received
         self.shadow_position, self.shadow_yaw = UNKNOWN, nan
         self.note, self.refusal, self.scan = note, refusal, scan
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import inf, isfinite, remainder, tau
-from typing import ClassVar, Final, Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 import msgspec
 
@@ -87,9 +87,7 @@ class Memory(Message, frozen=True, omit_defaults=True):
 class PoseReceipt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A neighbour's pose as a robot received it."""
 
-    RECORDED_AS: ClassVar[str] = "Heard"
-
-    sender: str = msgspec.field(name="speaker")
+    sender: str
     seq: int
     stamp: float  # [s] UTC of the measurement
     arrived: float  # [s] UTC of the reception
@@ -127,13 +125,11 @@ class State(Message, frozen=True, omit_defaults=True):
     error: float | None = None  # [m] Σ|d − distance| over the links of the robot, by its own knowledge
     true_position: Vector | None = None  # [m] of a twin
     true_yaw: float | None = None  # [rad] of a twin
-    # poses of neighbours since the last state
-    received: list[PoseReceipt] = msgspec.field(name="heard", default_factory=list)
+    received: list[PoseReceipt] = []  # poses of neighbours since the last state
     attitude: Setpoint | None = None  # quaternion w, x, y, z, of bodies that measure more than yaw
     shadow_position: Vector | None = None  # [m] of the twin beside a real robot
     shadow_yaw: float | None = None  # [rad]
-    # goals since the last state
-    goal_receipts: list[GoalReceipt] = msgspec.field(name="followed", default_factory=list)
+    goal_receipts: list[GoalReceipt] = []  # since the last state
 
 
 class Incident(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -154,7 +150,7 @@ class Status(Message, frozen=True):
     body: str  # report of the body
     battery: float | None  # charge, 0 to 1
     sent: int  # poses
-    received: int = msgspec.field(name="heard")  # poses of neighbours
+    received: int  # poses of neighbours
     lost: dict[str, int]  # by neighbour: samples that never arrived, by their sequence numbers
     dropped: dict[str, int]  # by neighbour, if any: samples that the modelled channel dropped
     malformed: int  # refused payloads
@@ -225,7 +221,7 @@ class CentreState(Message, frozen=True):
     decisions: int
     missed: int  # decisions that were skipped because they were late
     goals: int  # sent
-    received: dict[str, int] = msgspec.field(name="heard")  # poses
+    received: dict[str, int]  # poses
     lost: dict[str, int]  # by their sequence numbers
     dropped: dict[str, int]  # by the modelled channel
     malformed: int
@@ -349,7 +345,7 @@ class RunOrder(Message, frozen=True):
 
     order: ChangeKind
     robots: list[str]
-    who: str = ""  # name of the operator
+    operator: str = ""  # name of the operator
     spare: str | None = None  # of replace: robot of the experiment file that takes over
     body: str | None = None  # of replace: address of the new body
     at: tuple[float, float] | None = None  # [m] x, y of its start
@@ -367,13 +363,13 @@ class RunReply(Message, frozen=True):
 class Stop(Message, frozen=True):
     """Emergency stop for all robots; see `read_stop`."""
 
-    who: str  # sender
+    operator: str  # name of the sender
     reason: str
 
     @property
     def words(self) -> str:
         """Reason that robots and runs report."""
-        return f"{EMERGENCY} by {self.who}" + (f": {self.reason}" if self.reason else "")
+        return f"{EMERGENCY} by {self.operator}" + (f": {self.reason}" if self.reason else "")
 
 
 class Event(Message, frozen=True):

@@ -211,7 +211,7 @@ class Detector:
         if (
             state.battery < self.battery_low
             or state.flying != self.flies
-            or t - state.heard > self.silence_s
+            or t - state.received > self.silence_s
             or state.ahead > AHEAD_S
             or state.ahead < -self.behind_s
         ):
@@ -301,7 +301,7 @@ class Detector:
             found |= 1 << Cause.BATTERY
         if self.flies and not state.flying and status.cruising:
             found |= 1 << Cause.FALLEN
-        if t - state.heard > self.silence_s:
+        if t - state.received > self.silence_s:
             found |= 1 << Cause.UNREACHABLE
         if clock_off(state.ahead, self.silence_s):
             found |= 1 << Cause.CLOCK
@@ -420,7 +420,7 @@ class Detector:
             Cause.STRAYING: lambda: (
                 f"{ascent.aside:.2f} m aside while it climbs" if ascent.carried else f"{obedience.strayed:.2f} m lately"
             ),
-            Cause.UNREACHABLE: lambda: f"for {t - state.heard:.1f} s",
+            Cause.UNREACHABLE: lambda: f"for {t - state.received:.1f} s",
             Cause.HOVERING: lambda: f"at {now.position[2]:.2f} m",
             Cause.UNSEEING: lambda: f"for {t - self.scanned:.1f} s",
             Cause.UNSTARTED: lambda: f"the conductor is gone for {t - health.conductor_lost_since:.1f} s",

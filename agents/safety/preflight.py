@@ -77,7 +77,7 @@ class Preflight:
         if state.refusal:
             yield state.refusal
         if missing:
-            yield "never heard " + ", ".join(missing)
+            yield "never received " + ", ".join(missing)
         if health.offline_since < inf:
             yield "no connection to a router"
         if now.excess > WALL_M:

@@ -128,16 +128,16 @@ class CrazyflieBody(Body):
 
     def _state(self, row: int, now: float) -> BodyState:
         telemetry, pilot = self._telemetry[row], self._pilots[row]
-        settled, heard = telemetry.settled, telemetry.pose_time - self._zero
+        settled, received = telemetry.settled, telemetry.pose_time - self._zero
         x, y, z, vx, vy, vz, yaw = telemetry.pose
         state = BodyState(
-            heard,
+            received,
             (x, y, z) if settled else UNKNOWN,
             (vx, vy, vz) if settled else UNKNOWN,
             yaw,
             battery=telemetry.battery,
             flying=telemetry.airborne,
-            heard=heard,
+            received=received,
             note=self._note(row, now),
             refusal=pilot.refusal,
             scan=self._scan(telemetry) if self._settings[row].multiranger else None,
@@ -146,7 +146,7 @@ class CrazyflieBody(Body):
             self._external[row].fill(state)
             if not settled:
                 state.position = UNKNOWN  # no flight before the estimator on board has settled
-            state.time = min(state.time, heard)  # a drone without telemetry is lost as well
+            state.time = min(state.time, received)  # a drone without telemetry is lost as well
         return state
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:

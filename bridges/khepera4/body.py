@@ -57,15 +57,15 @@ class KheperaBody(Body):
 
     def _state(self, row: int, link: Khepera4Link, t: float, now: float) -> BodyState:
         odometry = link.odometry
-        x, (vx, vy), heard = odometry.x, odometry.velocity, odometry.stamp - now + t
+        x, (vx, vy), received = odometry.x, odometry.velocity, odometry.stamp - now + t
         state = BodyState(
-            heard,
+            received,
             # unknown before the first odometry: the pose is counted by the robot, not read from the file
             (x, odometry.y, 0.0 * x),
             (vx, vy, 0.0 * vx),
             odometry.yaw,
             battery=link.battery,
-            heard=heard,
+            received=received,
             note=self._note(link, now),
             scan=self._scan(link, now, t),
         )
@@ -73,7 +73,7 @@ class KheperaBody(Body):
             self._external[row].fill(state)
             # a robot without odometry cannot be driven, even if its external position is fresh
             if now - odometry.stamp > self._settings[row].silence_s:
-                state.time = min(state.time, heard)
+                state.time = min(state.time, received)
         return state
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:

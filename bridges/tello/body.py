@@ -84,21 +84,21 @@ class TelloBody(Body):
 
     def _state(self, row: int, pilot: TelloPilot, t: float, now: float) -> BodyState:
         """State of a drone, whose pilot gets its external pose."""
-        heard = pilot.state_received - now + t
+        received = pilot.state_received - now + t
         state = BodyState(
             t,
             velocity=ZERO,
             yaw=self._start_yaw[row] + pilot.turned,
             battery=pilot.battery,
             flying=pilot.flying,
-            heard=heard,
+            received=received,
             note=pilot.note(now),
         )
         self._external[row].fill(state)
         pilot.position = state.position if t - state.time <= FRESH_S else UNKNOWN
         pilot.yaw = state.yaw
         if pilot.silent(now):  # a drone without telemetry cannot be flown, even if its external position is fresh
-            state.time = min(state.time, heard)
+            state.time = min(state.time, received)
         return state
 
     def command(self, setpoints: Sequence[Setpoint]) -> None:

@@ -142,7 +142,7 @@ class TurtleBot3(Body):
             (x, y, 0.0) if isfinite(x) else UNKNOWN,
             yaw=yaw,
             battery=robot.battery,
-            heard=t - now + robot.odometry_received,
+            received=t - now + robot.odometry_received,
             note=robot.note(now, linked),
             scan=robot.scan,
         )

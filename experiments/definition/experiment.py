@@ -394,7 +394,7 @@ class Hybrid(Part, frozen=True):
 # metrics of zenpark that a criterion can name; those of other distributions come beside them
 JUDGED: Final = (
     *("f_hz", "messages", "bytes", "iae", "itae", "rmse", "acquired_s", "updates", "lost", "dropped"),
-    *("missed_deadlines", "residual", "settle_s", "collisions", "listeners"),
+    *("missed_deadlines", "residual", "settle_s", "collisions", "receivers"),
 )
 MEAN: Final = "mean"  # over robots
 WORST: Final = "worst"  # of them

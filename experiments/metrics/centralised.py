@@ -71,7 +71,7 @@ def guidance(trace: Trace) -> Guidance | None:
         goals_hz=len(goals.sent) / duration,
         goal_bytes=int(goals_to(trace)[1].sum()),
         goals_lost=max(0, len(goals.sent) - int(goals.reached.sum())),
-        heard=int(goals.received.sum()),
+        received=int(goals.received.sum()),
         poses_lost=int(goals.lost.sum() + goals.dropped.sum()),
         **_delays(goals.delay),
         load=statistics.fmean(load) if load else None,

@@ -53,7 +53,7 @@ def with_failures(case: CaseMetrics, told: Iterable[str]) -> CaseMetrics:
 
 def lost_share(case: CaseMetrics) -> float:
     """Poses that were lost over those that receivers were to get; 0 without any."""
-    due = case.lost + sum(robot.heard for robot in case.robots)
+    due = case.lost + sum(robot.received for robot in case.robots)
     return case.lost / due if due else 0.0
 
 

@@ -192,7 +192,7 @@ def _robots(
     net, received = trace.plan.pose_links, trace.received.link
     counted = linked[net.receiver, net.sender][received]
     delivered = np.bincount(net.sender[received[counted]], minlength=rows)
-    listeners = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.received_by_centre(trace)
+    receivers = np.bincount(errors.net.sender[~guided], minlength=rows) + centralised.received_by_centre(trace)
     if trace.goals is not None:
         delivered += trace.goals.received
     goals, goal_bytes = centralised.goals_to(trace)
@@ -202,7 +202,7 @@ def _robots(
         settled = [duration if when is None else when for when in shared.settled]
     own = [[each for each in touched if name in {each.first, each.second}] for name in trace.robots]
     numbers = {  # (N,) each
-        **{"recorded": shared.transmissions[1], "listeners": listeners, "heard": delivered},
+        **{"recorded": shared.transmissions[1], "receivers": receivers, "received": delivered},
         **{"interventions": trace.interventions, "avoided": trace.avoided, "goals": goals, "goal_bytes": goal_bytes},
         "foreign": np.zeros(rows, dtype=np.intp) if trace.foreign is None else trace.foreign,
     }

@@ -59,7 +59,7 @@ class Guidance(msgspec.Struct, frozen=True):
     goals_hz: float  # [Hz]
     goal_bytes: int  # payload
     goals_lost: int  # not received by their robots; those of the last instant may still have been on their way
-    heard: int  # poses received
+    received: int  # poses received
     poses_lost: int  # poses never received: lost, or dropped by the modelled network
     # [s] from the measurement of a pose until the robot acts on the first goal that rests on it; None without goals
     delay_mean_s: float | None
@@ -106,8 +106,8 @@ class RobotMetrics(msgspec.Struct, frozen=True):
     gap_median_s: float | None  # [s] median
     gap_max_s: float | None  # [s] longest
     recorded: int  # poses in the recording
-    listeners: int  # receivers, with the central controller
-    heard: int  # poses of it received, by all receivers together
+    receivers: int  # receivers, with the central controller
+    received: int  # poses of it received, by all receivers together
     coverage: float | None  # known share of its link errors; None for laws without errors
     known: float  # share of the run in which its own position is known
     collisions: int  # contacts with robots, obstacles and walls
@@ -155,7 +155,7 @@ class Passage(msgspec.Struct, frozen=True):
 
     receiver: str
     sender: str
-    heard: int  # poses received
+    received: int  # poses received
     dropped: int  # by the modelled network
     delay_mean: float | None  # [s] from the stamp of a pose to its arrival, whatever caused it
     delay_max: float | None  # [s]

@@ -326,7 +326,7 @@ def link_passages(trace: Trace) -> tuple[Passage, ...]:
         Passage(
             receiver=trace.robots[i],
             sender=trace.robots[j],
-            heard=number,
+            received=number,
             dropped=lost,
             delay_mean=float(total[k]) / number if number else None,
             delay_max=float(longest[k]) if number else None,

@@ -52,12 +52,12 @@ UNITS: Final[dict[str, Any]] = {
         "bytes": "bytes",
     },
     "links": {
-        "listener": "row in robots",
-        "speaker": "row in robots",
+        "receiver": "row in robots",
+        "sender": "row in robots",
         "distance": "m",
         "gain": "1/(m^2 decision) for distances, 1/decision for others",
-        "relative": "m, listener less speaker",
-        "bearing": "1, from the speaker to the listener",
+        "relative": "m, receiver less sender",
+        "bearing": "1, from the sender to the receiver",
     },
     "metrics": {
         "residual": "m",
@@ -168,8 +168,8 @@ def structure(trace: Trace, metrics: CaseMetrics) -> dict[str, Any]:
     columns += [name for robot in metrics.robots[:1] for name in robot.extra]
     measured = {name: metric.unit.translate(PLAIN) for name, metric in known_metrics().items() if metric.unit}
     links = {
-        "listener": net.receiver + 1,  # MATLAB counts from 1
-        "speaker": net.sender + 1,
+        "receiver": net.receiver + 1,  # MATLAB counts from 1
+        "sender": net.sender + 1,
         "distance": net.distance,
         "gain": net.gain,
         "relative": net.relative,

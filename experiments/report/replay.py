@@ -22,7 +22,7 @@ CASES: Final = 2  # side by side
 STILL: Final = 0.6  # of the run: when the picture was taken that stands where no script runs, and in print
 STEP_S: Final = 0.1  # between two samples
 NUMBERS: Final = 300_000  # at most, of all samples: 2 MB
-QUIET: Final = ("robot", "says", "clock", "router")  # kinds of events that are not on the slider
+QUIET: Final = ("robot", "output", "clock", "router")  # kinds of events that are not on the slider
 SCRIPT: Final = Path(__file__).with_name("replay.js")
 
 

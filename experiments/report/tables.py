@@ -27,7 +27,7 @@ Column = tuple[str, Callable[[Sequence[Any]], Cell]]  # head, cell of the same r
 
 MOST_EVENTS: Final = 200
 ALIKE_S: Final = 0.2  # [s] between the same event of two cases
-ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "says", "start")  # kinds that stand folded
+ROUTINE: Final = ("adopted", "body", "clock", "ready", "robot", "router", "output", "start")  # kinds that stand folded
 MOST_COLLISIONS: Final = 100
 
 FORMATION: Final = (
@@ -343,11 +343,11 @@ def _acquired_again(robots: Sequence[RobotMetrics], k: int) -> str:
 def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """Per case: poses sent, recorded, received, lost, and dropped by a modelled network; seeds are added up."""
     columns: list[Column] = [
-        ("Receivers", lambda robots: str(robots[0].listeners) if len({r.robot for r in robots}) == 1 else ""),
+        ("Receivers", lambda robots: str(robots[0].receivers) if len({r.robot for r in robots}) == 1 else ""),
         ("Sent", _cell(sum, "messages")),
         ("Recorded", _cell(sum, "recorded")),
-        ("To be received", lambda robots: number(sum(robot.messages * robot.listeners for robot in robots))),
-        ("Received", _cell(sum, "heard")),
+        ("To be received", lambda robots: number(sum(robot.messages * robot.receivers for robot in robots))),
+        ("Received", _cell(sum, "received")),
         ("Lost", _cell(sum, "lost")),
         ("Dropped", _cell(sum, "dropped")),
     ]
@@ -360,7 +360,7 @@ def proof_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     """For each case with a modelled network the fate of the poses on each link; several seeds are added up."""
     columns: list[Column] = [
-        ("Received", _cell(sum, "heard")),
+        ("Received", _cell(sum, "received")),
         ("Dropped", _cell(sum, "dropped")),
         ("Share [%]", lambda links: number(dropped_share(links))),
         ("Mean delay [ms]", lambda links: number(mean_delay(links), 1e3)),
@@ -375,15 +375,15 @@ def network_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
 def dropped_share(links: Sequence[Passage]) -> float | None:
     """Share of the poses on some links that the modelled network dropped [%]; None without poses."""
     dropped = sum(link.dropped for link in links)
-    every = dropped + sum(link.heard for link in links)
+    every = dropped + sum(link.received for link in links)
     return 100.0 * dropped / every if every else None
 
 
 def mean_delay(links: Sequence[Passage]) -> float | None:
     """Mean delay over all poses received on some links [s]; None without poses."""
-    heard = sum(link.heard for link in links)
-    total = sum(link.heard * link.delay_mean for link in links if link.delay_mean is not None)
-    return total / heard if heard else None
+    received = sum(link.received for link in links)
+    total = sum(link.received * link.delay_mean for link in links if link.delay_mean is not None)
+    return total / received if received else None
 
 
 def clearance_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:

@@ -202,7 +202,7 @@ def _modelled(name: str, runs: Sequence[CaseMetrics]) -> Finding | None:
         return None
     links = [link for run in runs for link in run.passages]
     dropped = sum(link.dropped for link in links)
-    every = dropped + sum(link.heard for link in links)
+    every = dropped + sum(link.received for link in links)
     text = f"The modelled network dropped {number(dropped)} of {number(every)} samples in {name}"
     text += f" ({number(dropped_share(links))} %)" if dropped else ""
     mean = mean_delay(links)

@@ -39,7 +39,7 @@ EVENTS: Final = 12
 LINKS: Final = 30  # rows
 FEW_MISSED: Final = 0.01  # share of ticks; more are shown in red
 NONE: Final = "–"  # error of a robot that receives on no link
-QUIET: Final = ("says",)  # kinds of events that are not shown
+QUIET: Final = ("output",)  # kinds of events that are not shown
 # the panel of a narrow page, which viser makes 20 em wide
 WHOLE_WIDTH: Final = "<style>@media(max-width:36em){[style*='width: 20em']{width:100%!important}}</style>"
 

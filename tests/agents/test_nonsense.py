@@ -39,7 +39,7 @@ class Nonsense:
         state = BodyState(
             t + self.number(0.02), self.numbers(3, 1.5), self.numbers(3, 0.5), self.number(3.0),
             battery=self.number(), flying=flies and self.happens(0.7), attitude=self.numbers(4),
-            ahead=self.number(0.1), heard=t - self.number(0.1),
+            ahead=self.number(0.1), received=t - self.number(0.1),
         )  # fmt: skip
         if self.happens(0.1):
             state.scan = RangeScan(t - self.number(0.1), *(self.numbers(5, size) for size in (3.0, 0.3, 2.0)))

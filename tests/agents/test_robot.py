@@ -42,7 +42,7 @@ def test_nothing_is_known_of_unreceived_robots():
 def test_missing_neighbour_is_named():
     bench = alone()
     bench.step()
-    assert (bench.life.phase, bench.life.reason) == (IDLE, "never heard B")
+    assert (bench.life.phase, bench.life.reason) == (IDLE, "never received B")
     assert bench.robot.missing_neighbours() == ["B"]
     bench.position = (nan, 0.0, 0.0)
     assert bench.step().life.reason == "no position of its own"

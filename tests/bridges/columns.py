@@ -3,8 +3,8 @@
 import numpy as np
 
 VALUES = (
-    "time", "position", "velocity", "yaw", "true_position", "true_yaw", "battery", "flying", "heard", "note", "refusal",
-    "scan",
+    "time", "position", "velocity", "yaw", "true_position", "true_yaw", "battery", "flying", "received", "note",
+    "refusal", "scan",
 )  # fmt: skip
 
 

@@ -133,7 +133,7 @@ def faults():
     killed.kill()
     aged = flight.until(lambda: flight.tick * TICK - flight.state.time[2] > 0.5, PATIENCE_S)
     said["killed"] = flight.state.note[2]
-    said["silence"] = (flight.tick * TICK - flight.state.heard)[[0, 2]].tolist()
+    said["silence"] = (flight.tick * TICK - flight.state.received)[[0, 2]].tolist()
     body.land([2])
     flight.until(lambda: flight.tick * TICK - flight.state.time[1] > 0.5, PATIENCE_S)
     said["silent"] = flight.state.note[1]

@@ -134,7 +134,7 @@ def test_lost_poses_and_goals_are_counted(cases):
     sent = sum(robot.messages for robot in case.robots)
     assert late.poses_lost / sent == pytest.approx(0.2, abs=0.02)
     assert case.lost == 0, "the real network lost nothing"
-    assert late.heard + late.poses_lost == pytest.approx(sent, abs=7)  # the last ones are under way
+    assert late.received + late.poses_lost == pytest.approx(sent, abs=7)  # the last ones are under way
     assert case.acquired_s == (None, None)
     assert max(robot.worst is None for robot in case.robots) is False
 
@@ -178,13 +178,13 @@ def test_messages_of_the_whole_network_are_counted_alike(cases):
     assert distributed.deliveries == 21 * 200
     assert centralised.network_messages == centralised.deliveries == poses + 7 * 40
     # of 21 links 10 are those of KH02, CF02, CF03; the centre hears all but the leader
-    listened = {robot.robot: robot.listeners for robot in hybrid.robots}
+    listened = {robot.robot: robot.receivers for robot in hybrid.robots}
     links = Plan(with_delay(park, 0.0, HYBRID)).pose_links
     assert hybrid.deliveries == (len(links) + 6) * 200 + 3 * 40
     assert sum(listened.values()) == len(links) + 6
     assert centralised.guidance.goals_hz == pytest.approx(70.0)
     assert centralised.network_bytes > distributed.network_bytes
-    assert {robot.heard for robot in centralised.robots} == {200}
+    assert {robot.received for robot in centralised.robots} == {200}
     assert [robot.goals for robot in hybrid.robots] == [0, 0, 40, 0, 0, 40, 40]
     assert hybrid.guidance.guided == ("KH02", "CF02", "CF03")
 

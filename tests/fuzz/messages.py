@@ -78,7 +78,7 @@ def of_all() -> dict[str, list[object]]:
         KEYS.clock: [messages.HostClock("lab1", now, 0.2, 0.001, ["KH01"], 0.2)],
         KEYS.world_order: list(orders),
         KEYS.run_order: [
-            messages.RunOrder("remove", ["KH01"], who="ana"),
+            messages.RunOrder("remove", ["KH01"], operator="ana"),
             messages.RunOrder("remove", ["KH01", "KH02"]),
             messages.RunOrder("restart", ["CF01"]),
             messages.RunOrder("add", ["nobody"]),

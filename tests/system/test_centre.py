@@ -109,7 +109,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
     robots = [RobotProcess(router.endpoint, file, name) for name in ("TB01", "KH01", "KH02")]
     watcher = Watcher(router.endpoint)
     watcher.until(lambda: len(watcher.status) == 3, "they are there")
-    watcher.until(lambda: "never heard centre" in watcher.status["KH01"].reason, "they wait for the centre")
+    watcher.until(lambda: "never received centre" in watcher.status["KH01"].reason, "they wait for the centre")
     assert watcher.status["KH01"].missing == ["centre"]
     command = [sys.executable, "-m", "experiments.real_time.processes.centre", str(file), "--connect", router.endpoint]
     centre = subprocess.Popen(

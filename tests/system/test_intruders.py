@@ -213,7 +213,7 @@ def test_a_wildcard_that_may_be_asked_is_answered_by_all(laboratory: Laboratory,
 @pytest.mark.parametrize("who", ["KH03", "observer", "recorder", "world"])
 def test_robots_are_changed_by_operators_only(laboratory: Laboratory, who: str) -> None:
     """Somebody else neither asks the conductor for a change, nor answers in its place."""
-    order = messages.RunOrder("remove", ["CF01"], who="operator")
+    order = messages.RunOrder("remove", ["CF01"], operator="operator")
     with laboratory.session(who) as session:
         false = pubsub.Orders(session, KEYS.run_order, messages.RunOrder)
         reply = orders.send_run_order(laboratory.watcher.session, KEYS, order, 0.5)

@@ -129,7 +129,7 @@ def test_a_silent_missing_link_is_named() -> None:
         watcher = Watcher(*right)
         stack.callback(watcher.close)
         watcher.until(lambda: watcher.phase("CF01") == "ready", "it hears both")
-        watcher.until(lambda: watcher.status["KH02"].reason == "never heard KH01", "and KH02 says whom it does not")
+        watcher.until(lambda: watcher.status["KH02"].reason == "never received KH01", "and KH02 says whom it does not")
         assert watcher.phase("KH02") == watcher.phase("KH01") == "idle"
         assert not watcher.order("KH02", messages.Order("takeoff")).ok
 

@@ -90,7 +90,7 @@ def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
         for name in ("KH01", "KH02"):
             watcher.until(lambda name=name: name in watcher.status, "it says something")
             watcher.until(lambda name=name: watcher.status[name].missing == ["CF01"], "two hear each other")
-            assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never heard CF01")
+            assert (watcher.phase(name), watcher.status[name].reason) == ("idle", "never received CF01")
         late = fly(stack, router, "triangle", "CF01")
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
         late.kill()

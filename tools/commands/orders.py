@@ -157,7 +157,7 @@ def _change_command(what: messages.ChangeKind) -> Callable[..., int]:
     def change(names: Names, *, by: Operator) -> int:
         from agents.network.messages import RunOrder
 
-        return _change(RunOrder(what, names, who=by.identity), by)
+        return _change(RunOrder(what, names, operator=by.identity), by)
 
     return with_options(change)
 
@@ -195,7 +195,7 @@ def replace(
     """Let another body take over a robot's name, links and plan; by default a spare of its kind."""
     from agents.network.messages import RunOrder
 
-    return _change(RunOrder("replace", [name], who=by.identity, spare=spare, body=body, at=at, yaw=yaw), by)
+    return _change(RunOrder("replace", [name], operator=by.identity, spare=spare, body=body, at=at, yaw=yaw), by)
 
 
 def _tell_world(order: messages.WorldOrder, done: str, by: Operator) -> int:

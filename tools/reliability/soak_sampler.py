@@ -66,7 +66,7 @@ class Row(msgspec.Struct, frozen=True):
     ticks: int | None = None
     malformed: int | None = None  # payloads that it refused
     # poses received since the sample before
-    heard: int | None = None
+    received: int | None = None
     delay_s: float | None = None  # median from sender to receiver [s]
     longest_s: float | None = None  # the largest delay [s]
 
@@ -164,7 +164,7 @@ class Sampler(ExitStack):
                     missed=statuses[0].missed,  # the process counts these, not the robot
                     ticks=statuses[0].ticks,
                     malformed=statuses[0].malformed,
-                    heard=len(delays),
+                    received=len(delays),
                     delay_s=round(delays[len(delays) // 2], 6) if delays else None,
                     longest_s=round(delays[-1], 6) if delays else None,
                 )

@@ -73,7 +73,7 @@ def judge(soaked: Soaked) -> list[Finding]:
         grown = ", ".join(f"{process} +{after - first}" for process, (first, after) in counts.items() if after > first)
         add(grown and f"{what} grow: {grown}", f"{what} do not grow")
     lost = ", ".join(f"{process} {row.lost}" for process, row in last.items() if row.lost)
-    received = sum(row.heard or 0 for row in soaked.rows)
+    received = sum(row.received or 0 for row in soaked.rows)
     untested = "" if received else "no pose was received: nothing was tested"
     add(f"lost poses: {lost}" if lost else untested, f"0 of {received} poses were lost")
     if malformed := total("malformed"):

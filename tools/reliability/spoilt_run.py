@@ -225,7 +225,7 @@ class SpoiltRun:
 
     def restart(self, robot: str, session: zenoh.Session) -> None:
         """Have the conductor start a robot again; do not wait for that."""
-        order = messages.RunOrder("restart", [robot], who="chaos")
+        order = messages.RunOrder("restart", [robot], operator="chaos")
 
         def ask() -> None:
             self.answer = orders.send_run_order(session, self._keys, order)

@@ -107,7 +107,7 @@ class HotChanges:
         if self._losses[name] > RESTARTS:
             self._view.report("given up", name, f"lost {self._losses[name]} times")
             return
-        self._begin(_Asked(messages.RunOrder(policy, names, who="on_loss")))
+        self._begin(_Asked(messages.RunOrder(policy, names, operator="on_loss")))
 
     def advance(self) -> None:
         """Take new orders, continue the changes under way, and answer those that are done."""
@@ -160,7 +160,7 @@ class HotChanges:
         left = list(dict.fromkeys(asked.order.robots))
         if asked.query is not None:
             self._pending.append(asked)
-        who = asked.order.who[:50]
+        who = asked.order.operator[:50]
         operator = who if who and who.isprintable() else "an operator"
         while left:
             names = tuple(name for name in left if name in self._processes.companions(left[0]))
@@ -261,7 +261,7 @@ class HotChanges:
                 f"then `./zenpark robot add {' '.join(foreign)}`"
             )
         self._require_whole(names)
-        automatic = order.who == "on_loss"
+        automatic = order.operator == "on_loss"
         places = {
             name: tuple(processes.place(name)) for name in names if processes.robot(name).body == replacement.TWIN
         }
@@ -279,7 +279,7 @@ class HotChanges:
         next_one, spare = self._spares.successor(name, self._processes.robot(name), order)
         if next_one.body == replacement.TWIN:
             places = {name: tuple(self._processes.place(name, next_one))}
-            yield from self._room(places, ROOM_S if order.who == "on_loss" else 0.0, body_stays=True)
+            yield from self._room(places, ROOM_S if order.operator == "on_loss" else 0.0, body_stays=True)
         yield from self._leave(names)
         self._processes.start_again(names, {name: next_one})
         if spare is not None:

@@ -34,7 +34,7 @@ MISSED_S: Final = 1.0  # a robot that changes from one router to another is back
 STILL_S: Final = 3.0  # a recorder without a token for longer than this is killed, and started again
 # beginnings of reasons for a landing that a user or the conductor wanted; every other one is a fault
 ASKED: Final = (FINISHED, "ordered to ", messages.EMERGENCY, TOLD_TO_END)
-OUTPUT: Final = "says"  # kind of the events that are a line of a process's output
+OUTPUT: Final = "output"  # kind of the events that are a line of a process's output
 
 
 @dataclass

@@ -44,11 +44,6 @@ class Codec(Generic[S]):
     decode: Callable[[bytes], S]  # the way back; raises `Undecodable`
 
 
-def type_name(kind: type[msgspec.Struct]) -> str:
-    """Name of the message type of a struct: its own, or the one that recordings have always had."""
-    return getattr(kind, "RECORDED_AS", kind.__name__)
-
-
 @cache
 def codec(kind: type[S]) -> Codec[S]:
     """The message type of a struct.
@@ -63,7 +58,7 @@ def codec(kind: type[S]) -> Codec[S]:
     encode, decode = writer.functions(rebuilt)
     first, *others = writer.definitions.items()
     texts = [first[1], *(f"MSG: {name}\n{text}" for name, text in others)]
-    return Codec(f"{PACKAGE}/msg/{type_name(kind)}", SEPARATOR.join(texts), encode, decode)
+    return Codec(f"{PACKAGE}/msg/{kind.__name__}", SEPARATOR.join(texts), encode, decode)
 
 
 SEPARATOR: Final = "=" * 80 + "\n"
@@ -113,7 +108,7 @@ class _Writer:
         assert isinstance(info, mi.StructType)
         if not info.fields:
             raise TypeError(f"{kind.__name__} has no fields; a ROS message needs at least one")
-        made, own = self._name("T", kind), f"{PACKAGE}/{type_name(kind)}"
+        made, own = self._name("T", kind), f"{PACKAGE}/{kind.__name__}"
         self.definitions[own] = self.definitions.get(own, "")  # before those inside it
         parts, lines = [], []
         for field in info.fields:
@@ -139,7 +134,7 @@ class _Writer:
         """Puts the expression `value`; returns the expression that rebuilds it, and its type in ROS."""
         match kind:
             case mi.StructType(cls=cls):
-                return self.struct(cls, value), f"{PACKAGE}/{type_name(cls)}"
+                return self.struct(cls, value), f"{PACKAGE}/{cls.__name__}"
             case mi.StrType():
                 return self._text(value), "string"
             case mi.BoolType() | mi.IntType() | mi.FloatType():

@@ -46,7 +46,7 @@ def running(name="A"):
 
 def test_ready_once_the_centre_is_known():
     bench = guided().step()
-    assert (bench.life.phase, bench.life.reason) == (IDLE, "never heard centre")
+    assert (bench.life.phase, bench.life.reason) == (IDLE, "never received centre")
     assert bench.robot.missing_neighbours() == ["centre"]
     guide(bench)
     assert bench.step().life.phase == READY

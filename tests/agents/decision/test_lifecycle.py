@@ -218,8 +218,8 @@ def test_idle_robot_tells_what_it_waits_for():
     robot = Life()
     robot.ready = False
     robot.step()
-    robot.life.set_missing("never heard KH01")
-    assert robot.life.takeoff() == "cannot take off while idle: never heard KH01"
+    robot.life.set_missing("never received KH01")
+    assert robot.life.takeoff() == "cannot take off while idle: never received KH01"
     robot.ready = True
     robot.step()
     assert (robot.life.phase, robot.life.reason) == (READY, "")

@@ -102,7 +102,7 @@ def test_damaged_message_is_decoded_or_malformed(encoding, message, data):
 @given(st.binary(max_size=200), st.sampled_from([JSON, MSGPACK, "zenoh/bytes", "text/plain", ""]))
 def test_any_payload_is_a_stop_with_printable_text(payload, mime):
     stop = wire.read_stop(payload, mime)
-    assert stop.who
+    assert stop.operator
     assert stop.words.isprintable()
 
 
@@ -214,7 +214,7 @@ def test_unknown_numbers_are_left_out(encoding):
         wire.position("A", 1000.0, [0.1, 0.2, 0.3], math.nan),
     ):
         payload = wire.encode(said, encoding)
-        assert not any(word in payload for word in (b"null", b"velocity", b"yaw", b"heard"))
+        assert not any(word in payload for word in (b"null", b"velocity", b"yaw", b"received"))
         assert wire.decode(payload, wire.MIME[encoding], type(said)) == said
 
 

@@ -497,7 +497,7 @@ def test_a_killed_robot_is_noticed(router, eventually):
 @pytest.mark.mechanism("emergency stop before everything else that came")
 @pytest.mark.system
 def test_alarm_is_obeyed_at_once_and_keeps_orders(router, eventually):
-    whole = b'{"who": "ana", "reason": "fire"}'
+    whole = b'{"operator": "ana", "reason": "fire"}'
     said = [  # by zenpark; by z_put and zenoh-cli; by `curl -X PUT -d`, with a header, with --json; by anything at all
         (whole, JSON, "by ana: fire"),
         (whole, "zenoh/bytes", "by ana: fire"),
@@ -505,10 +505,10 @@ def test_alarm_is_obeyed_at_once_and_keeps_orders(router, eventually):
         (b"stop", "application/x-www-form-urlencoded", "by an unknown sender: stop"),
         (b"stop it", "text/plain", "by an unknown sender: stop it"),
         (b'"stop"', JSON, "by an unknown sender: stop"),
-        (b'{"who": "ana"}', JSON, "by ana"),
+        (b'{"operator": "ana"}', JSON, "by ana"),
         (b"{}", JSON, "by an unknown sender: {}"),
         (b"", "zenoh/bytes", "by an unknown sender"),
-        (b"\x81\xa3who\xa3ana", MSGPACK, "by ana"),
+        (b"\x81\xa8operator\xa3ana", MSGPACK, "by ana"),
         (b"\xff\x00\x1b[2J", "image/png", "by an unknown sender: \N{REPLACEMENT CHARACTER}  [2J"),
     ]
     with open_session([router.endpoint], name="CF01") as robot, open_session([router.endpoint], name="ui") as ui:

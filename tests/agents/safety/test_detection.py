@@ -41,8 +41,8 @@ BODY = {  # values of the body: causes of a drone that cruises at 0.5 m, and the
     "empty": ({"battery": 0.09}, {Cause.BATTERY}, "9% (limit 10%)"),
     "no gauge": ({"battery": NAN}, set(), ""),
     "down": ({"flying": False}, {Cause.FALLEN}, "its motors are off"),
-    "silent": ({"heard": 0.4}, {Cause.UNREACHABLE}, "for 0.6 s"),
-    "no device": ({"heard": NAN}, set(), ""),
+    "silent": ({"received": 0.4}, {Cause.UNREACHABLE}, "for 0.6 s"),
+    "no device": ({"received": NAN}, set(), ""),
     "ahead": ({"ahead": 0.11}, {Cause.CLOCK}, "positions of A are stamped 0.11 s ahead"),
     "behind": ({"ahead": -0.3}, {Cause.CLOCK}, "positions of A are stamped 0.3 s behind"),
     "late": ({"ahead": -0.2}, set(), ""),
@@ -419,7 +419,7 @@ vector = st.tuples(number, number, number)
             optional={
                 "position": vector, "velocity": vector, "yaw": number, "setpoint": st.tuples(*[number] * 4),
                 "attitude": st.tuples(*[number] * 4), "battery": number, "time": number, "ahead": number,
-                "heard": number, "flying": st.booleans(), "flags": st.booleans(), "status": st.booleans(),
+                "received": number, "flying": st.booleans(), "flags": st.booleans(), "status": st.booleans(),
             },
         ),
         max_size=6,
@@ -436,7 +436,7 @@ def test_any_numbers_are_judged_and_worded(kind, story):
             setattr(robot.status, name, values.get("status", False))
         flags = {"invalid": values.get("flags", False), "outside": values.get("flags", False)}
         robot.misplace(**flags)
-        names = ("attitude", "battery", "time", "ahead", "heard", "flying")
+        names = ("attitude", "battery", "time", "ahead", "received", "flying")
         robot.values |= {name: values[name] for name in names if name in values}
         robot.step(0.35)
         assert all(isinstance(robot.words(cause), str) for cause in robot.found)

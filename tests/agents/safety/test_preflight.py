@@ -68,7 +68,7 @@ FAILURES = {
     "carried": ({"velocity": (0.0, 0.4, 0.3)}, "it is not at rest: 0.50 m/s"),
     "upside down": ({"attitude": leant(math.pi)}, "it is not level: it leans 180°"),
     "empty": ({"battery": 0.15}, "its battery is at 15%, less than 20%"),
-    "alone": ({"missing": ("G", "centre")}, "never heard G, centre"),
+    "alone": ({"missing": ("G", "centre")}, "never received G, centre"),
 }
 
 

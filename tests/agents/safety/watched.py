@@ -49,7 +49,7 @@ class Watched:
             if every_tick is not None:
                 every_tick(self)
             self.neighbours.update_active(self.t)
-            given = {"time": self.t, "heard": self.t, **self.values}
+            given = {"time": self.t, "received": self.t, **self.values}
             state = BodyState(position=self.position, velocity=self.velocity, yaw=self.yaw, **given)
             self.now.state = state
             self.detector.sees = self.detector.sees or (self.avoids and state.scan is not None)

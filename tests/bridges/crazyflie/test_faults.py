@@ -73,8 +73,8 @@ def test_faulty_drones_fail_differently_while_others_fly_on():
         assert any("landed: battery low" in note for note in said[empty])
         assert any("link lost" in note for note in said[killed])
         assert process.t - process.state.time[mute] > 0.5  # the robot's loop sees how old its position is,
-        assert process.t - process.state.heard[mute] > 0.5  # and that its device is silent
-        process.until(lambda: process.t - process.state.heard[well] < 0.5, "the one that is well is heard")
+        assert process.t - process.state.received[mute] > 0.5  # and that its device is silent
+        process.until(lambda: process.t - process.state.received[well] < 0.5, "the one that is well is heard")
         assert not any("landed" in note or "link lost" in note for note in said[well])
         assert process.state.flying[: lossy + 1].all(), said[lossy]
         process.until(

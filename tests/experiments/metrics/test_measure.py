@@ -167,7 +167,7 @@ def test_an_overtaken_pose_is_not_believed():
 def test_transmissions_rates_and_gaps():
     measured = measure.measure(moving())
     leader, other = measured.robots
-    assert (leader.messages, leader.bytes, leader.listeners, leader.heard) == (20, 2000, 1, 20)
+    assert (leader.messages, leader.bytes, leader.receivers, leader.received) == (20, 2000, 1, 20)
     assert leader.f_hz == pytest.approx(1.0)
     assert (leader.gap_min_s, leader.gap_median_s, leader.gap_max_s) == pytest.approx((1.0, 1.0, 1.0))
     assert (other.messages, other.gap_median_s) == (0, None)

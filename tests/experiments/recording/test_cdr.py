@@ -223,8 +223,8 @@ def test_the_schema_is_ros2msg():
     text = codec(State).schema
     assert text.startswith("string robot\nint64 seq\nfloat64 stamp\n")
     assert "float64[4] setpoint\n" in text
-    assert "zenpark_msgs/Heard[] heard\n" in text
-    assert f"{'=' * 80}\nMSG: zenpark_msgs/Heard\nstring speaker\n" in text
+    assert "zenpark_msgs/PoseReceipt[] received\n" in text
+    assert f"{'=' * 80}\nMSG: zenpark_msgs/PoseReceipt\nstring sender\n" in text
 
 
 def test_definitions_stand_once_however_often_they_are_used():

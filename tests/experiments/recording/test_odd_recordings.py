@@ -13,7 +13,11 @@ from tests.experiments.recordings import START, begun, landed, seconds, state, w
 def _figures(path, *messages, **more):
     write(path, *messages, **more)
     case = measure(read(path).trace)
-    return [(robot.iae, robot.messages, robot.heard, robot.known) for robot in case.robots], case.deliveries, case.lost
+    return (
+        [(robot.iae, robot.messages, robot.received, robot.known) for robot in case.robots],
+        case.deliveries,
+        case.lost,
+    )
 
 
 @pytest.fixture

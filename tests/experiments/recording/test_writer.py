@@ -56,8 +56,8 @@ def test_others_read_it(path):
         seen = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
     states = [message for topic, _, message in seen if topic == "/CF01/state"]
     assert [message.seq for message in states] == list(range(1, 12))
-    assert states[5].heard[0].speaker == "TB01"
-    assert states[5].heard[0].position.tolist() == [0.45, 0.0, 0.0]
+    assert states[5].received[0].sender == "TB01"
+    assert states[5].received[0].position.tolist() == [0.45, 0.0, 0.0]
     assert math.isnan(states[5].true_yaw)
     drawn = [(t, message) for topic, t, message in seen if topic == "/TB01/true_pose"]
     assert drawn[3][0] == round((START + 0.3) * 1e9)

@@ -80,8 +80,8 @@ def test_who_spoke_and_who_listens_count_from_one(flown, mat):
     assert read["sent"]["robot"].tolist() == (trace.sent.link + 1.0).tolist()
     assert read["sent"]["position"] == pytest.approx(trace.sent.position, abs=1e-6)
     net = trace.plan.links
-    assert read["links"]["listener"].tolist() == (net.receiver + 1.0).tolist()
-    assert read["links"]["speaker"].tolist() == (net.sender + 1.0).tolist()
+    assert read["links"]["receiver"].tolist() == (net.receiver + 1.0).tolist()
+    assert read["links"]["sender"].tolist() == (net.sender + 1.0).tolist()
     assert read["links"]["distance"].tolist() == net.distance.tolist()
     assert (np.diag(read["adjacency"].sum(axis=1)) - read["adjacency"]).tolist() == laplacian(net, 3).tolist()
     assert min(read["sent"]["robot"]) >= 1.0
@@ -133,7 +133,7 @@ def test_what_links_ask_for_besides_distances_is_told():
     run = simulate(read)
     made = structure(run.traces["default"], run.metrics["default"])
     assert made["links"]["relative"][0, :2].tolist() == [0.8, 0.1]  # KH02 from KH01
-    assert (made["links"]["listener"].tolist(), made["links"]["speaker"].tolist()) == ([2.0], [1.0])
+    assert (made["links"]["receiver"].tolist(), made["links"]["sender"].tolist()) == ([2.0], [1.0])
     assert made["adjacency"].tolist() == [[0.0, 0.0], [1.0, 0.0]]
 
 

@@ -36,12 +36,12 @@ def test_dropped_differs_from_lost(run):
     links = {(each.sender, each.receiver): each for each in measured.passages}
     assert len(links) == 21
     spared = links["TB01", "KH01"]
-    assert (spared.dropped, spared.heard) == (0, 200)  # that of the end is under way; one from before the start came
+    assert (spared.dropped, spared.received) == (0, 200)  # that of the end is under way; one from before the start came
     assert (spared.delay_mean, spared.delay_max) == (pytest.approx(0.03), pytest.approx(0.03))
     for ends, each in links.items():
         if ends != ("TB01", "KH01"):
             assert each.dropped == pytest.approx(40, abs=24)
-            assert each.heard + each.dropped == pytest.approx(200, abs=4)
+            assert each.received + each.dropped == pytest.approx(200, abs=4)
             assert each.delay_mean == pytest.approx(0.05)
     assert measured.dropped == sum(each.dropped for each in measured.passages)
     of = {robot.robot: robot.dropped for robot in measured.robots}
@@ -88,5 +88,5 @@ def test_recording_keeps_dropped_poses(tmp_path, run):
     np.testing.assert_array_equal(read.lost, 0)
     one, other = measure(read).passages, measure(trace).passages
     for a, b in zip(one, other, strict=True):
-        assert (a.heard, a.dropped) == (b.heard, b.dropped)
+        assert (a.received, a.dropped) == (b.received, b.dropped)
         assert a.delay_mean == pytest.approx(b.delay_mean, abs=1e-5)

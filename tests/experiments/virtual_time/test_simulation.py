@@ -168,7 +168,7 @@ def test_the_reference_formation_is_acquired():
 
 def test_who_hears_nobody_is_named(monkeypatch):
     monkeypatch.setattr("experiments.virtual_time.conductor.PATIENCE_S", 5.0)
-    with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never heard B\)"):
+    with pytest.raises(Stuck, match=r"not ready after 5 s: A, B \(never received B\)"):
         simulate(Plan(ground(channel=Channel(delay_s=100.0))), 1)
 
 

@@ -25,7 +25,7 @@ def soaked(change=None, *, until=SPAN, **more):
             fields = {"rss_mb": 60.0, "threads": 5, "files": 10, "cpu_s": 0.02 * t}
             if name in ROBOTS:
                 fields |= {"lost": 0, "missed": 0, "ticks": 100 * k, "malformed": 0}
-                fields |= {"heard": 5, "delay_s": 0.002, "longest_s": 0.01}
+                fields |= {"received": 5, "delay_s": 0.002, "longest_s": 0.01}
             if change is not None:
                 fields |= change(name, t)
             rows.append(Row(t, name, **fields))
@@ -63,7 +63,7 @@ def test_pools_that_fill_in_the_first_minutes_of_a_short_run_do_not_count():
         (lambda name, t: {"lost": int(t > 1800.0)} if name == "CF02" else {}, "lost poses: CF02 1"),
         (lambda name, t: {"malformed": 3} if name == "CF02" else {}, "3 payloads were refused"),
         (lambda name, t: {"delay_s": 0.002 + t / 1e5} if name in ROBOTS else {}, "delay of poses"),
-        (lambda name, t: {"heard": 0} if name in ROBOTS else {}, "no pose was received"),
+        (lambda name, t: {"received": 0} if name in ROBOTS else {}, "no pose was received"),
     ],
 )
 def test_what_was_planted_is_found(change, said):
