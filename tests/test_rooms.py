@@ -50,8 +50,6 @@ tools.terminal
 tools.live_table tools.consent
 tools.progress tools.completion
 tools.commands
-tools.reliability
-tools.bench
 tools.main
 tools.guard
 """

@@ -1,4 +1,4 @@
 """The command line and what it offers beyond running an experiment.
 
-May import: agents, twins, bridges, experiments, tools.commands, tools.bench, tools.reliability.
+May import: agents, twins, bridges, experiments, tools.commands.
 """

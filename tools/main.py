@@ -16,10 +16,8 @@ import typer
 from typer.models import CommandInfo
 
 from agents.errors import ExplainedError
-from tools.bench import bench
 from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
 from tools.commands.options import Command, Group, example, print_json, warn
-from tools.reliability import chaos, soak
 
 
 def _exit(code: object, **_: object) -> None:
@@ -36,7 +34,7 @@ app: Final = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _module in (run, results, view, sweep, check, soak, chaos, bench, processes, network, orders):
+for _module in (run, results, view, sweep, check, processes, network, orders):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
 app.add_typer(lab.app, name="cert")
@@ -135,12 +133,19 @@ def part_for(words: Sequence[str], whole: typer.Typer = app) -> typer.Typer:
 
 
 def main() -> None:
-    """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C."""
+    """Run the command of the command line."""
+    call(app if COMPLETING in os.environ else part_for(sys.argv[1:]))
+
+
+def call(command: typer.Typer, name: str = "zenpark") -> None:
+    """Run a command. Exit codes: its own, 2 for what the user can mend, 130 for Ctrl-C.
+
+    Args:
+        name: Words before its arguments.
+    """
     try:
         try:
-            words = sys.argv[1:]
-            called = app if COMPLETING in os.environ else part_for(words)
-            sys.exit(called(prog_name="zenpark", standalone_mode=False))
+            sys.exit(command(prog_name=name, standalone_mode=False))
         finally:
             with suppress(BrokenPipeError):
                 sys.stdout.flush()  # a full disk shows here at the latest

@@ -1,1 +1,1 @@
-"""Benchmarks of zenpark beside other simulators, and of its growth; ratios within one run, kept out of the tests."""
+"""Speed of zenpark (`./zenpark test --bench`), also beside other simulators; ratios within one run."""

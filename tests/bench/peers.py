@@ -27,7 +27,7 @@ from typing import Any
 from agents.user_folder import cache_folder
 from experiments.file import document
 from tests.bench.drivers import peer_zenpark, ring
-from tools.bench.process import FLIGHT_S, process
+from tests.bench.process import FLIGHT_S, process
 
 ROOT = Path(__file__).resolve().parents[2]
 DRIVERS = "tests.bench.drivers"

@@ -10,12 +10,15 @@ import typer.main
 
 from experiments.check.check import check
 from experiments.file import document
+from tests.__main__ import MEASUREMENTS
+from tests.__main__ import command as measurement
 from tests.docs.test_references import PAGES, ROOT, TOPS
 from tools.main import app
 
 COMMAND = re.compile(r"^ {4,}\./zenpark (?P<words>[^#\n]*)", re.MULTILINE)
 BLOCK = re.compile(r"^```toml\n(title = .*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND_LINE = typer.main.get_command(app)
+MEASURING = {option: typer.main.get_command(measurement(option)) for option in MEASUREMENTS}  # behind `./zenpark test`
 
 
 def commands(page) -> list[str]:
@@ -27,6 +30,8 @@ def commands(page) -> list[str]:
 def parse(words: list[str]) -> None:
     """Raises a usage error if the command line does not know a command or an option."""
     command, name = COMMAND_LINE, "zenpark"
+    if words[:1] == ["test"] and MEASURING.keys() & words[1:2]:
+        (_, name, *words), command = words, MEASURING[words[1]]
     while hasattr(command, "commands") and words and not words[0].startswith("-"):
         name, *words = words
         command = command.commands[name]
@@ -61,7 +66,14 @@ def _leaves(command, path=()):
 
 
 @pytest.mark.parametrize(
-    ("path", "command"), [pytest.param(*each, id=" ".join(each[0])) for each in _leaves(COMMAND_LINE)]
+    ("path", "command"),
+    [
+        pytest.param(path, command, id=" ".join(path))
+        for path, command in (
+            *_leaves(COMMAND_LINE),
+            *((("test", option), command) for option, command in MEASURING.items()),
+        )
+    ],
 )
 def test_help_of_commands_ends_with_valid_examples(path, command):
     lines = [line.strip() for line in (command.epilog or "").splitlines() if "./zenpark" in line]

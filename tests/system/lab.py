@@ -46,10 +46,12 @@ NEAR_TRIANGLE = [
 ]  # fmt: skip
 
 
-def zenpark(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+def zenpark(
+    *arguments: object, timeout_s: float = 60.0, module: str = "tools.guard"
+) -> subprocess.CompletedProcess[str]:
     """A command of zenpark, to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "tools.guard", *map(str, arguments)],
+        [sys.executable, "-m", module, *map(str, arguments)],
         cwd=ROOT,
         env=ENVIRONMENT,
         stdin=subprocess.DEVNULL,

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.system
 
 
 def chaos(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return zenpark("chaos", *arguments, "--out", folder, timeout_s=150.0)
+    return zenpark("--chaos", *arguments, "--out", folder, timeout_s=150.0, module="tests")
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,6 @@ def test_faults_are_made_and_recovered_from(tmp_path: Path, kinds: list[str]) ->
     assert not [each for each in result["outcomes"] if each["fault"]["kind"] == "double" and each["violations"]]
     assert not any("left behind" in text for each in result["rounds"] for text in each["violations"])
     assert json.loads((folder / "chaos.json").read_text()) == result
-    assert (folder / "chaos.html").stat().st_size > 1000
 
 
 def test_a_fault_that_nobody_knows_is_refused(tmp_path: Path) -> None:

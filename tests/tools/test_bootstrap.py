@@ -246,6 +246,20 @@ def test_help_installs_nothing(bootstrap, monkeypatch, capsys, command, option):
     assert capsys.readouterr().out.startswith(f"usage: ./zenpark {command}")
 
 
+@pytest.mark.parametrize("words", [("--chaos", "triangle", "-h"), ("--soak",), ("--bench", "start")])
+def test_measurements_run_in_the_folder_of_the_user(bootstrap, monkeypatch, words):
+    made = []
+    monkeypatch.setattr(bootstrap, "prepare", lambda level: None)
+    monkeypatch.setattr(
+        bootstrap.os, "execve", lambda python, command, environment: made.append((command, environment))
+    )
+    monkeypatch.setattr(bootstrap, "test", lambda arguments: 0)
+    bootstrap.main(["test", *words])
+    ((command, environment),) = made
+    assert command[1:] == ["-m", "tests", *words]
+    assert environment["PYTHONSAFEPATH"] == "1"
+
+
 @pytest.fixture
 def started(bootstrap, monkeypatch):
     """The modules that `./zenpark test` starts; those of tests fail."""

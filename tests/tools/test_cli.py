@@ -48,10 +48,7 @@ def test_commands():
                 "new",
                 "list",
                 "schema",
-                "bench",
                 "sweep",
-                "soak",
-                "chaos",
                 "import",
                 "view",
                 "top",
@@ -351,7 +348,6 @@ COMPLETED = (
     ("run triangle --set formation.t", ["formation.tracking_gain="]),
     ("agent triangle CF", ["CF01"]),
     ("report runs/f", ["runs/first"]),
-    ("bench saf", ["safety"]),
     ("new mix", ["mixed-reality"]),
     ("robot ho", ["hold"]),
 )

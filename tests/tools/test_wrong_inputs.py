@@ -115,8 +115,6 @@ COMMANDS = (
     ("compare full full", "full, full: 0 runs there", "name two or more"),
     ("clean --older -3", "--older: ", "must be greater than or equal to 0"),
     ("sweep triangle.toml trigger.threshold=lim3", "at lim3: 'threshold' must be a number", "[m]"),
-    ("chaos triangle.toml --kinds fire", "--kinds fire: is not known", "there are: kill, "),
-    ("bench nope", "bench nope: is not known", "there are: start, virtual"),
     ("import nope.yaml", "nope.yaml: there is no such file", "name an experiment file"),
     ("cert show nope", "nope is no lab", "`./zenpark cert init nope FILE` makes one"),
     ("hosts check triangle.toml", "the experiment has no hosts", "[hosts.lab1]"),

@@ -26,7 +26,6 @@ PANELS: Final = {
     "Act": "robot world estop",
     "By hand": "router agent centre twin bridge",
     "Lab": "preflight hosts cert",
-    "Quality": "bench chaos soak",
     "Set-up": "install hardware docs test",
 }
 

@@ -1,4 +1,4 @@
-"""A cable between robots and their routers: `python -m tools.reliability.cable NEAR FAR [NEAR FAR...]`.
+"""A cable between robots and their routers: `python -m tests.reliability.cable NEAR FAR [NEAR FAR...]`.
 
 A TCP relay between ports on loopback: it needs neither root nor a kernel with a network emulator, works wherever
 zenpark does, and does to a TCP connection what a bad cable does. It is cut by suspending its process. Nothing is lost

@@ -1,21 +1,25 @@
-"""`./zenpark chaos`: draws a script of faults, runs it, and reports what did not hold."""
+"""`./zenpark test --chaos`: draws a script of faults, runs it, and reports what did not hold."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
+import msgspec
 import typer
 
-from tools.commands.options import AsJson, File, Out, Settings, example, known_words, print_result
-
-if TYPE_CHECKING:
-    from experiments.definition.plan import Plan
-    from tools.reliability.chaos_report import FaultResult, RoundResult
-
-app: Final = typer.Typer()
+from agents.runtime.command_line import interrupts
+from experiments.definition.plan import Plan
+from experiments.file.document import chosen, load
+from experiments.recording.run_folder import SOURCE, new_folder
+from tests.reliability.chaos_report import ChaosResult, FaultResult, RoundResult, findings, table
+from tests.reliability.chaos_round import ChaosRound
+from tests.reliability.faults import FAULTS, script
+from tests.reliability.spoilt_run import Setting
+from tools.commands.options import AsJson, File, Out, Settings, known_words, print_result
+from tools.progress import columns, finding_lines
 
 BARREN: Final = 3  # rounds without any fault, and it gives up
 
@@ -26,9 +30,9 @@ ALWAYS: Final = ('world.engine="pymunk"', "world.wheels_stop_s=0.5", "start.dead
 AVOIDANCE: Final = 'avoidance={ kind = "barrier", hears = "all", clearance = 1.0 }'
 BODY_HZ: Final = 50.0  # relays, world and robots share one machine: at 100 Hz two cores are full, and ticks are missed
 SCRIPT: Final = "script.json"
+RESULT: Final = "chaos.json"
 
 
-@app.command(epilog=example("chaos triangle --faults 20 --seed 1", "chaos triangle --kinds kill,freeze"))
 def chaos(
     file: File,
     *,
@@ -43,18 +47,6 @@ def chaos(
     as_json: AsJson = False,
 ) -> int:
     """Run an experiment again and again while faults befall it, and say what did not hold."""
-    import msgspec
-
-    from agents.runtime.command_line import interrupts
-    from experiments.file.document import chosen, load
-    from experiments.recording.run_folder import SOURCE, new_folder
-    from tools.progress import columns, finding_lines
-    from tools.reliability import chaos_report
-    from tools.reliability.chaos_report import ChaosResult
-    from tools.reliability.chaos_round import ChaosRound
-    from tools.reliability.faults import FAULTS, script
-    from tools.reliability.spoilt_run import Setting
-
     changes = [*defaults(load(file).plan), *(settings or [])]
     read = load(file, *changes)
     name = case or list(read.cases())[-1]
@@ -76,15 +68,12 @@ def chaos(
             outcomes += flown.outcomes
             barren = 0 if flown.outcomes else barren + 1
     result = ChaosResult(read.experiment.title, seed, planned, outcomes, ends)
-    words = ["./zenpark", "chaos", file, "--faults", str(faults), "--seed", str(seed)]
-    words += [part for kind in kinds or () for part in ("--kinds", kind)]
-    page = chaos_report.write(folder, result, " ".join(words))
-    table, findings = chaos_report.table(result), chaos_report.findings(result)
-    lines = [*columns([table.head, *(tuple(map(str, row.cells)) for row in table.rows)]), *finding_lines(findings)]
-    print_result(result, *lines, f"report: {page}", as_json=as_json)
+    (folder / RESULT).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
+    verdict = findings(result)
+    print_result(result, *columns(table(result)), *finding_lines(verdict), f"results: {folder}", as_json=as_json)
     if interrupted():
         return 130
-    return int(any(finding.mark == "bad" for finding in findings))
+    return int(any(finding.mark == "bad" for finding in verdict))
 
 
 def defaults(plan: Plan) -> list[str]:

@@ -1,20 +1,26 @@
-"""`./zenpark soak`: an experiment in real time for hours, and whether anything grows, is lost, slows down or dies.
+"""`./zenpark test --soak`: an experiment for hours, and whether anything grows, is lost, slows down or dies.
 
 Everything is written down as it comes: the processes that are measured keep no samples.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
-from tools.commands.options import AsJson, Bodies, Case, Out, Settings, example, print_result
+from agents.errors import ExplainedError
+from agents.runtime.command_line import interrupts
+from experiments.file.document import chosen, load
+from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
+from experiments.real_time.conductor.run_view import RunFailed
+from experiments.recording.run_folder import new_folder
+from tests.reliability.soak_sampler import Sampler
+from tests.reliability.soak_verdict import judge, passed, table
+from tools.commands.options import AsJson, Bodies, Case, Out, Settings, print_result
+from tools.progress import columns, finding_lines
 
-app: Final = typer.Typer()
 
-
-@app.command(epilog=example("soak --minutes 60", "soak triangle --minutes 10"))
 def soak(
     file: Annotated[str, typer.Argument(metavar="[FILE]", help="Experiment file.")] = "endurance",
     *,
@@ -26,16 +32,6 @@ def soak(
     as_json: AsJson = False,
 ) -> int:
     """Run an experiment for long and say whether anything grows, is lost, slows down or dies."""
-    from agents.errors import ExplainedError
-    from agents.runtime.command_line import interrupts
-    from experiments.file.document import chosen, load
-    from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
-    from experiments.real_time.conductor.run_view import RunFailed
-    from experiments.recording.run_folder import new_folder
-    from tools.progress import finding_lines
-    from tools.reliability import soak_verdict
-    from tools.reliability.soak_sampler import Sampler
-
     read = load(file, *(settings or []), f"duration_s={60.0 * minutes!r}")
     name = case or next(iter(read.cases()))
     folder = new_folder(read, out)
@@ -49,11 +45,10 @@ def soak(
         except ExplainedError as error:
             sampler.end_early(error)
         soaked = sampler.result(interrupted=interrupted() or bool(user.emergency))
-    findings = soak_verdict.judge(soaked)
-    well = soak_verdict.passed(findings)
-    page = soak_verdict.write(folder, soaked, findings, f"./zenpark soak {file} --minutes {minutes:g}")
+    findings = judge(soaked)
+    well = passed(findings)
     shown = {"run": folder, "passed": well, "findings": findings}
-    print_result(shown, *finding_lines(findings), f"report: {page}", as_json=as_json)
+    print_result(shown, *columns(table(soaked)), *finding_lines(findings), f"results: {folder}", as_json=as_json)
     if soaked.interrupted:
         return 130
     return 0 if well else 1

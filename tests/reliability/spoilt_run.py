@@ -1,8 +1,8 @@
 """A run to which faults are done: its start, the levers by which they are done, and its end.
 
-It is a process of its own, which may be killed: `python -m tools.reliability.spoilt_run REQUEST`, a struct as JSON; its
+It is a process of its own, which may be killed: `python -m tests.reliability.spoilt_run REQUEST`, a struct as JSON; its
 standard input is the lifeline, without which all robots land. Its robots reach their routers through cables
-(`tools.reliability.cable`), and live in one world, so that the body of a robot whose process is dead, frozen or cut
+(`tests.reliability.cable`), and live in one world, so that the body of a robot whose process is dead, frozen or cut
 off stays in the room.
 """
 
@@ -40,16 +40,16 @@ from experiments.file.document import load
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.conduct import RunOptions, Supervision, conduct
 from experiments.real_time.hosts.launcher import RUN, Launcher, Process, tagged
+from tests.reliability import spoilt_process
+from tests.reliability.spoilt_process import CONDUCTOR, Switch, role_of
 from tools.progress import Lines
-from tools.reliability import spoilt_process
-from tools.reliability.spoilt_process import CONDUCTOR, Switch, role_of
 from twins.devices.device import CAPTURE_FAULTS, CaptureFault
 
 Stage = Literal["plain", "two routers", "patient router", "motion capture"]
 
 GARBAGE: Final = 20  # payloads of nonsense at a time, on each key of a victim
 CABLE: Final = "cable"
-MODULE: Final = "tools.reliability.spoilt_run"
+MODULE: Final = "tests.reliability.spoilt_run"
 LEASE_S: Final = 60.0  # of a patient router, as ROS 2 sets it
 END_S: Final = 1.0  # before its time is over: then the conductor lands all robots, and lets none in again
 MOCAP_CLOCK: Final = "clock-positioning"
@@ -75,7 +75,7 @@ class Request(msgspec.Struct):
     case: str
     changes: list[str]  # as behind `--set`
     cables: dict[str, dict[str, str]]  # for each process of robots, by its role, an endpoint in place of each router's
-    switches: str  # folder, with which `tools.reliability.spoilt_process` spoils processes
+    switches: str  # folder, with which `tests.reliability.spoilt_process` spoils processes
 
 
 class SpoiltLauncher(Launcher):
@@ -139,7 +139,7 @@ class SpoiltRun:
         self._launcher = stack.enter_context(Launcher(folder / "logs"))
         for role, ends in near.items():
             ports = [end.rpartition(":")[2] for way in ends.items() for end in reversed(way)]
-            self._launcher.start(f"{CABLE}-{role}", "tools.reliability.cable", *ports)
+            self._launcher.start(f"{CABLE}-{role}", "tests.reliability.cable", *ports)
         words = [MODULE, msgspec.json.encode(request).decode()]
         self.process = self._spawn(CONDUCTOR, [sys.executable, "-m", spoilt_process.MODULE, request.switches, *words])
         stack.callback(self._kill)
@@ -173,7 +173,7 @@ class SpoiltRun:
     # ---------------------------------------------------------------------- levers
 
     def switch(self, name: str) -> Switch:
-        """A switch between a process and its clock, body or lease (`tools.reliability.spoilt_process`)."""
+        """A switch between a process and its clock, body or lease (`tests.reliability.spoilt_process`)."""
         return Switch(self._switches / name)
 
     def process_of(self, robot: str) -> str:

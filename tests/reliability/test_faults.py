@@ -4,8 +4,8 @@ import pytest
 
 from experiments.definition.plan import Plan
 from experiments.file.document import load
-from tools.reliability.chaos import ALWAYS, AVOIDANCE, defaults
-from tools.reliability.faults import FAULT_KINDS, FAULTS, next_fault, script
+from tests.reliability.chaos import ALWAYS, AVOIDANCE, defaults
+from tests.reliability.faults import FAULT_KINDS, FAULTS, next_fault, script
 
 ROBOTS = ("TB01", "KH01", "CF01", "CF02")
 
@@ -78,7 +78,7 @@ def test_only_the_kinds_that_were_asked_for():
 
 
 def test_every_kind_is_defined_in_a_sentence():
-    assert all(kind.meant.endswith(".") for kind in FAULT_KINDS.values())
+    assert all(kind.begin.__doc__.endswith(".") for kind in FAULT_KINDS.values())
 
 
 def test_defaults_keep_robots_apart_and_fit_the_rates_of_the_file():

@@ -1,7 +1,7 @@
 """Reaction times of robots: to an emergency stop, to a neighbour that was killed, to one that hangs.
 
 Twenty robots run as processes of their own. The command to cut the motors is stamped where the body obeys it, by the
-monotonic clock by which the stop was sent: for twins in the robot's own process (`tools.reliability.spoilt_process`),
+monotonic clock by which the stop was sent: for twins in the robot's own process (`tests.reliability.spoilt_process`),
 as for a device that is driven from there; for external bodies here, for the bench is their far end. The knowledge of a
 death is stamped when a status, which names the missing neighbours, arrives here: one way over the router more than the
 robot itself needs.
@@ -37,9 +37,9 @@ from experiments.file.document import write_json
 from experiments.real_time.conductor import orders
 from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.launcher import Launcher
-from tools.bench.measuring import Figure
-from tools.reliability import spoilt_process
-from tools.reliability.spoilt_process import ROBOT, Switch
+from tests.bench.measuring import Figure
+from tests.reliability import spoilt_process
+from tests.reliability.spoilt_process import ROBOT, Switch
 
 ROBOTS: Final = 20
 BODIES: Final = ("twin", "external")

@@ -14,10 +14,10 @@ from functools import partial
 from typing import Final
 
 from agents.network import session as network
-from tools.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
-from tools.reliability.faults import FAULT_KINDS, NOTICE_S, ActiveFault, Check, Fault, next_fault
-from tools.reliability.observer import Observer
-from tools.reliability.spoilt_run import Setting, SpoiltRun
+from tests.reliability.chaos_report import FaultResult, RoundResult, line, recording_faults
+from tests.reliability.faults import FAULT_KINDS, NOTICE_S, ActiveFault, Check, Fault, next_fault
+from tests.reliability.observer import Observer
+from tests.reliability.spoilt_run import Setting, SpoiltRun
 
 POLL_S: Final = 0.02
 BEGIN_S: Final = 100.0  # to the common start

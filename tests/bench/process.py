@@ -1,4 +1,4 @@
-"""`./zenpark bench process`: CPU and memory of a robot's process, beside a bare Zenoh process with the same messages.
+"""`./zenpark test --bench process`: CPU and memory of a robot process, beside a bare one with the same messages.
 
 Each robot of the reference experiment has a bare process of its own name, which sends as many poses and receives those
 of the same neighbours, in the same seconds through the same router. The ratio of the CPU times of each pair holds on a
@@ -24,8 +24,8 @@ from experiments.real_time.conductor.support import start_router
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE
-from tools.bench.measuring import Figure
-from tools.reliability.soak_sampler import Usage, usage_of
+from tests.bench.measuring import Figure
+from tests.reliability.soak_sampler import Usage, usage_of
 
 FLIGHT_S: Final = 20.0
 
@@ -92,7 +92,7 @@ def process(read: Document | None = None) -> Iterator[Figure]:
                 senders = [link.name for link in plan.assignment(robot).neighbours]
                 rate = f"{experiment.rates.pose_hz:g}"
                 started = launcher.start(
-                    f"bare-{robot}", "tools.bench.bare_process", endpoints[0], robot, rate, *senders
+                    f"bare-{robot}", "tests.bench.bare_process", endpoints[0], robot, rate, *senders
                 )
                 beside[robot] = started.handle.pid
             source, hosts = folder / SOURCE, Hosts(launcher, endpoints)

@@ -1,10 +1,9 @@
-"""Results of a fault laboratory: a table of fault kinds, and a page."""
+"""Results of a fault laboratory: a table of fault kinds, and the verdict."""
 
 from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -15,9 +14,8 @@ from agents.errors import ExplainedError
 from experiments.metrics.measure import measure
 from experiments.recording import playback
 from experiments.recording.reader import recover
-from experiments.report.page import NONE, Finding, Section, Table, date_of, render
-from experiments.report.page import Row as Line
-from tools.reliability.faults import FAULT_KINDS, FAULTS, Fault
+from experiments.report.page import NONE, Finding
+from tests.reliability.faults import FAULTS, Fault
 
 
 class FaultResult(msgspec.Struct, frozen=True):
@@ -78,10 +76,7 @@ def recording_faults(recording: Path, outcomes: Sequence[FaultResult], *, disk_f
     return wrong
 
 
-PAGE: Final = "chaos.html"
-FILE: Final = "chaos.json"
 BUSY: Final = 0.05  # share of the ticks that a machine may miss which is to be trusted with the rest
-SMALL: Final = 20  # so many rows stand open
 
 
 class ChaosResult(msgspec.Struct, frozen=True):
@@ -94,18 +89,17 @@ class ChaosResult(msgspec.Struct, frozen=True):
     rounds: list[RoundResult]
 
 
-def table(result: ChaosResult) -> Table:
-    """A row for each kind of fault."""
-    lines = []
+def table(result: ChaosResult) -> list[tuple[str, ...]]:
+    """A head and a row for each kind of fault; times count from the begin of the fault."""
+    rows: list[tuple[str, ...]] = [("fault", "done", "well again", "came down", "median", "longest", "violations")]
     for kind in FAULTS:
         mine = [each for each in result.outcomes if each.fault.kind == kind]
         well = [each.begin_s for each in mine if each.recovered]
         counts = len(mine), len(well), sum(each.ended for each in mine)
         times = (f"{what(well):.1f} s" if well else NONE for what in (statistics.median, max))
         wrong = sum(len(each.violations) for each in mine)
-        lines += [Line((kind, *map(str, counts), *times, str(wrong)))] if mine else []
-    head = ("Fault", "Done", "Well again", "Came down", "Median", "Longest", "Violations")
-    return Table(head, tuple(lines), note="Times count from the begin of the fault.")
+        rows += [(kind, *map(str, counts), *times, str(wrong))] if mine else []
+    return rows
 
 
 def findings(result: ChaosResult) -> list[Finding]:
@@ -125,23 +119,3 @@ def findings(result: ChaosResult) -> list[Finding]:
     wrong = [line(each) for each in result.outcomes if each.violations]
     wrong += [f"round {each.round}: {text}" for each in rounds for text in each.violations]
     return found + ([Finding("bad", text) for text in wrong] or [Finding("good", "0 violations")])
-
-
-def write(folder: Path, result: ChaosResult, command: str) -> Path:
-    """Write `chaos.json` and `chaos.html` into a folder."""
-    (folder / FILE).write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1))
-    rows = tuple(Line((line(each),)) for each in result.outcomes)
-    folded = "Show the list" if len(rows) > SMALL else ""
-    return render(
-        folder / PAGE,
-        title=f"Faults: {result.experiment}",
-        source="",
-        facts=[("Date", date_of(time.time())), ("Seed", str(result.seed)), ("Rounds", str(len(result.rounds)))],
-        command=command,
-        verdict=findings(result),
-        sections=[
-            Section("By kind", tables=(table(result),)),
-            Section("Every fault", tables=(Table(("What",), rows, words=True),), folded=folded),
-            Section("Definitions", terms=tuple((kind, nature.meant) for kind, nature in FAULT_KINDS.items())),
-        ],
-    )

@@ -7,8 +7,8 @@ import subprocess
 import sys
 import time
 
-from tools.bench.process import Meter
-from tools.reliability.soak_sampler import usage_of
+from tests.bench.process import Meter
+from tests.reliability.soak_sampler import usage_of
 
 
 def test_what_another_process_spends_is_read_exactly() -> None:

@@ -20,7 +20,7 @@ from agents.safety.hazards import failed
 from experiments.definition.plan import Plan
 from experiments.real_time.conductor.run_view import News, Progress, RobotView
 from experiments.real_time.hosts.launcher import RUN, tagged
-from tools.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
+from tests.reliability.spoilt_process import CONDUCTOR, OTHER, role_of
 
 SAMPLE_S: Final = 5.0
 SAMPLES: Final = 60  # at least so many, however short it is

@@ -5,7 +5,7 @@ import pytest
 
 from agents.network.messages import Command
 from experiments.file.document import load
-from tools.reliability.observer import Invariants
+from tests.reliability.observer import Invariants
 
 TRIANGLE = {"KH01": (-0.3, 0.0, 0.0), "KH02": (0.3, 0.0, 0.0), "CF01": (0.0, 0.4359, 0.6)}
 

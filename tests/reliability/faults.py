@@ -1,6 +1,6 @@
 """Faults: what each does to a run, why the run may not yet be well after it, and their script.
 
-A fault is a function; its docstring is its definition in the report. It is given the fault that begins, and returns the
+A fault is a function, which its docstring defines. It is given the fault that begins, and returns the
 check that goes on until all is well: the reason why it is not, or an empty text.
 """
 
@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from agents.network import messages
-from tools.reliability.observer import Observer
-from tools.reliability.spoilt_run import MOCAP_CLOCK, SpoiltRun, Stage
+from tests.reliability.observer import Observer
+from tests.reliability.spoilt_run import MOCAP_CLOCK, SpoiltRun, Stage
 from twins.arrays import Array
 
 HELD_M: Final = 0.25  # largest distance of a robot that no process steers
@@ -379,11 +379,6 @@ class FaultKind:
     disbands: bool = False  # drones land for it: for the rest of the round no formation is asked for
     ordered: bool = False  # its landings are ordered, so they fail no run
     recorded: Literal["", "lost", "router"] = ""  # kind of the event of which the recording must have one
-
-    @property
-    def meant(self) -> str:
-        """Its definition."""
-        return self.begin.__doc__ or ""
 
 
 FAULT_KINDS: Final = {

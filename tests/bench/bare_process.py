@@ -1,6 +1,6 @@
-"""A bare Zenoh process for `./zenpark bench process`.
+"""A bare Zenoh process for `./zenpark test --bench process`.
 
-    python -m tools.bench.bare_process ENDPOINT NAME HZ NEIGHBOUR ...
+    python -m tests.bench.bare_process ENDPOINT NAME HZ NEIGHBOUR ...
 
 The least that a robot can do: a session with the settings of every robot, its own pose sent at the same rate, the poses
 of the same neighbours received, JSON encoded and decoded. No body, no law, no safety.

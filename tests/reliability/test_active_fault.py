@@ -7,8 +7,8 @@ import pytest
 from agents.network.messages import Event, Incident
 from experiments.definition.plan import Plan
 from experiments.file.document import load
-from tools.reliability.faults import ActiveFault, Fault
-from tools.reliability.observer import Invariants
+from tests.reliability.faults import ActiveFault, Fault
+from tests.reliability.observer import Invariants
 
 
 def status(phase="running", *, missing=(), incidents=()):

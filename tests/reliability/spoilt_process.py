@@ -1,4 +1,4 @@
-"""A process of a run that a fault laboratory can spoil: `python -m tools.reliability.spoilt_process FOLDER MODULE
+"""A process of a run that a fault laboratory can spoil: `python -m tests.reliability.spoilt_process FOLDER MODULE
 ARGUMENT...`.
 
 Runs MODULE as it runs by itself, but for the switches in FOLDER: numbers in files of eight bytes, which the laboratory
@@ -29,7 +29,7 @@ from typing import Final
 
 from agents.clock import READING
 
-MODULE: Final = "tools.reliability.spoilt_process"
+MODULE: Final = "tests.reliability.spoilt_process"
 _NUMBER: Final = struct.Struct("d")
 CONDUCTOR: Final = "conductor"
 ROLES: Final = {  # by the module that a process runs
@@ -37,7 +37,7 @@ ROLES: Final = {  # by the module that a process runs
     "experiments.real_time.processes.recorder": "recorder",
     "experiments.real_time.processes.world": "world",
     "experiments.real_time.processes.centre": "centre",
-    "tools.reliability.spoilt_run": CONDUCTOR,
+    "tests.reliability.spoilt_run": CONDUCTOR,
     "bridges.vicon.publisher": "positioning",
     "twins.devices.vicon": "capture",
 }

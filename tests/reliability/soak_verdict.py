@@ -1,18 +1,14 @@
-"""Verdict of a soak: whether anything grows, is lost, slows down or dies; with its page."""
+"""Verdict of a soak: whether anything grows, is lost, slows down or dies."""
 
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Final, NamedTuple
 
-from experiments.report.page import NONE, Finding, Section, Table, date_of, render
-from experiments.report.page import Row as Line
-from tools.reliability.soak_sampler import Row, Soaked
+from experiments.report.page import NONE, Finding
+from tests.reliability.soak_sampler import Row, Soaked
 
-PAGE: Final = "soak.html"
 WARM_SHARE: Final = 0.5  # of the run that does not count (a recorder fills its pools for 150 s), but not more than
 WARM_S: Final = 300.0
 WINDOW: Final = 0.1  # share of what counts that is compared at both ends
@@ -123,30 +119,10 @@ def _memory(soaked: Soaked, both: Mapping[str, Ends]) -> Finding:
     return Finding("good", f"{text}, within {100 * GROWTH:g} %")
 
 
-# ---------------------------------------------------------------------- the page
-
-
-def write(folder: Path, soaked: Soaked, findings: Sequence[Finding], command: str) -> Path:
-    """Write `soak.html` into a folder."""
-    return render(
-        folder / PAGE,
-        title=f"Soak: {soaked.title}",
-        source="",
-        facts=[
-            ("Date", date_of(time.time())),
-            ("Duration", f"{soaked.duration_s / 60.0:g} min"),
-            ("Robots", str(len(soaked.robots))),
-            ("Warm-up", f"{warm_s(soaked):g} s"),
-        ],
-        command=command,
-        verdict=findings,
-        sections=[Section("Processes", tables=(table(soaked),))],
-    )
-
-
-def table(soaked: Soaked) -> Table:
-    """Each process after the warm-up and at the end."""
-    lines = []
+def table(soaked: Soaked) -> list[tuple[str, ...]]:
+    """A head and a row for each process: resident memory after the warm-up and at the end, CPU as share of a core."""
+    head = ("process", "MB first", "MB last", "growth", "threads", "files", "CPU", "lost", "missed", "delay [ms]")
+    rows: list[tuple[str, ...]] = [head]
     for process, each in ends(soaked).items():
         last, first = each.last[-1], each.first[0]
         share = 100.0 * (last.cpu_s - first.cpu_s) / max(last.time_s - first.time_s, 1e-9)
@@ -161,6 +137,5 @@ def table(soaked: Soaked) -> Table:
             *(NONE if count is None else str(count) for count in (last.lost, last.missed)),
             f"{1e3 * statistics.median(delays):.2f}" if delays else NONE,
         )
-        lines.append(Line(cells))
-    head = ("Process", "MB first", "MB last", "Growth", "Threads", "Files", "CPU", "Lost", "Missed", "Delay [ms]")
-    return Table(head, tuple(lines), note="CPU is the share of a core after the warm-up; memory is resident.")
+        rows.append(cells)
+    return rows

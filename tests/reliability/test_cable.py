@@ -33,7 +33,7 @@ def laid():
     with socket.create_server(("127.0.0.1", 0)) as far:
         thread = threading.Thread(target=answer_everything, args=(far,), daemon=True)
         thread.start()
-        words = [sys.executable, "-m", "tools.reliability.cable", str(near), str(far.getsockname()[1])]
+        words = [sys.executable, "-m", "tests.reliability.cable", str(near), str(far.getsockname()[1])]
         with subprocess.Popen(words, stdin=subprocess.PIPE) as cable:
 
             def reached():
