@@ -51,7 +51,7 @@ def members(context: typer.Context) -> list[str]:
 
 def robots() -> list[str]:
     """Robots of the runs that are up on this machine."""
-    from agents.runtime import run_registry  # noqa: PLC0415 - help and other completion are quicker without
+    from experiments.real_time.hosts import run_registry  # noqa: PLC0415 - help and other completion are quicker without
 
     return sorted({name for run in run_registry.runs() for name in run.robots})
 

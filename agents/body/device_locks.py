@@ -1,6 +1,6 @@
 """Exclusive use of a device on this machine: a lock on its address, held while a body is open.
 
-The locks are files of the user's runtime folder (`agents.runtime.run_registry`) and end with their process. Other
+The locks are files of the user's runtime folder (`agents.user_folder`) and end with their process. Other
 machines and other users are not excluded.
 """
 

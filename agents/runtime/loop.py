@@ -7,11 +7,10 @@ neighbours can wake the loop between two ticks: then they are known at once, whi
 from __future__ import annotations
 
 import gc
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from math import ceil, inf, isfinite, isnan
@@ -32,13 +31,14 @@ from agents.network import session as network
 from agents.network.access_control import Rights
 from agents.network.channel_model import Conditions
 from agents.network.keys import Keys
-from agents.network.name_ownership import ANSWER_S, NameKeeper
-from agents.network.shutdown import FAREWELL_S, STOPPED_S, leave
+from agents.network.name_ownership import NameKeeper
+from agents.network.shutdown import leave
 from agents.network.zenoh_config import ASK_S
 from agents.plugins.calls import explain
 from agents.plugins.registry import FAILURES
 from agents.robot import Robot
 from agents.runtime.command_line import on_termination
+from agents.runtime.descent import Descent
 from agents.runtime.goal_inbox import GoalInbox
 from agents.runtime.lifeline import SILENCE_S as LIFELINE_S
 from agents.runtime.lifeline import Lifeline
@@ -46,8 +46,7 @@ from agents.runtime.orders import LAND, STOP, carry_out
 from agents.runtime.pose_inbox import PoseInbox
 from agents.runtime.range_inbox import RangeInbox
 from agents.runtime.telemetry import Counts, Telemetry
-from agents.runtime.watchdog import AGAIN_S, DOWN_S, SILENCE_S, Watchdog
-from agents.safety.detection import SLOWEST
+from agents.runtime.watchdog import SILENCE_S
 from agents.ticks import Ticks
 
 STOP_YIELD_S: Final = 0.05  # sleep after an emergency stop, so that other processes get the CPU to stop their motors
@@ -104,23 +103,18 @@ class Runtime:
         self._cut_off = False  # motors were cut by a stop that the loop has not polled yet
         self._estimators = [External() for _ in self._names]
         self._states: Sequence[BodyState] = ()  # last reading of the body
-        self._airborne = False  # a row flew at the last reading of its body, or took off since
         self._opened = self._joined = False
         self._ticks = Ticks(common.body_hz, clock=uptime)
         self._bell = pubsub.Bell() if setup.wake else None
         self._utc = 0.0
         self._keeper = NameKeeper(setup.keys, self._names, setup.clock.utc())
-        self._reason_to_end: Callable[[], str | None] = lambda: None
         self._reach = validation.reach_of(common.limits.low, common.limits.high)
         self._everyone = tuple(range(len(self._names)))
-        self._on_wheels = tuple(row for row, each in enumerate(assignments) if not each.kind.flies)
-        self._coming_down = False  # the loop is over
-        ceiling = common.limits.high[2] if any(each.kind.flies for each in assignments) else 0.0
-        self._descent_s = ceiling / SLOWEST  # [s] longest landing: what still descends after a limit would fall
-        self._watchdog = Watchdog(
-            body, self._everyone, alarm=self._call_for_help, silence_s=setup.loop_silence_s,
-            down_s=max(DOWN_S, self._descent_s),
+        self._descent = Descent(
+            self.robots, body, self._keeper, self._ticks,
+            silence_s=setup.loop_silence_s, alarm=self._call_for_help, recover=self._recover,
         )  # fmt: skip
+        self._watchdog = self._descent.watchdog
 
     def run(self) -> int:
         """Opens the body, joins the network, drives until all is done; returns the exit code of the process.
@@ -150,102 +144,17 @@ class Runtime:
             self._keeper.claim(session, self._setup.endpoints, asked)
             out.callback(self._keeper.end)
             self._body.open()
-            out.callback(self._close_body)
-            out.callback(self._watchdog.end)
-            out.callback(self._order_down, self._body.stop, STOPPED_S)
-            out.callback(self._come_down)
+            self._descent.register(out)
             self._join(session)
             self._loop(lambda: lifeline.reason if lost.is_set() else self._reason(asked.is_set()))
         return 0
-
-    def _close_body(self) -> None:
-        if not self._keeper.hands_off:
-            self._body.close()
 
     def _reason(self, asked: bool) -> str | None:
         if asked:
             return TOLD_TO_END
         return "ordered to leave" if len(self._leaving) == len(self._names) else None
 
-    def _come_down(self) -> None:
-        """Lands robots that still fly after an error, before the motors are switched off."""
-        if self._keeper.hands_off:
-            return
-        self._coming_down = True
-        self._watchdog.start()
-        failures: list[Exception] = []
-        if self._in_the_air(failures) and any(
-            robot.lifecycle.phase < Phase.DONE for robot in self.robots
-        ):  # else it was stopped
-            error = sys.exception()
-            why = (
-                "it did not land in time"
-                if error is None
-                else f"its control loop broke: {type(error).__name__}: {error}"
-            )
-            self._watchdog.call_for_help(why)
-            self._order_down(self._body.land, max(FAREWELL_S, self._descent_s))
-        if failures:
-            raise failures[0]
-
-    def _order_down(self, order: Callable[[Sequence[int]], object], limit_s: float) -> None:
-        """Repeats an order until it succeeds and no row flies any more, for at most `limit_s` [s].
-
-        A body that cannot be read gets all of that time if it flew before. The first error is raised at the end.
-        """
-        if self._keeper.hands_off:
-            return
-        failures: list[Exception] = []
-        begin, again, obeyed = self._ticks.elapsed(), -inf, False
-        while True:
-            self._watchdog.beat()
-            self._await_ownership()
-            if (now := self._ticks.elapsed()) >= again:
-                again = now + AGAIN_S
-                obeyed = False
-                with _noted(failures):
-                    order(self._everyone)
-                    obeyed = True
-            if (obeyed and not self._in_the_air(failures)) or now > begin + limit_s:
-                break
-            time.sleep(self._dt)
-        if failures:
-            raise failures[0]
-
-    def _in_the_air(self, failures: list[Exception]) -> bool:
-        """Whether a row flies, by the last successful reading of its body; an error is noted."""
-        with _noted(failures):
-            states = self._body.read(max(self._ticks.t, self._ticks.elapsed()))
-            self._airborne = any(state.flying for state in states)
-        return self._airborne
-
     # ------------------------------------------------------------------ the network
-
-    def _await_ownership(self) -> bool:
-        """Whether the process stood still since the last call; then it has waited until the ownership was certain.
-
-        Until then it must not command its bodies, since another process may drive them. Without an answer those on
-        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
-        the process drives its bodies again then, until it learns that they belong to another one.
-        """
-        if not self._keeper.stood_still() or self._watchdog.tripped:  # the watchdog handles a loop that hangs
-            return False
-        limits, drives = self._limits, self._on_wheels
-        woke, self._keeper.hands_off = uptime(), True
-        self._keeper.begin_check(self._session)
-        while not self._keeper.is_owner():
-            waited = uptime() - woke
-            if waited > limits.offline_s or (waited > ANSWER_S and self._reason_to_end() is not None):
-                self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
-                break
-            if drives and waited > limits.link_silence_s:
-                self._body.land(drives)
-                drives = ()
-            self._watchdog.beat()
-            time.sleep(self._dt)
-        self._keeper.stood_still()
-        self._keeper.hands_off = False
-        return True
 
     def _subscribe_to_stops(self, session: zenoh.Session) -> None:
         """Subscribes to emergency stops before the body is opened, which may take a minute."""
@@ -254,7 +163,7 @@ class Runtime:
     def _join(self, session: zenoh.Session) -> None:
         self._opened = True
         keys, names = self._setup.keys, self._names
-        self._session = session
+        self._session = self._descent.session = session
         self._router_due, self._silent_since = -inf, inf
         self._router = network.RouterWatch(session, keys.alive(names[0]), self._setup.endpoints)
         self._poses = [pubsub.pose_publisher(session, keys.pose(name), self._mime) for name in names]
@@ -301,7 +210,7 @@ class Runtime:
         if self._joined:
             self._telemetry.repeat_statuses(why, self._setup.clock.utc())
             # a loop that has recovered meanwhile keeps its tokens
-            self._keeper.withdraw(self._everyone, lambda: self._coming_down or bool(self._watchdog.tripped))
+            self._keeper.withdraw(self._everyone, lambda: self._descent.begun or bool(self._watchdog.tripped))
 
     def _recover(self, why: str) -> None:
         """Lands the robots after the watchdog ordered it, although the loop runs again."""
@@ -414,8 +323,8 @@ class Runtime:
     def _loop(self, stopping: Callable[[], str | None]) -> None:
         gc.collect()
         gc.freeze()  # imported objects live as long as the process: a collection need not visit them
-        self._reason_to_end = stopping
-        self._await_ownership()  # opening the body may have taken long
+        self._descent.reason_to_end = stopping
+        self._descent.await_ownership()  # opening the body may have taken long
         # one reading: a step of the wall clock in mid-run does not move the experiment
         self._utc = self._telemetry.utc = self._setup.clock.at(self._ticks.start())
         self._joined = True
@@ -431,7 +340,7 @@ class Runtime:
             self._wait(ticks.until_next())
             if self._cut_off:  # most stops come during that sleep
                 self._yield_after_stop()
-            if self._await_ownership():
+            if self._descent.await_ownership():
                 continue
             missed = ticks.begin()
             counts.missed += missed
@@ -443,7 +352,7 @@ class Runtime:
             ticks.zero -= self._setup.clock.slew(self._dt)
             self._tick(t)
             if farewell == inf and (reason := stopping()) is not None:
-                farewell = t + max(FAREWELL_S, self._descent_s)
+                farewell = t + self._descent.limit_s
                 self._stopping = reason
                 for robot in self.robots:
                     robot.lifecycle.land(reason)
@@ -507,7 +416,7 @@ class Runtime:
     def _read(self, t: float) -> Sequence[BodyState]:
         """States of the bodies, completed by what others measure."""
         states = self._body.read(t)
-        self._airborne = any(state.flying for state in states)
+        self._descent.airborne = any(state.flying for state in states)
         for row, state in enumerate(states):
             if isnan(state.velocity[0]):
                 self._estimators[row].estimate(t, state)
@@ -553,7 +462,7 @@ class Runtime:
     def _act(self) -> None:
         """Commands the body, motors-off first."""
         robots, body = self.robots, self._body
-        stale = self._await_ownership()
+        stale = self._descent.await_ownership()
         overruled = self._cut_off or self._watchdog.tripped  # another thread has ordered the body to stop or to land
         stops = [row for row, robot in enumerate(robots) if robot.stops]
         lands = [row for row, robot in enumerate(robots) if robot.lands]
@@ -564,7 +473,7 @@ class Runtime:
                 for row in rises:
                     robots[row].lifecycle.land("its process stood still at its take-off")
             elif not overruled:
-                self._airborne = True
+                self._descent.airborne = True
                 body.takeoff(rises, [robots[row].assignment.hover for row in rises])
         if not overruled and not stale:
             body.command([robot.setpoint for robot in robots])
@@ -580,12 +489,3 @@ class Runtime:
         payload = messages.encode(pose, self._setup.encoding)
         self._last[row].hold(payload)
         self._poses[row].put(payload)
-
-
-@contextmanager
-def _noted(failures: list[Exception]) -> Iterator[None]:
-    """Keeps the first error, to be raised when all has been tried."""
-    try:
-        yield
-    except Exception as error:  # noqa: BLE001
-        failures[:] = failures or [error]

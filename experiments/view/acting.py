@@ -26,7 +26,7 @@ from experiments.view.heartbeat import STALE_S
 if TYPE_CHECKING:
     import viser
 
-    from agents.runtime.run_registry import Run
+    from experiments.real_time.hosts.run_registry import Run
     from experiments.view.serving import Server
 
 REASON: Final = "button of zenpark view"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from agents.network import endpoints
-from agents.runtime import run_registry
 from experiments.real_time.conductor.orders import EmergencyStop
+from experiments.real_time.hosts import run_registry
 from experiments.recording import playback
 from tests.system.lab import Flight
 from tools.commands import orders as order_commands

@@ -268,8 +268,8 @@ def estop(
 ) -> int:
     """Cut the motors of every robot of every run of this machine, or at a router."""
     from agents.network import endpoints as topology
-    from agents.runtime import run_registry
     from experiments.real_time.conductor.orders import EmergencyStop
+    from experiments.real_time.hosts import run_registry
 
     if given := routers(connect, lab):
         stops = [EmergencyStop(given, realm or "park", identity or IDENTITY)]

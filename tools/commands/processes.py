@@ -99,7 +99,7 @@ def router(
     from agents.network.endpoints import DEFAULT_ENDPOINT
     from agents.network.lab import LabError, secured
     from agents.runtime.router import serve
-    from agents.runtime.run_registry import own_entry, registered
+    from experiments.real_time.hosts.run_registry import own_entry, registered
 
     if file is None and lab is not None:
         raise LabError(f"name the experiment too, from which the rights follow: ./zenpark router FILE --lab {lab}")

@@ -460,7 +460,7 @@ def runs(
     """Show which runs are up on this machine; with --past those that left their folders, with key figures."""
     import msgspec
 
-    from agents.runtime import run_registry
+    from experiments.real_time.hosts import run_registry
 
     if past or words or below:
         return _show_past(words or [], below, as_json=as_json)
@@ -549,7 +549,7 @@ def clean(
     as_json: AsJson = False,
 ) -> int:
     """Remove folders of past runs: those of some words or age, never one with a tag or one that is up."""
-    from agents.runtime import run_registry
+    from experiments.real_time.hosts import run_registry
     from experiments.recording import cleaning
 
     if not words and older is None:

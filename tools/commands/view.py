@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import zenoh
     from rich.console import Group
 
-    from agents.runtime.run_registry import Run
+    from experiments.real_time.hosts.run_registry import Run
     from experiments.run import Watch
     from experiments.view.acting import Watched
     from experiments.view.replay import Clock
@@ -278,7 +278,7 @@ def _running_run(folder: Path, *, wait_s: float, ended: threading.Event) -> Run 
     """The run of a folder, if it is up, or is within `wait_s` [s]."""
     import time
 
-    from agents.runtime import run_registry
+    from experiments.real_time.hosts import run_registry
 
     here, deadline = str(folder.absolute()), time.monotonic() + wait_s
     while True:
@@ -309,7 +309,7 @@ def _replay(folder: Path, ended: threading.Event, *, port: int, dark: bool, open
 
 def _watched(connect: list[str] | None, realm: str, lab: str | None, identity: str | None) -> Watched:
     """The run on the command line, else the newest one of this machine."""
-    from agents.runtime import run_registry
+    from experiments.real_time.hosts import run_registry
     from experiments.view.acting import Watched
 
     if given := routers(connect, lab):

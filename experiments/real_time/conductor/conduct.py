@@ -21,7 +21,6 @@ from agents.network.lab import LabError, lab_of, register, require, secured
 from agents.network.lab import options as lab_options
 from agents.network.zenoh_config import check_loopback
 from agents.plugins import registry as plugins
-from agents.runtime import run_registry
 from experiments.definition import access_rights, mesh
 from experiments.definition import endpoints as reach
 from experiments.definition.bodies import choose_bodies
@@ -34,6 +33,7 @@ from experiments.real_time.conductor.conductor import CaseResult, Conductor
 from experiments.real_time.conductor.emergency import Emergency
 from experiments.real_time.conductor.run_view import Shown
 from experiments.real_time.conductor.support import RouterEnded, make_routers, start_routers
+from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import Launcher
 from experiments.recording.run_folder import SOURCE

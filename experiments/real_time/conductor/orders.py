@@ -17,7 +17,7 @@ from agents.network.keys import Keys
 from agents.network.shutdown import held
 
 if TYPE_CHECKING:
-    from agents.runtime.run_registry import Run
+    from experiments.real_time.hosts.run_registry import Run
 
 REPLY_S: Final = 1.0
 LEAD_S: Final = 0.5  # from the order to the common start: every robot has it by then,

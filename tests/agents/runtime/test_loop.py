@@ -13,7 +13,7 @@ from agents.network import session as network
 from agents.network.keys import Keys
 from agents.plugins.registry import PluginError
 from agents.plugins.triggers import Trigger
-from agents.runtime import loop
+from agents.runtime import descent, loop
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition import bodies
 from experiments.definition.experiment import Formation, Robot
@@ -33,7 +33,8 @@ def test_standstill_skips_ticks_and_holds(stands_s, missed, holds, monkeypatch, 
     def sleep(seconds):
         now[0] += seconds
 
-    monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=sleep))
+    for module in (loop, descent):
+        monkeypatch.setattr(module, "time", types.SimpleNamespace(sleep=sleep))
     monkeypatch.setattr(loop, "uptime", lambda: now[0])  # it alone goes on while the machine sleeps
     experiment = pair()
     with Net().worn() as net:
@@ -76,7 +77,8 @@ class Stage:
         hover = {"hover": 0.5} if kind == "crazyflie" else {}
         experiment = pair(robots={"F": Robot(kind=kind, start=[0.1, 0.2], **hover)}, formation=Formation())
         self.now, self.orders, self.commands = 1000.0, [], 0
-        monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=self.sleep))
+        for module in (loop, descent):
+            monkeypatch.setattr(module, "time", types.SimpleNamespace(sleep=self.sleep))
         for module in (loop, name_ownership):
             monkeypatch.setattr(module, "uptime", lambda: self.now)
         self.body = assemble(bodies.body_request(Plan(experiment), ("F",), 1))

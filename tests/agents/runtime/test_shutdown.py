@@ -11,7 +11,7 @@ import pytest
 from agents.body.interface import BodyState, call_all
 from agents.network import messages
 from agents.network.keys import Keys
-from agents.runtime import loop
+from agents.runtime import descent, loop
 from agents.runtime.loop import Runtime, Setup
 from experiments.definition.experiment import Arena, Formation, Robot
 from experiments.definition.plan import Plan
@@ -88,9 +88,9 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
 
 @pytest.fixture(autouse=True)
 def short_waits(monkeypatch):
-    monkeypatch.setattr(loop, "FAREWELL_S", 0.3)
-    monkeypatch.setattr(loop, "STOPPED_S", 0.1)
-    monkeypatch.setattr(loop, "SLOWEST", inf)
+    monkeypatch.setattr(descent, "FAREWELL_S", 0.3)
+    monkeypatch.setattr(descent, "STOPPED_S", 0.1)
+    monkeypatch.setattr(descent, "SLOWEST", inf)
 
 
 @pytest.mark.parametrize("broken", [(), ("read",), ("land",), ("stop",), ("close",), ("read", "land", "stop", "close")])
@@ -106,7 +106,7 @@ def test_shutdown_tries_everything_and_raises(broken):
 
 
 def test_robot_is_stopped_once_it_is_down(monkeypatch):
-    monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
+    monkeypatch.setattr(descent, "FAREWELL_S", 30.0)
     body = Airborne(steps=10)
     with pytest.raises(OSError, match="the loop breaks"):
         run(body)
@@ -115,8 +115,8 @@ def test_robot_is_stopped_once_it_is_down(monkeypatch):
 
 
 def test_slow_descent_is_not_stopped_in_flight(monkeypatch):
-    monkeypatch.setattr(loop, "FAREWELL_S", 0.05)
-    monkeypatch.setattr(loop, "SLOWEST", 2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
+    monkeypatch.setattr(descent, "FAREWELL_S", 0.05)
+    monkeypatch.setattr(descent, "SLOWEST", 2.5 / 20.0)  # from the ceiling of 2.5 m it takes 20 s
     body = Airborne(steps=100)  # a second
     with pytest.raises(OSError, match="the loop breaks"):
         run(body)
@@ -135,7 +135,7 @@ def test_watchdog_waits_for_a_whole_descent(monkeypatch, height, down_s):
 
 
 def test_unreadable_body_gets_time_to_land(monkeypatch):
-    monkeypatch.setattr(loop, "AGAIN_S", 0.02)
+    monkeypatch.setattr(descent, "AGAIN_S", 0.02)
     body = Airborne("read")
     with pytest.raises(OSError, match="read fails"):
         run(body)
@@ -144,7 +144,7 @@ def test_unreadable_body_gets_time_to_land(monkeypatch):
 
 
 def test_failed_stop_is_repeated(monkeypatch):
-    monkeypatch.setattr(loop, "AGAIN_S", 0.02)
+    monkeypatch.setattr(descent, "AGAIN_S", 0.02)
     body = Airborne("stop", steps=0)
     with pytest.raises(OSError, match="stop fails"):
         run(body)
@@ -153,7 +153,7 @@ def test_failed_stop_is_repeated(monkeypatch):
 
 
 def test_emergency_stop_during_a_descent(monkeypatch):
-    monkeypatch.setattr(loop, "FAREWELL_S", 30.0)
+    monkeypatch.setattr(descent, "FAREWELL_S", 30.0)
     body = Airborne(steps=10**9)
 
     def stop() -> None:

@@ -8,7 +8,7 @@ from agents.body.fleet import assemble
 from agents.network import messages, name_ownership, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.runtime import loop
+from agents.runtime import descent, loop
 from agents.runtime.loop import Phase, Runtime, Setup
 from experiments.definition import bodies
 from experiments.definition.plan import Plan
@@ -27,7 +27,8 @@ class Stage:
         self.now, self.net, self.arrivals, self.rung = 1000.0, net, list(arrivals), False
         self.known, self.ticks = [], []  # times of A: of the reception of each pose, of each tick
         self.stopped_at = float("inf")
-        monkeypatch.setattr(loop, "time", types.SimpleNamespace(sleep=self.wait))
+        for module in (loop, descent):
+            monkeypatch.setattr(module, "time", types.SimpleNamespace(sleep=self.wait))
         monkeypatch.setattr(pubsub, "Bell", lambda: self)
         for module in (loop, name_ownership):
             monkeypatch.setattr(module, "uptime", lambda: self.now)

@@ -35,7 +35,7 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> type[EmergencyStop]:
     monkeypatch.setattr(EmergencyStop, "look", look)
     monkeypatch.setattr(EmergencyStop, "send", send)
     monkeypatch.setenv(orders.CONNECT, "tcp/127.0.0.1:1")
-    monkeypatch.setattr("agents.runtime.run_registry.runs", list)
+    monkeypatch.setattr("experiments.real_time.hosts.run_registry.runs", list)
     return EmergencyStop
 
 

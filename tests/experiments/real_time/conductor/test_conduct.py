@@ -5,11 +5,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from agents.runtime import run_registry
 from experiments.definition.experiment import Formation, Host, Robot
 from experiments.definition.plan import Plan
 from experiments.file.problems import DocumentError
 from experiments.real_time.conductor.conduct import check_other_runs, hardware
+from experiments.real_time.hosts import run_registry
 from tests.agents.few import pair
 
 RADIO = "radio://0/80/2M/E7E7E7E701"

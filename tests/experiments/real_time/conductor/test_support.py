@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from agents.network.endpoints import Endpoint, free_endpoint
-from agents.runtime import run_registry
 from experiments.definition.plan import Plan
 from experiments.file import document
 from experiments.real_time.conductor import conduct
 from experiments.real_time.conductor.case_context import CaseContext
 from experiments.real_time.conductor.conduct import PORT_CHOICES, RunOptions, Supervision, embody, staged
 from experiments.real_time.conductor.support import STARTS, RouterEnded, Servants
+from experiments.real_time.hosts import run_registry
 from experiments.real_time.hosts.hosts import Hosts
 from experiments.real_time.hosts.launcher import ROUTER, Launcher
 

@@ -11,7 +11,7 @@ import pytest
 from agents.network import messages, shutdown
 from agents.network import session as network
 from agents.network.keys import Keys
-from agents.runtime import loop
+from agents.network.shutdown import FAREWELL_S, STOPPED_S
 from experiments.real_time.processes.recorder import AFTER_S, Recorder, with_truth
 from tests.conftest import RouterProcess
 from tests.experiments.recordings import START, state, touched, world
@@ -34,7 +34,7 @@ class Taken:
 
 def test_servers_and_recorders_wait_for_the_longest_descent() -> None:
     assert shutdown.AFTER_S == AFTER_S
-    assert AFTER_S > 2.0 * loop.FAREWELL_S + loop.STOPPED_S
+    assert AFTER_S > 2.0 * FAREWELL_S + STOPPED_S
 
 
 @pytest.mark.system

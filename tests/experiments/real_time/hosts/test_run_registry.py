@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from agents.network.endpoints import free_endpoint
-from agents.runtime import run_registry
-from agents.runtime.run_registry import Run, born, own_entry, registered, runs
+from experiments.real_time.hosts import run_registry
+from experiments.real_time.hosts.run_registry import Run, born, own_entry, registered, runs
 
 
 @pytest.fixture(autouse=True)

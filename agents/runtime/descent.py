@@ -1,0 +1,153 @@
+"""Landing of the robots of a process by other means than their decisions, and the end of their body."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from math import inf
+
+import zenoh
+
+from agents.body.interface import Body
+from agents.decision.lifecycle import Phase
+from agents.network.name_ownership import ANSWER_S, NameKeeper
+from agents.network.shutdown import FAREWELL_S, STOPPED_S
+from agents.robot import Robot
+from agents.runtime.watchdog import AGAIN_S, DOWN_S, Watchdog
+from agents.safety.detection import SLOWEST
+from agents.ticks import Ticks
+
+
+class Descent:
+    """Halts and lands the robots of one process when it stood still, when its loop hangs, and when the loop is over.
+
+    A body that belongs to another process, or may do so, is left as it is.
+    """
+
+    session: zenoh.Session  # set before the loop begins
+
+    def __init__(
+        self,
+        robots: Sequence[Robot],
+        body: Body,
+        keeper: NameKeeper,
+        ticks: Ticks,
+        *,
+        silence_s: float,  # [s] without a tick after which the watchdog lands the robots
+        alarm: Callable[[str], object],  # tells the other processes why they land, in another thread
+        recover: Callable[[str], object],  # lands the robots by their decisions, for a reason
+    ) -> None:
+        self.begun = False  # the loop is over
+        self.airborne = False  # a row flew at the last reading of its body, or took off since
+        self.reason_to_end: Callable[[], str | None] = lambda: None
+        kinds = [robot.assignment.kind for robot in robots]
+        self._robots, self._body, self._keeper, self._ticks = robots, body, keeper, ticks
+        self._recover = recover
+        self._limits = robots[0].assignment.limits  # those of the experiment
+        self._everyone = tuple(range(len(robots)))
+        self._on_wheels = tuple(row for row, kind in enumerate(kinds) if not kind.flies)
+        ceiling = self._limits.high[2] if any(kind.flies for kind in kinds) else 0.0
+        longest_s = ceiling / SLOWEST  # [s] landing: what still descends after a limit would fall
+        self.limit_s = max(FAREWELL_S, longest_s)  # [s] for a landing
+        down_s = max(DOWN_S, longest_s)
+        self.watchdog = Watchdog(body, self._everyone, alarm=alarm, silence_s=silence_s, down_s=down_s)
+
+    def await_ownership(self) -> bool:
+        """Whether the process stood still since the last call; then it has waited until the ownership was certain.
+
+        Until then it must not command its bodies, since another process may drive them. Without an answer those on
+        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
+        the process drives its bodies again then, until it learns that they belong to another one.
+        """
+        if not self._keeper.stood_still() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
+            return False
+        limits, drives = self._limits, self._on_wheels
+        woke, self._keeper.hands_off = self._ticks.elapsed(), True
+        self._keeper.begin_check(self.session)
+        while not self._keeper.is_owner():
+            waited = self._ticks.elapsed() - woke
+            if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
+                self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
+                break
+            if drives and waited > limits.link_silence_s:
+                self._body.land(drives)
+                drives = ()
+            self.watchdog.beat()
+            time.sleep(self._ticks.period)
+        self._keeper.stood_still()
+        self._keeper.hands_off = False
+        return True
+
+    def register(self, steps: ExitStack) -> None:
+        """Register the steps of the end: land what still flies, stop it, end the watchdog, close the body."""
+        steps.callback(self._close_body)
+        steps.callback(self.watchdog.end)
+        steps.callback(self._order_down, self._body.stop, STOPPED_S)
+        steps.callback(self._land)
+
+    def _close_body(self) -> None:
+        if not self._keeper.hands_off:
+            self._body.close()
+
+    def _land(self) -> None:
+        """Lands robots that still fly after an error, before the motors are switched off."""
+        if self._keeper.hands_off:
+            return
+        self.begun = True
+        self.watchdog.start()
+        failures: list[Exception] = []
+        if self._in_the_air(failures) and any(
+            robot.lifecycle.phase < Phase.DONE for robot in self._robots
+        ):  # else it was stopped
+            error = sys.exception()
+            why = (
+                "it did not land in time"
+                if error is None
+                else f"its control loop broke: {type(error).__name__}: {error}"
+            )
+            self.watchdog.call_for_help(why)
+            self._order_down(self._body.land, self.limit_s)
+        if failures:
+            raise failures[0]
+
+    def _order_down(self, order: Callable[[Sequence[int]], object], limit_s: float) -> None:
+        """Repeats an order until it succeeds and no row flies any more, for at most `limit_s` [s].
+
+        A body that cannot be read gets all of that time if it flew before. The first error is raised at the end.
+        """
+        if self._keeper.hands_off:
+            return
+        failures: list[Exception] = []
+        begin, again, obeyed = self._ticks.elapsed(), -inf, False
+        while True:
+            self.watchdog.beat()
+            self.await_ownership()
+            if (now := self._ticks.elapsed()) >= again:
+                again = now + AGAIN_S
+                obeyed = False
+                with _noted(failures):
+                    order(self._everyone)
+                    obeyed = True
+            if (obeyed and not self._in_the_air(failures)) or now > begin + limit_s:
+                break
+            time.sleep(self._ticks.period)
+        if failures:
+            raise failures[0]
+
+    def _in_the_air(self, failures: list[Exception]) -> bool:
+        """Whether a row flies, by the last successful reading of its body; an error is noted."""
+        with _noted(failures):
+            states = self._body.read(max(self._ticks.t, self._ticks.elapsed()))
+            self.airborne = any(state.flying for state in states)
+        return self.airborne
+
+
+@contextmanager
+def _noted(failures: list[Exception]) -> Iterator[None]:
+    """Keeps the first error, to be raised when all has been tried."""
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001
+        failures[:] = failures or [error]
