@@ -13,7 +13,7 @@ subprocess.run([sys.executable, "-c", shows], check=True)
 """
 
 
-def test_ctrl_c_reaches_the_children_of_tests_that_run_in_the_background_of_a_shell():
+def test_ctrl_c_reaches_children_of_background_tests():
     in_background = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-c", CHILD]
     done = subprocess.run(in_background, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"

@@ -173,7 +173,7 @@ def plugged_in() -> set[str]:
     return set(re.findall(r'= "((?:agents|bridges|twins|experiments|tools)[\w.]*):', text))
 
 
-def test_every_folder_says_what_lives_there_and_imports_no_more_than_it_says():
+def test_folders_describe_themselves_and_import_what_they_say():
     silent, beyond = [], []
     for folder in sorted({file.parent for file in modules().values()}):
         tree = ast.parse((folder / "__init__.py").read_text("utf-8"))

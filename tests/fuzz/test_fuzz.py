@@ -51,7 +51,7 @@ def test_every_example_is_found_by_name() -> None:
     assert sum(place.inputs for place in PLACES.values()) >= 1_000_000
 
 
-def test_inputs_are_the_same_for_a_seed_and_not_too_long() -> None:
+def test_inputs_repeat_with_the_seed_and_stay_short() -> None:
     examples = [b'{"a":[1,2.5,"x"]}', b'{"b":null}']
     first, second = (Mutator(examples, np.random.default_rng(3)) for _ in range(2))
     made = [first.spoilt() for _ in range(500)]

@@ -30,7 +30,7 @@ def it():
     return active
 
 
-def test_the_end_of_a_process_is_reported_since_the_fault(it):
+def test_end_of_a_process_is_reported_since_fault(it):
     it.observer.events.append(Event(0.0, "router2", "", "ended with exit code 1"))
     assert it.reported("router")() == ""
     assert it.reported("recorder")() == "the end of the recorder is not reported"

@@ -81,7 +81,7 @@ def test_every_kind_is_defined_in_a_sentence():
     assert all(kind.begin.__doc__.endswith(".") for kind in FAULT_KINDS.values())
 
 
-def test_defaults_keep_robots_apart_and_fit_the_rates_of_the_file():
+def test_defaults_keep_robots_apart_and_fit_files_rates():
     assert AVOIDANCE in defaults(load("robotic-park").plan)
     assert "rates.body_hz=50" in defaults(load("robotic-park").plan)
     avoiding = load("robotic-park", 'avoidance.kind="potential"', "rates.pose_hz=100").experiment

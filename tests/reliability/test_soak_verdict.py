@@ -42,11 +42,11 @@ def test_nothing_is_wrong():
     assert [row[0] for row in table(made)[1:]] == ["CF02", "TB01", "recorder", "router"]
 
 
-def test_memory_that_is_taken_before_the_warm_up_does_not_count():
+def test_memory_taken_before_the_warm_up_is_ignored():
     assert passed(judge(soaked(lambda name, t: {"rss_mb": 60.0 + min(t, 250.0) / 10.0})))
 
 
-def test_pools_that_fill_in_the_first_minutes_of_a_short_run_do_not_count():
+def test_pools_filling_early_in_short_runs_are_ignored():
     made = soaked(lambda name, t: {"rss_mb": 60.0 + min(t, 150.0) / 15.0}, until=420.0)
     assert passed(judge(replace(made, duration_s=420.0)))
 
@@ -77,7 +77,7 @@ def test_the_dead_are_named():
     assert found == ["CF02 ended after 12 s"]
 
 
-def test_a_robot_that_landed_early_fails_a_soak_although_its_process_lives(tmp_path):
+def test_early_landed_robot_fails_soak_though_process_lives(tmp_path):
     with Sampler(load("triangle").plan, tmp_path, "event") as sampler:
         events = [
             ("hazard", "CF01", "hold: silent neighbour KH01"),
@@ -101,7 +101,7 @@ def test_memory_of_a_short_run_is_not_judged():
 
 
 @pytest.mark.parametrize("begun", [True, False])
-def test_a_run_that_fails_on_the_way_is_judged_and_one_that_never_began_is_an_error(begun, tmp_path, monkeypatch):
+def test_failed_run_is_judged_and_unstarted_one_errs(begun, tmp_path, monkeypatch):
     def broken(read, folder, options, user):
         with user.show as show:
             if begun:

@@ -31,7 +31,7 @@ def experiment(folder: Path, endpoint: str) -> str:
     return str(file)
 
 
-def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess, tmp_path: Path) -> None:
+def test_present_robot_is_adopted_unless_it_has_flown(router: RouterProcess, tmp_path: Path) -> None:
     file = experiment(tmp_path, router.endpoint)
     short = ("--case", "event", *SHORT)
     at_boot = RobotProcess(router.endpoint, "join", "KH02", "--once")
@@ -61,7 +61,7 @@ def test_who_is_there_is_adopted_and_who_has_flown_is_not(router: RouterProcess,
     assert by_hand.end() == 0
 
 
-def test_who_joins_in_a_lab_needs_its_own_files_alone(tmp_path: Path) -> None:
+def test_lab_member_needs_only_its_own_files(tmp_path: Path) -> None:
     lab, own = tmp_path / "lab", tmp_path / "robot" / "zenpark-lab"
     robots: dict[str, Role] = dict.fromkeys(("KH01", "KH02", "CF01"), "robot")
     authority.create(lab, {**{role: role for role in authority.SERVICES}, **robots})

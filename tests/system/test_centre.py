@@ -48,7 +48,7 @@ HYBRID = '{ kind = "hybrid", robots = ["TB01", "KH01"] }'
 
 @pytest.mark.mechanism("central controller: killed")
 @pytest.mark.timeout(120)
-def test_robots_hold_while_the_centre_is_dead_and_go_on_when_it_is_back(tmp_path: Path) -> None:
+def test_robots_hold_while_the_centre_is_dead(tmp_path: Path) -> None:
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=12.0, architecture=HYBRID))
     flight = Flight(folder, str(file), "--json", "--no-report")
@@ -172,7 +172,7 @@ def test_by_hand_and_what_nobody_should_believe(router: RouterProcess, tmp_path:
 
 
 @pytest.mark.timeout(120)
-def test_a_lab_lets_the_centre_decide_and_nobody_else(tmp_path: Path) -> None:
+def test_lab_lets_only_the_centre_decide(tmp_path: Path) -> None:
     """Its own certificate is its right: a robot's gives none over others, and a router that died enforces it again."""
     file, folder = tmp_path / "three.toml", tmp_path / "run"
     file.write_text(FAST.format(duration=8.0, architecture=HYBRID) + '[network]\nlab = "lab"\n')

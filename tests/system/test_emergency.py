@@ -35,7 +35,7 @@ trigger = {{ kind = "send-on-delta", threshold = 0.01 }}
 
 
 @pytest.mark.timeout(120)
-def test_every_run_of_the_machine_ends_says_why_and_no_other_case_begins(
+def test_every_run_of_the_machine_ends_with_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, folder = tmp_path / "two.toml", tmp_path / "run"

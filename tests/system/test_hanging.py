@@ -117,9 +117,7 @@ def test_a_loop_that_hangs_is_landed_and_said(router: RouterProcess, watcher: Tr
             process.wait(30)
 
 
-def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
-    router: RouterProcess, watcher: Truth, tmp_path: Path
-) -> None:
+def test_process_frozen_aloft_is_landed_and_notices(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     world = WorldProcess(router.endpoint, lonely(tmp_path))
     robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
     try:
@@ -144,9 +142,7 @@ def test_what_was_frozen_in_the_air_is_landed_and_knows_it(
         world.end()
 
 
-def test_what_was_frozen_and_replaced_leaves_its_body_to_the_new_one(
-    router: RouterProcess, watcher: Truth, tmp_path: Path
-) -> None:
+def test_frozen_process_leaves_body_to_its_replacement(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     world = WorldProcess(router.endpoint, lonely(tmp_path))
     started = [RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")]
     try:
@@ -179,7 +175,7 @@ def test_what_was_frozen_and_replaced_leaves_its_body_to_the_new_one(
         world.end()
 
 
-def test_a_stop_behind_a_flood_of_what_is_none_is_obeyed(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
+def test_stop_behind_a_flood_of_deletions_is_obeyed(router: RouterProcess, watcher: Truth, tmp_path: Path) -> None:
     world = WorldProcess(router.endpoint, lonely(tmp_path))
     robot = RobotProcess(router.endpoint, tmp_path / "lonely.toml", "TE01")
     try:
@@ -197,7 +193,7 @@ def test_a_stop_behind_a_flood_of_what_is_none_is_obeyed(router: RouterProcess, 
         world.end()
 
 
-def test_a_process_that_hangs_in_the_final_landing_fails_the_run(tmp_path: Path) -> None:
+def test_process_hanging_in_final_landing_fails_the_run(tmp_path: Path) -> None:
     file = tmp_path / "short.toml"
     file.write_text(
         'title = "short"\nduration_s = 1.5\ntrigger = { kind = "periodic" }\n'

@@ -34,7 +34,7 @@ def written(folder: Path, safety: str) -> Path:
     return file
 
 
-def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
+def test_robot_too_near_holds_and_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, str(written(tmp_path, "separation = 0.5")), "--no-report")
     flight.until_said(r"hazard [AB]: hold: minimum separation: 0\.\d\d m from [AB] \(limit 0\.5 m\)")
@@ -51,7 +51,7 @@ def test_who_comes_too_near_holds_and_the_run_says_so(tmp_path: Path) -> None:
     assert [incident.text.partition(":")[0] for incident in status.incidents] == ["hold", "unresolved at the end"]
 
 
-def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path) -> None:
+def test_drone_with_low_battery_lands_and_others_continue(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     low = ("--set", "safety.battery_low=0.985", "--set", "duration_s=8")  # it flies for 7 minutes on a charge
     flight = Flight(folder, "triangle", "--case", "event", "--no-report", *low)
@@ -69,7 +69,7 @@ def test_a_drone_whose_battery_is_low_lands_and_the_others_go_on(tmp_path: Path)
     assert ends["KH01"] == "done: finished"
 
 
-def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterProcess, tmp_path: Path) -> None:
+def test_uncharged_robot_does_not_take_off_with_reason(router: RouterProcess, tmp_path: Path) -> None:
     watcher = Watcher(router.endpoint)
     robots = RobotProcess(router.endpoint, written(tmp_path, "battery_min = 1.0"), "A", "B")
     try:
@@ -83,7 +83,7 @@ def test_nobody_takes_off_without_charge_and_the_reason_is_shown(router: RouterP
 
 
 @pytest.mark.mechanism("hazard: conductor lost")
-def test_without_the_conductor_robots_end_if_the_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
+def test_robots_without_conductor_end_if_file_says_so(router: RouterProcess, tmp_path: Path) -> None:
     watcher = Watcher(router.endpoint)
     token = pubsub.alive_token(watcher.session, watcher.keys.conductor)
     file = written(tmp_path, 'lost_conductor = "land"')

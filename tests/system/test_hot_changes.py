@@ -93,7 +93,7 @@ def lab(tmp_path: Path) -> Iterator[Lab]:
     made.close()
 
 
-def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
+def test_killed_robot_is_restarted_and_takes_part(lab: Lab) -> None:
     lab.fly()
     first = lab.watcher.status["CF01"].pid
     os.kill(first, signal.SIGKILL)
@@ -124,7 +124,7 @@ def test_a_killed_robot_is_started_again_and_takes_part(lab: Lab) -> None:
 
 
 @pytest.mark.mechanism("hot change: hold, remove, add")
-def test_robots_hold_leave_and_come_while_the_others_go_on(lab: Lab) -> None:
+def test_robots_hold_leave_and_come_while_others_continue(lab: Lab) -> None:
     lab.fly()
     watcher = lab.watcher
     said = lab.zenpark("hold", "CF01")
@@ -204,7 +204,7 @@ def test_robots_of_one_process_come_together(lab: Lab) -> None:
     assert lab.end()[0] in (0, 130)
 
 
-def test_who_was_started_by_hand_leaves_and_is_let_in_again(router: RouterProcess, lab: Lab) -> None:
+def test_hand_started_robot_leaves_and_is_readmitted(router: RouterProcess, lab: Lab) -> None:
     lab.file.write_text(lab.file.read_text() + f'\n[network]\nconnect = ["{router.endpoint}"]\n')
     by_hand = RobotProcess(router.endpoint, lab.file, "CF01", "--case", "event")
     again: RobotProcess | None = None
@@ -225,7 +225,7 @@ def test_who_was_started_by_hand_leaves_and_is_let_in_again(router: RouterProces
                 robot.end()
 
 
-def test_a_spare_takes_over_by_itself_when_a_robot_is_lost(lab: Lab) -> None:
+def test_spare_takes_over_from_a_lost_robot(lab: Lab) -> None:
     lab.fly("on_loss=replace")
     os.kill(lab.watcher.status["CF01"].pid, signal.SIGKILL)
     lab.flight.until_said("changed CF01: S1 has its name and takes part")

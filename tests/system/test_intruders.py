@@ -109,7 +109,7 @@ def test_an_ended_certificate_is_refused(laboratory: Laboratory, tmp_path: Path)
             laboratory.session(identity, old)
 
 
-def test_a_self_made_authority_of_the_same_name_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_self_made_authority_of_same_name_is_refused(laboratory: Laboratory, tmp_path: Path) -> None:
     forger = copy(laboratory.folder, tmp_path / "forger")
     authority.renew(forger, authority=True)
     (forger / "ca.pem").write_bytes((laboratory.folder / "ca.pem").read_bytes())
@@ -136,7 +136,7 @@ def test_a_robots_certificate_does_not_make_a_router(laboratory: Laboratory, tmp
         zenoh.open(config(settings("client", connect=[honest], name="KH01")))
 
 
-def test_a_router_elsewhere_than_its_certificate_says_is_refused(laboratory: Laboratory) -> None:
+def test_router_outside_its_certificates_addresses_is_refused(laboratory: Laboratory) -> None:
     address = laboratory.plain.rpartition(":")[2]
     (endpoint,) = lab.secured([f"tls/127.0.0.2:{address}"], laboratory.folder)
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
@@ -198,7 +198,7 @@ def test_orders_are_the_operators(laboratory: Laboratory, who: str) -> None:
 
 
 @pytest.mark.parametrize(("who", "part"), [("observer", "pose"), ("operator", "pose"), ("operator", "order")])
-def test_a_wildcard_that_may_be_asked_is_answered_by_all(laboratory: Laboratory, who: str, part: str) -> None:
+def test_queryable_wildcard_is_answered_by_all(laboratory: Laboratory, who: str, part: str) -> None:
     order = (
         {}
         if part == "pose"
@@ -273,7 +273,7 @@ def test_no_one_takes_anothers_place(laboratory: Laboratory) -> None:
 # ---------------------------------------------------------------------- who has stolen a key of somebody who may
 
 
-def test_samples_that_are_said_again_are_not_believed_again(laboratory: Laboratory, flight: Flight) -> None:
+def test_replayed_samples_are_not_believed_again(laboratory: Laboratory, flight: Flight) -> None:
     """With the very key of KH01, its own poses of a moment ago, twenty times each."""
     with pubsub.pose_subscriber(laboratory.watcher.session, KEYS.pose("KH01"), 500) as ear:
         settled(laboratory)
@@ -290,7 +290,7 @@ def test_samples_that_are_said_again_are_not_believed_again(laboratory: Laborato
         assert twice < 120 < 20 * len(taken), "each once, give or take the age of a status"
 
 
-def test_nonsense_at_ten_thousand_a_second_is_counted_and_forgotten(laboratory: Laboratory, flight: Flight) -> None:
+def test_nonsense_at_ten_thousand_hertz_is_counted(laboratory: Laboratory, flight: Flight) -> None:
     """From a robot that has gone mad, on its own key: KH01's, in a thief's hands."""
     flight.mad = "KH01"
     nonsense = [b"", b"{", b"[" * 1000, os.urandom(200), b'{"robot":"KH01","seq":NaN}', forged("KH02"), b"null"]
@@ -314,7 +314,7 @@ def test_what_is_too_large_does_not_arrive(laboratory: Laboratory) -> None:
         settled(laboratory)
 
 
-def test_denied_samples_at_ten_thousand_a_second_arrive_nowhere(laboratory: Laboratory) -> None:
+def test_denied_samples_at_ten_thousand_hertz_arrive_nowhere(laboratory: Laboratory) -> None:
     with laboratory.session("observer") as session:
         for count in steady(10_000, 1.5):
             say(session, (KEYS.estop, KEYS.pose("KH01"), "park/**")[count % 3], STOP)

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.system
 KEYS = Keys()
 
 
-def test_one_command_runs_it_and_others_look_and_stop_it(tmp_path: Path) -> None:
+def test_one_command_runs_while_others_watch_and_stop(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
@@ -72,7 +72,7 @@ def test_what_is_missing_is_said_before_anything_starts(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
 
 
-def test_a_router_of_a_lab_listens_on_every_interface(tmp_path: Path) -> None:
+def test_lab_router_listens_on_every_interface(tmp_path: Path) -> None:
     authority.create(tmp_path / "lab", {"router": "router"})
     process = subprocess.Popen(
         [sys.executable, "-m", "tools.guard", "router", str(FILE), "--lab", str(tmp_path / "lab"),
@@ -110,7 +110,7 @@ class Ear:
 @pytest.mark.parametrize(
     "laboratory", [pytest.param("tls", marks=pytest.mark.mechanism("revocation")), "quic"], indirect=True
 )
-def test_a_revoked_key_is_refused_by_a_router_that_runs(laboratory: Laboratory, tmp_path: Path) -> None:
+def test_revoked_key_is_refused_by_a_running_router(laboratory: Laboratory, tmp_path: Path) -> None:
     stolen = copy(laboratory.folder, tmp_path / "stolen")
     key = KEYS.pose("KH01")
     with laboratory.session("operator") as operator, laboratory.session("KH01", stolen) as thief:
@@ -150,7 +150,7 @@ def test_a_new_authority_refuses_every_earlier_file(laboratory: Laboratory, tmp_
         until(lambda: not network.connected(before), "who was connected is out")
 
 
-def test_robots_go_on_with_their_new_files_where_those_are_put(laboratory: Laboratory) -> None:
+def test_robots_continue_with_new_files_where_installed(laboratory: Laboratory) -> None:
     """A revocation costs a moment of the network; whoever finds new files in its folder is back by itself."""
     laboratory.fly()
     authority.revoke(laboratory.folder, ["KH01", "KH03"])

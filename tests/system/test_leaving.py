@@ -25,7 +25,7 @@ pytestmark = pytest.mark.system
 CUT_OFF_S = 3.0  # until the loss of the router is noticed: before that good-byes are still taken
 
 
-def test_a_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
+def test_robot_leaves_a_router_that_does_not_answer(router: RouterProcess) -> None:
     watcher = Watcher(router.endpoint)
     robot = RobotProcess(router.endpoint, "triangle", "KH01")
     try:
@@ -46,7 +46,7 @@ def stopped(pid: int) -> bool:
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
 
 
-def test_a_router_that_was_frozen_ends_when_it_is_told_to() -> None:
+def test_router_that_was_frozen_ends_when_ordered() -> None:
     """The kernel then gives the signal to any of its threads, at every second time to one that does not heed it."""
     for _ in range(4):
         router = RouterProcess()
@@ -56,7 +56,7 @@ def test_a_router_that_was_frozen_ends_when_it_is_told_to() -> None:
         assert router.stop() == 0
 
 
-def test_a_session_is_left_in_time_and_a_live_one_at_once(router: RouterProcess) -> None:
+def test_session_closes_in_time_and_live_ones_immediately(router: RouterProcess) -> None:
     sessions = [network.open_session([router.endpoint], name="test", lease_s=1.0) for _ in range(2)]
     declared = [pubsub.pose_subscriber(sessions[1], Keys().status("*"))]
     assert leave(sessions[0])
@@ -89,7 +89,7 @@ def test_an_estop_that_nobody_answers_ends(router: RouterProcess) -> None:
 
 
 @pytest.mark.parametrize("bodies", ["twin", "world"])
-def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
+def test_frozen_robot_delays_nobody_when_launcher_is_killed(tmp_path: Path, bodies: str) -> None:
     flight = Flight(tmp_path / "run", "triangle", "--bodies", bodies, "--set", "duration_s=60")
     flight.until_said("formation")
     children = flight.children()
@@ -111,7 +111,7 @@ def test_a_frozen_robot_keeps_nobody_when_the_launcher_is_killed(tmp_path: Path,
                 continue
 
 
-def test_a_conductor_that_stood_still_gives_no_further_order(tmp_path: Path) -> None:
+def test_suspended_conductor_gives_no_further_order(tmp_path: Path) -> None:
     flight = Flight(tmp_path / "run", "triangle", "--case", "event", "--no-report")
     flight.until_said(r"phase conductor: formation", 60.0)
     robots = [process for name, process in flight.children().items() if name in ("KH01", "KH02", "CF01")]

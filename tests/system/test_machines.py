@@ -77,7 +77,7 @@ def busy(lab: Machines) -> list[str]:
     return [f"{name}: {process}" for name, each in lab.machines.items() for process in each.processes()]
 
 
-def test_one_command_flies_the_reference_experiment_and_brings_everything_back(lab: Machines, tmp_path: Path) -> None:
+def test_one_command_flies_reference_and_fetches_all_files(lab: Machines, tmp_path: Path) -> None:
     file, folder = experiment(lab, tmp_path, 4.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", "--json")
     out, _ = flight.communicate(timeout=100)
@@ -121,7 +121,7 @@ def test_one_command_flies_the_reference_experiment_and_brings_everything_back(l
     assert re.search(r"\+20\d\.\d{3}", report)
 
 
-def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: Machines, tmp_path: Path) -> None:
+def test_centre_here_guides_remote_robots_by_one_clock(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 3.0), tmp_path / "run"
     options = ["--case", "periodic", "--set", "architecture=centralised", "--anyway", "--no-report"]
     flight = zenpark(lab, "run", str(file), *options, "--out", str(folder))
@@ -140,7 +140,7 @@ def test_a_centre_here_guides_robots_elsewhere_and_all_stamp_by_one_clock(lab: M
 
 
 @pytest.mark.mechanism("hosts: way out")
-def test_after_the_death_of_the_launcher_everybody_lands_and_all_is_gone(lab: Machines, tmp_path: Path) -> None:
+def test_launchers_death_lands_everybody_and_clears_all(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 20.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "periodic", "--out", str(folder), "--anyway", *NEAR_TRIANGLE)
     logs, flying = folder / "logs", ("KH01", "KH02", "CF01")
@@ -168,7 +168,7 @@ def said(logs: Path, robot: str, case: str = "event") -> str:
     return file.read_text() if file.exists() else ""
 
 
-def test_a_machine_that_is_cut_off_lands_its_robots_and_the_others_go_on(lab: Machines, tmp_path: Path) -> None:
+def test_machine_cut_off_lands_its_robots_only(lab: Machines, tmp_path: Path) -> None:
     file, folder = triangle(lab, tmp_path, 8.0), tmp_path / "run"
     flight = zenpark(lab, "run", str(file), "--case", "event", "--out", str(folder), "--anyway", "--no-report")
     until(lambda: "running" in said(folder / "logs", "CF01"), "it runs", 60.0)
@@ -200,7 +200,7 @@ def test_a_short_cut_of_the_cable_lands_nobody(lab: Machines, tmp_path: Path) ->
     until(lambda: not busy(lab), "nothing is left")
 
 
-def test_a_robot_that_dies_on_a_machine_is_started_again_there(lab: Machines, tmp_path: Path) -> None:
+def test_dead_robot_on_a_machine_is_restarted_there(lab: Machines, tmp_path: Path) -> None:
     file, folder = tmp_path / "x.toml", tmp_path / "run"
     text = catalogue.path("triangle").read_text("utf-8").replace("duration_s = 15.0", "duration_s = 12.0")
     text = text.replace("seed = 1 ", 'on_loss = "restart"\nseed = 1 ')
@@ -242,7 +242,7 @@ def test_hosts_check_tells_of_each_machine(lab: Machines, tmp_path: Path) -> Non
     assert abs(float(offset[1]) - 1e3 * OFFSET_S) < 5.0
 
 
-def test_what_is_wrong_with_a_machine_is_told_with_a_remedy(lab: Machines, tmp_path: Path) -> None:
+def test_faults_of_machines_are_reported_with_remedy(lab: Machines, tmp_path: Path) -> None:
     file = experiment(lab, tmp_path, 4.0)
     text = file.read_text()
     text = text.replace(str(lab["lab1"].folder / "zenpark"), "nowhere/zenpark")

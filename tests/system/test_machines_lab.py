@@ -84,7 +84,7 @@ class Laboratory:
             assert f"{robot}: done (finished)" in log, log
 
 
-def test_each_machine_gets_its_own_keys_and_all_fly_through_ssh(lab: Machines, tmp_path: Path) -> None:
+def test_machines_get_own_keys_and_fly_through_ssh(lab: Machines, tmp_path: Path) -> None:
     made = Laboratory(lab, tmp_path)
     code, out = made.zenpark("hosts", "check")
     assert code == 1, out
@@ -118,7 +118,7 @@ def test_each_machine_gets_its_own_keys_and_all_fly_through_ssh(lab: Machines, t
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
-def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tmp_path: Path, protocol: str) -> None:
+def test_remote_robots_reach_a_router_listening_for_them(lab: Machines, tmp_path: Path, protocol: str) -> None:
     made = Laboratory(lab, tmp_path, f'listen = ["{protocol}/0.0.0.0:7447"]')
     assert made.zenpark("hosts", "install")[0] == 0
     code, out = made.fly()
@@ -131,7 +131,7 @@ def test_robots_elsewhere_reach_a_router_that_listens_for_them(lab: Machines, tm
     made.flew()
 
 
-def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tmp_path: Path) -> None:
+def test_faults_of_certificates_are_reported_with_remedy(lab: Machines, tmp_path: Path) -> None:
     made = Laboratory(lab, tmp_path)
     assert made.zenpark("hosts", "install")[0] == 0
     authority.revoke(made.keys, ["KH01"])
@@ -158,7 +158,7 @@ def test_what_is_wrong_with_certificates_is_told_with_a_remedy(lab: Machines, tm
     assert "the certificate of KH02" in out
 
 
-def test_robots_follow_a_clock_that_drifts_during_the_run(lab: Machines, tmp_path: Path) -> None:
+def test_robots_follow_a_clock_that_drifts_meanwhile(lab: Machines, tmp_path: Path) -> None:
     drift = 2e-3  # forty times what is bad, so that seconds show it
     made = Laboratory(lab, tmp_path, drift=drift)
     assert made.zenpark("hosts", "install")[0] == 0

@@ -81,7 +81,7 @@ def test_the_reference_experiment_without_a_router(tmp_path: Path, capsys: pytes
     assert run.notes == ("event: lost CF02",) or "event" in run.traces
 
 
-def test_a_robot_that_is_cut_off_from_everybody_holds(tmp_path: Path) -> None:
+def test_robot_cut_off_from_everybody_holds(tmp_path: Path) -> None:
     flight = Flight(
         tmp_path / "run", "triangle", "--case", "periodic", "--no-report",
         "--set", "network.topology=mesh", "--set", "duration_s=60",
@@ -142,7 +142,7 @@ def free(count: int) -> list[str]:
     return sorted(found)
 
 
-def test_members_of_a_lab_let_nobody_do_what_is_not_his(tmp_path: Path) -> None:
+def test_lab_members_let_nobody_exceed_its_rights(tmp_path: Path) -> None:
     """There is no router that could refuse anything: whoever is told it does."""
     file = tmp_path / "mesh.toml"
     file.write_text(load("triangle").path.read_text() + '\n[network]\ntopology = "mesh"\nlab = "lab"\n')

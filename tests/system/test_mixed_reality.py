@@ -112,9 +112,7 @@ def kill_positioning(flight: Flight, session: zenoh.Session, robot: str) -> None
         Way("all", IN_THE_AIR, "CF02", "CF01"),
     ],
 )
-def test_a_real_robot_that_stands_in_the_way_of_a_twin_is_seen_and_avoided(
-    tmp_path: Path, router: RouterProcess, way: Way
-) -> None:
+def test_twin_sees_and_avoids_a_real_robot(tmp_path: Path, router: RouterProcess, way: Way) -> None:
     twin, real = way.twin, way.real
     file, folder = tmp_path / "mixed.toml", tmp_path / "run"
     file.write_text(WORLD.format(hears=way.hears, twin=twin, real=real) + way.robots)

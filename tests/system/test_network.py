@@ -38,7 +38,7 @@ def virtual(duration_s: float) -> Trace:
 
 
 @pytest.mark.mechanism("modelled channel in real time")
-def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Path) -> None:
+def test_receivers_lose_what_the_virtual_network_loses(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     changes = [
         part
@@ -73,7 +73,7 @@ def test_listeners_lose_the_samples_that_the_virtual_network_loses(tmp_path: Pat
     assert real.dropped.sum() == pytest.approx(0.3 * sent, rel=0.15)
 
 
-def test_a_centre_hears_and_is_heard_over_the_same_network(tmp_path: Path) -> None:
+def test_centre_communicates_over_the_same_network(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     changes = [part for change in (*BAD, "duration_s=4") for part in ("--set", change)]
     changes += ["--set", "architecture=centralised"]

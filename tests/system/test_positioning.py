@@ -31,7 +31,7 @@ plan = { kind = "line", move_by = [0.8, 0.0], speed = 0.2 }
 
 
 @pytest.mark.timeout(120)
-def test_positioning_is_started_again_and_the_end_of_a_device_is_told(tmp_path: Path) -> None:
+def test_positioning_is_restarted_and_devices_end_is_reported(tmp_path: Path) -> None:
     file, folder = tmp_path / "pair.toml", tmp_path / "run"
     file.write_text(PAIR)
     flight = Flight(folder, str(file), "--json", "--no-report")

@@ -37,7 +37,7 @@ def begin(folder: Path, *options: str, body: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.timeout(90)
-def test_one_hops_and_is_stopped_and_the_other_is_red(tmp_path: Path) -> None:
+def test_one_hops_and_stops_while_another_is_red(tmp_path: Path) -> None:
     process = begin(tmp_path, "--hop", "--stop", body="khepera4://127.0.0.1:9")
     out, err = process.communicate(timeout=80)
     assert process.returncode == 1, err

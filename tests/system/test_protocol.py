@@ -82,7 +82,7 @@ def heard_of(folder: Path) -> dict[str, object]:
     return {"topics": topics, "fields": {tuple(pose.__slots__) for pose in poses}}
 
 
-def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) -> None:
+def test_swap_is_one_word_without_difference_to_neighbours(tmp_path: Path) -> None:
     twins, protocol = tmp_path / "twins", tmp_path / "protocol"
     short = ("--case", "periodic", "--no-report", "--set", "duration_s=4")
     assert Flight(twins, "triangle", *short).finish()[0] == 0
@@ -96,7 +96,7 @@ def test_a_swap_is_one_word_and_neighbours_hear_no_difference(tmp_path: Path) ->
     assert heard_of(twins) == heard_of(protocol)
 
 
-def test_a_robot_that_does_not_move_is_said_on_the_console_and_fails_the_run(tmp_path: Path) -> None:
+def test_robot_that_does_not_move_fails_the_run(tmp_path: Path) -> None:
     """A Khepera whose server ignores `d`, and answers as one that obeys it."""
     twin = Served(khepera4.KheperaDevice, request("khepera4", ["khepera4-twin"], device={"server": "2023-01-15"}))
     file = tmp_path / "pair.toml"

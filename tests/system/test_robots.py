@@ -81,9 +81,7 @@ def test_each_robot_hears_exactly_its_neighbours(router: RouterProcess, watcher:
             assert all("estop" in key or "@adv" in key for key in beyond), beyond
 
 
-def test_a_late_joiner_and_a_restarted_robot_hear_the_last_poses_at_once(
-    router: RouterProcess, watcher: Watcher
-) -> None:
+def test_late_joiner_and_restarted_robot_receive_last_poses(router: RouterProcess, watcher: Watcher) -> None:
     with ExitStack() as stack:
         fly(stack, router, "triangle", "KH01")
         fly(stack, router, "triangle", "KH02")
@@ -187,7 +185,7 @@ def nonsense() -> list[tuple[bytes, str]]:
 
 
 @pytest.mark.mechanism("malformed messages")
-def test_nonsense_on_every_key_is_counted_and_moves_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
+def test_nonsense_on_every_key_is_counted_moving_nobody(router: RouterProcess, watcher: Watcher, low: str) -> None:
     with ExitStack() as stack:
         fly(stack, router, low, *TRIANGLE)
         watcher.until(lambda: all(watcher.phase(name) == "ready" for name in TRIANGLE), "all are ready")
@@ -243,7 +241,7 @@ def test_a_robot_whose_starter_falls_silent_lands(router: RouterProcess, watcher
         assert watcher.state["CF01"].position[2] < 0.03
 
 
-def test_what_a_user_can_mend_is_said_without_a_traceback(router: RouterProcess) -> None:
+def test_user_errors_are_reported_without_a_traceback(router: RouterProcess) -> None:
     for arguments, words in (
         (("triangle", "KH9"), "no robot 'KH9' in this experiment"),
         (("trangle", "KH01"), "did you mean 'triangle'"),

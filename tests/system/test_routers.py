@@ -94,7 +94,7 @@ def laboratory(tmp_path: Path) -> Iterator[tuple[Laboratory, str]]:
         second.stdout.close()  # type: ignore[union-attr]
 
 
-def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Laboratory, str]) -> None:
+def test_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Laboratory, str]) -> None:
     made, other = laboratory
     keys = made.watcher.keys
     assert msgspec.json.decode(made.rights.read_bytes(), type=Rights).linked
@@ -130,7 +130,7 @@ def test_an_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[L
 
 
 @pytest.mark.mechanism("router frozen")
-def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: RouterProcess, tmp_path: Path) -> None:
+def test_robots_hold_while_a_long_lease_router_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
     changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "safety.link_silence_s=0.6")
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "--no-report", *NEAR_TRIANGLE, *changes)
     flight.until_said("phase conductor: formation")
@@ -145,9 +145,7 @@ def test_robots_hold_while_a_router_with_a_long_lease_is_frozen(patient_router: 
     assert_held_in_time(flight, "periodic", stopped)
 
 
-def test_a_run_goes_on_at_the_second_router_while_the_first_with_a_long_lease_is_frozen(
-    patient_router: RouterProcess, tmp_path: Path
-) -> None:
+def test_run_continues_at_second_router_while_first_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
     second = RouterProcess(lease_s=60.0)
     try:
         both = f'network.connect=["{patient_router.endpoint}", "{second.endpoint}"]'

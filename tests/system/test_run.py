@@ -93,7 +93,7 @@ def test_a_recording_opens_elsewhere_with_typed_messages(whole: Whole) -> None:
     assert {"experiment.toml", "experiment.json"} <= set(names)
 
 
-def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> None:
+def test_ctrl_c_lands_everybody_and_leaves_valid_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--no-report")
     flight.until_said(r"phase conductor: formation")
@@ -109,7 +109,7 @@ def test_ctrl_c_lands_everybody_and_leaves_a_valid_recording(tmp_path: Path) -> 
     assert typed(folder / "event.mcap", "/CF01/status")[-1].phase == "done"
 
 
-def test_a_killed_follower_is_missed_and_the_others_go_on(tmp_path: Path) -> None:
+def test_killed_follower_is_missed_and_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", *SHORT)
     flight.until_said(r"phase conductor: formation")
@@ -143,7 +143,7 @@ def test_robots_fly_on_without_their_zygote(tmp_path: Path) -> None:
     assert gone(everyone)
 
 
-def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> None:
+def test_killed_router_comes_back_and_formation_holds(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", "--no-report", "--set", "duration_s=8")
     flight.until_said(r"phase conductor: formation")
@@ -165,7 +165,7 @@ def test_a_killed_router_comes_back_and_the_formation_holds(tmp_path: Path) -> N
         assert np.abs(side - target).mean() < 0.05
 
 
-def test_a_killed_conductor_leaves_no_orphan_and_a_recording_that_opens(tmp_path: Path) -> None:
+def test_killed_conductor_leaves_no_orphan_and_readable_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event")
     flight.until_said(r"phase conductor: formation")
@@ -190,7 +190,7 @@ def test_a_killed_conductor_leaves_no_orphan_and_a_recording_that_opens(tmp_path
     assert len(read.trace.time) > 40, "a second at 50 Hz"
 
 
-def test_a_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None:
+def test_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--case", "event", "--json", *SHORT)
     flight.until_said(r"event: phase conductor: formation")
@@ -213,7 +213,7 @@ def test_a_killed_recorder_is_replaced_and_fails_the_run(tmp_path: Path) -> None
     assert list(folder.glob("cases/event/*.mcap")) == []
 
 
-def test_a_robot_that_cannot_start_ends_the_run_or_not_as_the_file_says(tmp_path: Path) -> None:
+def test_unstartable_robot_ends_run_as_the_file_says(tmp_path: Path) -> None:
     absent = (
         "--case", "event", "--json", "--no-report",
         "--set", "robots.CF01.body=udp://127.0.0.1:9", "--set", "duration_s=4",

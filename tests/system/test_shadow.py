@@ -15,7 +15,7 @@ from tests.system.lab import Flight
 pytestmark = pytest.mark.system
 
 
-def test_a_twin_beside_a_crazyflie_and_one_beside_a_khepera(tmp_path: Path) -> None:
+def test_twins_shadow_a_crazyflie_and_a_khepera(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     flight = Flight(
         folder, "triangle", "--case", "periodic", "--no-report", "--json", "--set", "duration_s=4",

@@ -81,7 +81,7 @@ def test_seeds_of_one_experiment_are_split_over_processes(tmp_path):
     assert found[0] == found[1] == found[2]
 
 
-def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole):
+def test_ctrl_c_keeps_results_and_the_command_resumes(tmp_path, whole):
     with zenpark(tmp_path, "--processes", "2") as process:
         until(lambda: seeds_done(tmp_path), "a cell is done")
         children = psutil.Process(process.pid).children(recursive=True)
@@ -104,7 +104,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path, whole)
 
 
 @pytest.mark.mechanism("sweep: killed")
-def test_a_sweep_that_is_killed_leaves_no_process_and_goes_on(tmp_path, whole):
+def test_killed_sweep_leaves_no_process_and_resumes(tmp_path, whole):
     with zenpark(tmp_path, "--processes", "2") as process:
         until(lambda: seeds_done(tmp_path), "a cell is done")
         children = psutil.Process(process.pid).children(recursive=True)
@@ -130,7 +130,7 @@ def test_a_process_that_is_killed_is_explained(tmp_path):
         assert not psutil.wait_procs(children, timeout=30.0)[1]
 
 
-def test_a_cluster_of_which_a_worker_is_killed_half_way_gives_the_same_table(tmp_path, whole):
+def test_cluster_with_a_killed_worker_gives_same_table(tmp_path, whole):
     pytest.importorskip("distributed")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -76,9 +76,7 @@ def announced(watcher: Watcher, park: Experiment, case: str) -> Iterator[None]:
 
 
 @pytest.mark.mechanism("view")
-def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
-    router: RouterProcess, watcher: Watcher, tmp_path: Path
-) -> None:
+def test_page_shows_seven_robots_and_stops_all(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     low = (f"robots.{name}.hover=0.2" for name in ("CF01", "CF02", "CF03"))  # soon airborne
     park = document.load("robotic-park", *NEAR[1::2], *low, "duration_s=60").cases()["event"].experiment
     (tmp_path / "event.json").write_bytes(document.write_json(Plan(park)))
@@ -117,9 +115,7 @@ def test_seven_robots_move_links_change_colour_and_the_button_stops_all(
         robots.kill()
 
 
-def test_orders_of_the_page_reach_the_robots_and_are_events(
-    router: RouterProcess, watcher: Watcher, tmp_path: Path
-) -> None:
+def test_page_orders_reach_robots_and_become_events(router: RouterProcess, watcher: Watcher, tmp_path: Path) -> None:
     convoy = document.load("convoy", "timeline=[]").cases()["event"].experiment
     (tmp_path / "event.json").write_bytes(document.write_json(Plan(convoy)))
     names, robots = list(convoy.robots), RobotProcess(router.endpoint, tmp_path / "event.json", *convoy.robots)
@@ -187,7 +183,7 @@ def test_orders_of_the_page_reach_the_robots_and_are_events(
 
 
 @pytest.mark.timeout(240)
-def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_path: Path) -> None:
+def test_lab_observer_watches_and_shift_s_stops_run(tmp_path: Path) -> None:
     file = tmp_path / "triangle.toml"
     text = (ROOT / "experiments" / "catalogue" / "triangle.toml").read_text("utf-8")
     file.write_text(text + '\n[network]\nlab = "lab"\n', "utf-8")
@@ -229,7 +225,7 @@ def test_an_observer_of_a_lab_looks_on_and_shift_s_stops_an_operators_run(tmp_pa
     assert said == ["trigger.threshold = 0.0102: 3 of 3 robots", "emergency stop: stopped: CF01, KH01, KH02"]
 
 
-def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> None:
+def test_slider_moves_robots_to_recorded_places(tmp_path: Path) -> None:
     run = simulate(document.load("robotic-park", "duration_s=6", "timeline=[]"), cases=["event"], folder=tmp_path)
     trace = run.traces["event"]
     with viewed(tmp_path) as view, opened(view.address, 640, 480) as page:
@@ -249,7 +245,7 @@ def test_the_slider_moves_robots_to_where_the_recording_says(tmp_path: Path) -> 
         assert page.hosts == {f"127.0.0.1:{view.port}"}
 
 
-def test_a_hundred_robots_are_drawn_at_twenty_frames_a_second() -> None:
+def test_hundred_robots_are_drawn_at_twenty_frames() -> None:
     from experiments.view.live import Page  # noqa: PLC0415 - viser may be missing
     from experiments.view.serving import served  # noqa: PLC0415
 

@@ -52,7 +52,7 @@ def reporting(session: zenoh.Session, names: list[str], hazard: str) -> Iterator
 
 
 @pytest.mark.mechanism("table of a run from another shell")
-def test_top_shows_robots_of_a_router_the_worst_first(router: RouterProcess, watcher: Watcher) -> None:
+def test_top_shows_a_routers_robots_worst_first(router: RouterProcess, watcher: Watcher) -> None:
     with reporting(watcher.session, ["alpha", "beta", "gamma"], "hold: link silence"):
         done = zenpark("top", "--connect", router.endpoint, timeout_s=30.0)
     assert done.returncode == 0, done.stderr
@@ -66,7 +66,7 @@ def test_top_shows_robots_of_a_router_the_worst_first(router: RouterProcess, wat
 
 
 @pytest.mark.mechanism("recording played onto a network")
-def test_a_recording_is_played_with_keys_and_payloads_as_flown(
+def test_recording_plays_with_keys_and_payloads_as_flown(
     router: RouterProcess, watcher: Watcher, tmp_path: Path
 ) -> None:
     simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)
@@ -94,7 +94,7 @@ def test_a_recording_is_played_with_keys_and_payloads_as_flown(
     listening.undeclare()  # type: ignore[no-untyped-call]
 
 
-def test_a_replay_owns_the_names_of_its_robots_and_ends_when_it_was_replaced(
+def test_replay_owns_robot_names_and_ends_when_replaced(
     router: RouterProcess, watcher: Watcher, tmp_path: Path
 ) -> None:
     simulate(load("triangle", "duration_s=3.0", "timeline=[]"), cases=["event"], folder=tmp_path)

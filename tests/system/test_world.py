@@ -167,7 +167,7 @@ def test_the_reference_experiment_forms_up_in_one_world(tmp_path: Path) -> None:
 
 
 @pytest.mark.mechanism("world: killed", "way out: Ctrl-C")
-def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_were(tmp_path: Path) -> None:
+def test_killed_world_is_restarted_and_robots_continue(tmp_path: Path) -> None:
     """Until Ctrl-C, which lands everybody and leaves a valid recording."""
     folder = tmp_path / "run"
     flight = Flight(folder, "triangle", "--bodies", "world", "--case", "event", "--no-report", *NEAR_TRIANGLE)
@@ -208,7 +208,7 @@ def test_a_world_that_is_killed_is_started_again_and_robots_go_on_where_they_wer
     assert not [event for event in trace.events if event.kind == "robot" and "lost" in event.text]
 
 
-def test_climbs_and_landings_go_on_in_the_next_world(router: RouterProcess, file: Path) -> None:
+def test_climbs_and_landings_continue_in_the_next_world(router: RouterProcess, file: Path) -> None:
     world = WorldProcess(router.endpoint, file)
     watcher = Watcher(router.endpoint)
     robots = RobotProcess(router.endpoint, file, "CF01", "TE01")
@@ -279,7 +279,7 @@ def test_what_a_world_cannot_use_is_counted(world: WorldProcess, desk: Desk) -> 
 # ---------------------------------------------------------------------- robots
 
 
-def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
+def test_robots_without_commands_hold_and_then_land(world: WorldProcess, desk: Desk) -> None:
     for name in ("CF01", "TE01"):
         desk.tell(name, "takeoff", height=0.6)
     desk.until(lambda: min(desk.x("CF01")[2], desk.x("TE01")[2]) > 0.59, "they are up")
@@ -292,9 +292,7 @@ def test_robots_that_are_told_nothing_hold_and_then_land(world: WorldProcess, de
     assert {event.source for event in desk.events if event.kind == "silent"} == {"CF01", "TE01"}
 
 
-def test_a_second_world_is_refused_and_so_is_an_experiment_without_one(
-    world: WorldProcess, router: RouterProcess, file: Path
-) -> None:
+def test_second_world_and_useless_world_are_refused(world: WorldProcess, router: RouterProcess, file: Path) -> None:
     second = WorldProcess(router.endpoint, file)
     assert second.wait() == 2
     assert second.ready.startswith("zenpark: a world runs in the realm 'park' already: end it first, choose another")
@@ -306,9 +304,7 @@ def test_a_second_world_is_refused_and_so_is_an_experiment_without_one(
     assert "did you mean 'pymunk'?" in unknown.ready
 
 
-def test_a_world_that_is_told_to_end_waits_for_its_robots(
-    world: WorldProcess, router: RouterProcess, file: Path
-) -> None:
+def test_world_ordered_to_end_waits_for_robots(world: WorldProcess, router: RouterProcess, file: Path) -> None:
     watcher = Watcher(router.endpoint)
     robot = RobotProcess(router.endpoint, file, "CF01", lifeline=False)
     try:

@@ -107,7 +107,7 @@ def test_an_experiment_at_a_router_of_somebody_else(tmp_path: Path, start: Route
 
 @NEEDED
 @pytest.mark.parametrize("freezes", [pytest.param(False, marks=pytest.mark.mechanism("zenohd")), True])
-def test_a_plain_zenohd_is_read_by_rest_and_may_freeze(tmp_path: Path, freezes: bool) -> None:
+def test_plain_zenohd_is_read_by_rest_and_freezes(tmp_path: Path, freezes: bool) -> None:
     """No file: a lease of 10 s. What the README says of REST."""
     endpoint, rest = free_endpoint(0), free_endpoint(0).partition("/")[2]
 

@@ -185,7 +185,7 @@ def test_a_broken_stamp_makes_it_stale(bootstrap, stamp):
     assert not bootstrap.ready("core")
 
 
-def test_a_start_imports_nothing_that_only_an_installation_needs():
+def test_start_imports_nothing_that_only_installing_needs():
     program = "import runpy, sys; runpy.run_path('zenpark'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"ast", "shutil", "ssl", "subprocess"} & set(done.stdout.split())
@@ -209,7 +209,7 @@ def test_trouble_ends_with_2_and_a_message(bootstrap, monkeypatch, capsys):
     assert capsys.readouterr().err == "zenpark: no core\n"
 
 
-def test_ctrl_c_waits_until_the_command_line_can_answer_it(bootstrap, monkeypatch):
+def test_ctrl_c_waits_until_the_command_line_answers(bootstrap, monkeypatch):
     masks = []
     now = bootstrap.signal.pthread_sigmask
     monkeypatch.setattr(bootstrap, "prepare", lambda level: None)
@@ -221,13 +221,13 @@ def test_ctrl_c_waits_until_the_command_line_can_answer_it(bootstrap, monkeypatc
     assert bootstrap.signal.SIGINT in masks[0]
 
 
-def test_a_failing_command_is_told_with_its_last_lines(bootstrap):
+def test_failing_command_is_reported_with_its_last_lines(bootstrap):
     with pytest.raises(bootstrap.Trouble, match="getting it failed:\n  why\ndo this"):
         bootstrap.call(["sh", "-c", "echo why; exit 3"], {}, "getting it", "do this")
 
 
 @pytest.mark.parametrize(("uid", "installs"), [(0, True), (1000, False)])
-def test_what_tests_need_besides_is_installed_by_root_only(bootstrap, monkeypatch, uid, installs):
+def test_root_alone_installs_what_tests_need_besides(bootstrap, monkeypatch, uid, installs):
     run = []
     monkeypatch.setattr(bootstrap.os, "geteuid", lambda: uid)
     monkeypatch.setattr(shutil, "which", lambda name, path=None: None if name in {"sshd", "ip"} else f"/{name}")
@@ -269,7 +269,7 @@ def started(bootstrap, monkeypatch):
     return modules
 
 
-def test_tests_run_in_two_parts_and_none_is_tried_again(bootstrap, started, capsys):
+def test_tests_run_in_two_parts_without_retries(bootstrap, started, capsys):
     assert bootstrap.test([]) == 1
     assert [module[0] for module in started] == ["ruff", "ruff", "mypy", "pytest", "pytest"]
     computing, processes = started[3:]
@@ -288,7 +288,7 @@ def test_all_prepares_what_the_tests_of_processes_need(bootstrap, started):
     assert [module[2] for module in (started[3], started[7])] == ["not system", "system"]
 
 
-def test_arguments_go_to_pytest_in_place_of_the_parts(bootstrap, started):
+def test_arguments_replace_the_parts_for_pytest(bootstrap, started):
     bootstrap.test(["--quick", "tests/agents", "-x"])
     assert started[3:] == [["pytest", "-m", bootstrap.QUICK, "tests/agents", "-x"]]
 
@@ -306,7 +306,7 @@ def test_why_there_is_no_rclpy_is_said(monkeypatch, tmp_path):
         assert rclpy_wheels.install() == rclpy_wheels.missing() == why
 
 
-def test_why_there_is_no_zenohd_is_said_by_the_tests_that_are_skipped(monkeypatch, tmp_path):
+def test_skipped_tests_say_why_zenohd_is_absent(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     for name in ("CACHE", "BUILT", "REASON"):
         monkeypatch.setattr(zenohd, name, tmp_path / name)

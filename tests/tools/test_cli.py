@@ -133,7 +133,7 @@ def test_texts_need_no_pydantic(tmp_path):
     assert "pydantic" not in modules
 
 
-def test_help_shows_every_command_in_a_panel_with_its_whole_description():
+def test_help_shows_commands_with_their_whole_description():
     shown = typer.main.get_command(app).commands
     panels = [name for names in PANELS.values() for name in names.split()]
     assert sorted(panels) == sorted(name for name, command in shown.items() if not command.hidden)
@@ -154,7 +154,7 @@ def with_parameters(built, above=()):
             yield " ".join((*above, name))
 
 
-def test_a_call_builds_the_parameters_of_its_own_command_only():
+def test_call_builds_only_its_own_commands_parameters():
     whole = typer.main.get_command(app)
     assert {"run", "robot stop", "cert init"} < set(with_parameters(whole))
     for words in (*([name] for name in COMMANDS), ["robot", "stop", "KH01"], [], ["--help"], ["rnu"], ["robot", "run"]):
@@ -191,7 +191,7 @@ def test_errors_are_json_where_it_is_asked_for(arguments, why, monkeypatch, caps
     assert printed.err.startswith(f"zenpark: {why}")
 
 
-def test_a_plugin_of_two_places_has_its_parameters_once_with_their_defaults():
+def test_plugin_of_two_places_has_parameters_once():
     lines = CliRunner().invoke(app, ["explain", "send-on-delta"]).stdout.splitlines()
     assert lines[:2] == ["trigger(send-on-delta)", "formation.update(send-on-delta) "]
     (threshold,) = [line for line in lines if ".threshold" in line]
@@ -209,7 +209,7 @@ def test_tables_are_json_where_it_is_asked_for():
     assert json.loads(said.stdout)[0]["key"].startswith("disturbance.")
 
 
-def test_results_of_doing_are_json_where_it_is_asked_for(tmp_path, monkeypatch):
+def test_results_of_actions_are_json_on_request(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     past = tmp_path / "runs" / "past"
     past.mkdir(parents=True)

@@ -37,7 +37,7 @@ def test_passes_when_the_packages_are_ours(tmp_path):
     assert done.stdout.startswith("zenpark ")
 
 
-def test_ctrl_c_while_python_starts_ends_it_without_a_traceback():
+def test_ctrl_c_while_python_starts_prints_no_traceback():
     def interrupted():
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         os.kill(os.getpid(), signal.SIGINT)
@@ -47,7 +47,7 @@ def test_ctrl_c_while_python_starts_ends_it_without_a_traceback():
     assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")
 
 
-def test_ctrl_c_while_the_script_imports_ends_it_without_a_traceback():
+def test_ctrl_c_while_script_imports_prints_no_traceback():
     program = (
         "import runpy, sys\n"
         "class Interrupted:\n"
@@ -61,7 +61,7 @@ def test_ctrl_c_while_the_script_imports_ends_it_without_a_traceback():
 
 
 @pytest.mark.slow
-def test_names_the_package_in_the_way_and_the_remedy(tmp_path):
+def test_guard_names_obstructing_package_and_remedy(tmp_path):
     for name in ("agents", "twins"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('must not be imported')")
@@ -92,7 +92,7 @@ def test_imports_nothing_of_ours_and_nothing_heavy():
 @pytest.mark.parametrize(
     ("words", "code"), [(["station"], 0), (["agent", "-", "KH01", "--clock-correction=-0.5", "--lifeline"], 2)]
 )
-def test_what_a_run_starts_on_its_hosts_needs_no_typer(words, code):
+def test_run_needs_no_typer_on_its_hosts(words, code):
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "tools.guard", *words],
         cwd=ROOT,

@@ -180,7 +180,7 @@ def test_a_missing_library_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize(("second", "same"), [("ROVER://192.0.2.7:5005/", True), ("rover://192.0.2.7:5006", False)])
-def test_two_robots_with_the_address_of_one_device_are_a_finding(second: str, same: bool) -> None:
+def test_two_robots_with_one_devices_address_are_found(second: str, same: bool) -> None:
     robots = {name: Robot(kind="khepera4", start=[0.0, 0.0], body="world") for name in ("RV01", "RV02", "RV03", "RV04")}
     for name, body in (("RV01", "rover://192.0.2.7:5005"), ("RV03", second)):
         robots[name] = msgspec.structs.replace(robots[name], body=body)

@@ -142,7 +142,7 @@ def test_hover_jitter_fades_on_the_way_down():
 
 
 @pytest.mark.parametrize("engine", [PointMass(), Planar()], ids=["point-mass", "pymunk"])
-def test_wind_pushes_what_flies_by_the_error_of_its_loop(engine):
+def test_wind_pushes_flying_robots_by_their_loops_error(engine):
     world = World(Scene.empty(), engine, ((),) * 2, 1.0, (False,) * 2)
     twin = TwinBody(request((CRAZYFLIE, KHEPERA4), STARTS[:2], disturbance=Disturbance(wind=(0.8, -0.3))), world)
     twin.takeoff([0], [0.5])
@@ -180,7 +180,7 @@ def test_velocity_is_that_of_motion_capture():
     assert twin.engine.motions[0].velocity[:2] == (0.0, 0.0)  # its controller holds its place
 
 
-def test_placed_robot_is_at_rest_or_moves_as_told():
+def test_placed_robot_rests_or_moves_as_commanded():
     twin = body(KHEPERA4)
     _, state = run(twin, 200, command=AHEAD)
     assert state.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-6)

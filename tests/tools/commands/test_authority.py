@@ -32,7 +32,7 @@ def extension(made, kind):
     return made.extensions.get_extension_for_class(kind).value
 
 
-def test_a_certificate_says_who_and_until_when_and_who_vouches(folder):
+def test_certificate_says_who_until_when_and_who_vouches(folder):
     ca = certificate(folder, "ca")
     assert extension(ca, x509.BasicConstraints) == x509.BasicConstraints(ca=True, path_length=0)
     for name in ROBOTS:

@@ -45,7 +45,7 @@ def check(*words):
 
 
 @pytest.mark.slow
-def test_an_error_of_the_experiment_is_1_and_a_malformed_file_2(file, tmp_path):
+def test_experiment_error_exits_1_and_malformed_file_2(file, tmp_path):
     assert check(file).exit_code == 1
     (tmp_path / "wrong.toml").write_text("title = ")
     wrong = check(tmp_path / "wrong.toml", "--json")

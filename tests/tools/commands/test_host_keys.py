@@ -32,7 +32,7 @@ def lab(tmp_path):
     return folder
 
 
-def test_a_folder_holds_what_it_was_sent_and_nothing_else(home, lab):
+def test_folder_holds_only_what_it_was_sent(home, lab):
     host, there = Host(address="lab1", lab="~/keys of mine"), home / "keys of mine"
     assert send("lab1", host, lab, ["KH01", "CF01"]) == "certificates of KH01, CF01 put into keys of mine"
     before = (there / "KH01.key").read_bytes()
@@ -61,7 +61,7 @@ def test_what_is_not_its_own_is_left_alone(home, lab):
 
 
 @pytest.mark.parametrize("place", ["", "~/", "/", ".", "../keys"])
-def test_what_is_no_folder_of_its_own_is_no_place(lab, place):
+def test_keys_need_a_folder_of_their_own(lab, place):
     with pytest.raises(HostError, match="names no folder of its own"):
         send("lab1", Host(address="lab1", lab=place), lab, ["KH01"])
 

@@ -140,7 +140,7 @@ def test_hosts_are_chosen_by_name_or_tag():
         choose({}, [])
 
 
-def test_a_package_holds_code_and_nothing_that_running_left():
+def test_package_holds_code_and_nothing_that_running_left():
     with tarfile.open(fileobj=io.BytesIO(packed(ROOT, ["agents", "zenpark"]))) as tar:
         names = tar.getnames()
         assert tar.getmember("zenpark").mode & 0o100
@@ -205,6 +205,6 @@ def test_install_leaves_alone_what_is_not_its_own(home, tmp_path, capsys, there,
 
 
 @pytest.mark.parametrize("place", ["zenpark", "~/zenpark", "/zenpark", "bin/zp"])
-def test_a_command_without_a_folder_of_its_own_is_no_place(place):
+def test_host_command_needs_a_folder_of_its_own(place):
     with pytest.raises(hosts.HostError, match="names no folder of its own"):
         tool.put("lab1", hosts.Host(address="a", zenpark=place))

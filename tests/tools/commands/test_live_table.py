@@ -41,7 +41,7 @@ def styles(*rows: Row) -> dict[str, str]:
 @pytest.mark.parametrize("width", [40, 64, 80, 140])
 @pytest.mark.parametrize("height", [8, 14, 24, 50])
 @pytest.mark.parametrize("count", [3, 12, 100])
-def test_the_table_fits_the_terminal_and_names_are_whole(width, height, count):
+def test_table_fits_the_terminal_with_whole_names(width, height, count):
     held = msgspec.structs.replace(STATUS, hazard="hold: minimum separation: 0.18 m from robot-03 (limit 0.25 m)")
     all_rows = rows(count)
     all_rows[-1] = Trends().row(f"robot-{count - 1:02}", held, now=10.1, error=0.0)
@@ -77,7 +77,7 @@ def test_rows_that_fit_stay_in_their_order():
     assert [row.name for row in worst_first(few, fit=True)][:2] == ["robot-03", "robot-00"]
 
 
-def test_cpu_is_a_share_and_counters_that_grow_are_coloured():
+def test_cpu_is_a_share_and_growing_counters_coloured():
     trends = Trends()
     first = trends.row("robot-01", STATUS, now=10.0, error=None)
     assert (first.cpu, first.growing) == (None, frozenset())

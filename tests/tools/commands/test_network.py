@@ -71,7 +71,7 @@ def test_payloads_become_one_harmless_line(payload, mime, line):
     assert readable(payload, mime) == line
 
 
-def test_cadence_counts_per_window_and_keeps_the_last_stamp():
+def test_cadence_counts_per_window_and_keeps_last_stamp():
     cadence = Cadence()
     for stamp in (10.0, 10.1, 10.3):
         cadence.add("b", stamp, 50)
@@ -127,7 +127,7 @@ def test_keys_shows_who_holds_what(router, eventually):
 
 
 @pytest.mark.system
-def test_echo_prints_the_last_pose_and_then_what_comes(router):
+def test_echo_prints_last_pose_and_then_new_ones(router):
     with open_session([router.endpoint], name="CF01") as robot:
         pose = pose_publisher(robot, "park/CF01/pose", JSON)
         pose.put(b'{"x": 1}')

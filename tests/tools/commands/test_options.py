@@ -8,7 +8,7 @@ from tools.commands.options import open_in_browser
 
 
 @pytest.mark.parametrize("opened", [True, False])
-def test_a_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
+def test_page_is_named_where_no_browser_opens_it(opened, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(webbrowser, "open", lambda address: asked.append(address) or opened)
     open_in_browser("file:///report.html")

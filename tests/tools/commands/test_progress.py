@@ -12,7 +12,7 @@ from tools.progress import Lines, Table
 
 
 @pytest.mark.parametrize("kind", [Lines, Table])
-def test_errors_from_before_the_router_fell_silent_are_not_printed_as_news(
+def test_errors_from_before_routers_silence_are_no_news(
     kind: type[Lines | Table], capsys: pytest.CaptureFixture[str]
 ) -> None:
     progress = Progress("event", "formation", 4.0, 15.0, {"KH01": RobotView(error=0.123)})
@@ -27,7 +27,7 @@ def test_errors_from_before_the_router_fell_silent_are_not_printed_as_news(
     assert "error [m]" not in said
 
 
-def test_a_hazard_is_printed_with_the_time_at_which_it_began(capsys: pytest.CaptureFixture[str]) -> None:
+def test_hazard_is_printed_with_its_beginning(capsys: pytest.CaptureFixture[str]) -> None:
     progress = Progress("event", "formation", 9.0, 15.0, {})
     stamp = progress.clock.utc()
     progress.events += [

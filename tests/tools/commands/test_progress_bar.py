@@ -67,7 +67,7 @@ def test_a_bar_in_a_terminal(terminal, clock):
     assert "4/4" in screen.getvalue()
 
 
-def test_a_passing_bar_comes_after_two_seconds_and_counts_from_the_beginning(terminal, clock):
+def test_passing_bar_appears_late_and_counts_from_beginning(terminal, clock):
     screen = terminal()
     with Bar(passing=True) as bar:
         bar.show("event", 0, 60)

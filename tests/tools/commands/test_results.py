@@ -39,7 +39,7 @@ def three(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder / "run", zenpark("run", str(folder / "short.toml"), "--virtual", "--seeds", "3", "--out", out)
 
 
-def test_a_report_made_again_keeps_the_seeds_that_are_not_recorded(three: tuple[Path, str], tmp_path: Path) -> None:
+def test_new_report_keeps_seeds_without_recordings(three: tuple[Path, str], tmp_path: Path) -> None:
     again = tmp_path / "run"
     shutil.copytree(three[0], again)
     for k, file in enumerate(("event.mcap", "periodic.mcap")):
@@ -66,7 +66,7 @@ def test_figures_are_pdf_on_demand(three: tuple[Path, str], tmp_path: Path) -> N
         assert isinstance(done.exception, DocumentError)
 
 
-def test_without_the_errors_of_all_seeds_their_figure_stays(three: tuple[Path, str], tmp_path: Path) -> None:
+def test_figure_of_errors_stays_without_all_seeds_errors(three: tuple[Path, str], tmp_path: Path) -> None:
     again = tmp_path / "run"
     shutil.copytree(three[0], again)
     (again / "figures" / "errors.csv").unlink()
@@ -93,7 +93,7 @@ def test_tables_for_papers_are_over_all_seeds(three: tuple[Path, str]) -> None:
         assert zenpark("report", str(three[0]), str(three[0]), form).count("3 seeds")
 
 
-def test_the_console_gives_the_digits_that_an_interval_bears(three: tuple[Path, str]) -> None:
+def test_console_gives_the_digits_an_interval_supports(three: tuple[Path, str]) -> None:
     lines = three[1].splitlines()
     half = re.search(r"IAE (\d\.\d+) ± (\d\.\d+) m s, ", lines[0])
     assert half is not None
@@ -101,7 +101,7 @@ def test_the_console_gives_the_digits_that_an_interval_bears(three: tuple[Path, 
     assert re.search(r"\(ratios: f \d\.\d+ ± \d\.\d+, IAE \d\.\d+ ± \d\.\d+\)", lines[1])
 
 
-def test_tables_for_papers_go_into_a_file_and_have_the_chosen_metrics(three: tuple[Path, str], tmp_path: Path) -> None:
+def test_paper_tables_have_a_file_and_chosen_metrics(three: tuple[Path, str], tmp_path: Path) -> None:
     file = tmp_path / "paper" / "t.tex"
     assert zenpark("report", str(three[0]), "--latex", "--out", str(file), "--metrics", "f,iae").strip() == str(file)
     rows = [line for line in file.read_text().splitlines() if line.startswith(("f ", "IAE", "ITAE", "RMSE"))]
@@ -110,7 +110,7 @@ def test_tables_for_papers_go_into_a_file_and_have_the_chosen_metrics(three: tup
     assert "--metrics speed: is not known" in str(done.exception)
 
 
-def test_a_sweep_has_figures_and_a_table_for_papers(three: tuple[Path, str], tmp_path: Path) -> None:
+def test_sweep_has_figures_and_a_paper_table(three: tuple[Path, str], tmp_path: Path) -> None:
     folder = tmp_path / "swept"
     axis = ["trigger.threshold=0.01,0.05", "seeds=2", "--out", str(folder)]
     said = zenpark("sweep", str(three[0].parent / "short.toml"), *axis)
@@ -177,7 +177,7 @@ def test_a_comparison_has_the_intervals_of_the_report(three: tuple[Path, str], t
     assert figures["ci95"] > 0.0
 
 
-def test_a_ratio_has_the_digits_that_its_interval_bears() -> None:
+def test_ratio_has_the_digits_its_interval_supports() -> None:
     assert ratio_words(spread([0.0610, 0.0611, 0.0612])) == "0.0611 ± 0.0002"
     assert ratio_words(spread([1.0784])) == "1.078"
 
@@ -187,7 +187,7 @@ def test_a_run_names_its_replay(three: tuple[Path, str]) -> None:
 
 
 @pytest.mark.parametrize(("made", "kept"), [([], "nothing is kept"), (["event"], "kept is seed 1 of event")])
-def test_an_interrupted_run_over_seeds_says_what_is_kept(
+def test_interrupted_run_over_seeds_reports_what_is_kept(
     made: list[str], kept: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object, folder: Path, **__: object) -> None:

@@ -94,7 +94,7 @@ def speed(robot):
     return np.hypot(after[0] - before[0], after[1] - before[1]) / 0.5
 
 
-def test_the_server_of_2025_drives_in_centimetres_and_tells_its_pose_in_centimetres(talk):
+def test_server_of_2025_drives_and_reports_in_centimetres(talk):
     robot = talk("2025-05", start=[[0.5, -0.2, 0.0]], yaw=np.pi / 2)
     assert robot.ask(b"p") == "0.00,0.00,0.00"
     robot.say(b"d 10.0 0.0")
@@ -127,7 +127,7 @@ def test_only_some_servers_obey_a_speed(talk, server, moves):
     [("2023-01-07", b"d 5 0"), ("2023-01-15", b"g 5 0"), ("2023-04-10", b"g 0 5"), ("2025-05", b"d 5 0"),
      ("fork", b"d 5 0"), ("kteam", b"D,74,74\r")],
 )  # fmt: skip
-def test_no_server_has_a_watchdog_and_some_drive_on_without_a_client(talk, server, words):
+def test_no_server_stops_by_watchdog_some_by_disconnection(talk, server, words):
     robot = talk(server)
     robot.say(words)
     robot.wait(4.0)
@@ -139,7 +139,7 @@ def test_no_server_has_a_watchdog_and_some_drive_on_without_a_client(talk, serve
 
 
 @pytest.mark.parametrize("server", ["2023-01-07", "2023-01-15", "2023-04-10", "2025-05", "fork", "kteam"])
-def test_the_servers_of_2023_accept_one_client_in_their_life(talk, server):
+def test_servers_of_2023_accept_one_client_per_life(talk, server):
     robot = talk(server)
     question = b"R\r" if server == "kteam" else b"p"
     second = robot.connect()
@@ -159,7 +159,7 @@ def test_park_loses_what_is_glued_to_a_command(talk):
     assert robot.truth()[0] > 0.08
 
 
-def test_the_range_poll_is_a_goal_to_the_servers_since_2023_01_15(talk):
+def test_range_poll_is_a_goal_to_later_servers(talk):
     for server, drives, answers in (
         ("2023-01-07", False, True),
         ("2023-01-15", True, True),
@@ -176,7 +176,7 @@ def test_the_range_poll_is_a_goal_to_the_servers_since_2023_01_15(talk):
         assert (speed(robot) > 0.0) == drives, server  # the next turn of its loop drives again
 
 
-def test_a_goal_is_reached_by_the_controller_of_2023_04_10(talk):
+def test_goal_is_reached_by_2023_04_10_controller(talk):
     robot = talk("2023-04-10", start=[[0.3, 0.0, 0.0]])
     robot.say(b"i 1.0 0.5 1.0")
     assert robot.ask(b"p") == "1.0000,0.5000,1.0000"
@@ -246,7 +246,7 @@ def test_kteam_speaks_in_lines_units_and_pulses(talk):
 
 
 @pytest.mark.parametrize("line", [b"Q\r", b"D,1\r", b"D,a,b\r", b"V,99\r", b"\xff\r", b"d,1,1\r"])
-def test_kteam_answers_a_dollar_to_what_it_does_not_know(talk, line):
+def test_kteam_answers_a_dollar_to_unknown_commands(talk, line):
     assert talk("kteam").ask(line) == "$\r\n"
 
 
@@ -299,7 +299,7 @@ def test_a_battery_that_ends_stops_and_silences_it(talk):
     assert robot.ask(b"V,5\r") is None
 
 
-def test_odometry_drifts_and_commands_are_late_as_the_experiment_says(talk):
+def test_odometry_drifts_and_commands_lag_as_specified(talk):
     robot = talk("2025-05", disturbance=Disturbance(odometry_drift=0.02, latency_s=0.2))
     robot.say(b"d 20 0")
     robot.wait(0.2)
@@ -329,7 +329,7 @@ def test_units_and_their_inverse(v, turn):
     assert back == pytest.approx((v, turn), abs=0.6781e-3 / 0.1054)
 
 
-def test_a_curve_too_fast_for_the_wheels_stays_that_curve():
+def test_curve_too_fast_for_wheels_stays_that_curve():
     left, right = protocol.units(2.0, 4.0)
     assert max(left, right) == protocol.FASTEST
     v, turn = protocol.twist(left, right)

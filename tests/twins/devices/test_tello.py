@@ -85,7 +85,7 @@ def talk(monkeypatch):
         each.close()
 
 
-def test_it_is_silent_until_it_is_in_sdk_mode(talk):
+def test_tello_is_silent_until_in_sdk_mode(talk):
     drone = talk()
     assert drone.ask("battery?") is None
     drone.wait(1.0)
@@ -99,7 +99,7 @@ def test_it_is_silent_until_it_is_in_sdk_mode(talk):
     assert (state["bat"], state["h"], state["time"], state["tof"], state["yaw"]) == ("100", "0", "0", "10", "0")
 
 
-def test_take_off_and_landing_are_answered_when_they_are_over(talk):
+def test_take_off_and_landing_are_answered_when_over(talk):
     drone = talk()
     [(answer, when)] = drone.up()
     assert answer == "ok"
@@ -136,7 +136,7 @@ def test_landing_is_refused_for_some_time(talk):
     assert drone.place()[2] == 0.0
 
 
-def test_sticks_are_velocities_in_its_own_frame_until_they_change(talk):
+def test_sticks_are_body_velocities_until_they_change(talk):
     drone = talk(yaw=np.pi / 2)  # its nose points along y
     drone.up()
     before = drone.place()
@@ -242,7 +242,7 @@ def test_mission_pads_are_searched_for_when_switched_on(talk):
         assert (state["mid"], state["x"]) == said
 
 
-def test_a_gap_of_the_wifi_leaves_the_sticks_as_they_are(talk):
+def test_wifi_gap_leaves_the_sticks_as_they_are(talk):
     """As a real one: it flies on, hears nothing, and lands 15 s after the last command if nobody comes back."""
     drone = talk()
     drone.up()
@@ -284,7 +284,7 @@ def test_what_it_refuses_on_the_ground(talk):
     assert drone.ask("\xff") == "unknown command: ??"
 
 
-def test_it_lands_by_itself_after_fifteen_seconds_without_a_command(talk):
+def test_tello_lands_after_fifteen_seconds_without_a_command(talk):
     drone = talk()
     drone.up()
     drone.wait(6.9)

@@ -262,7 +262,7 @@ def test_announces_itself(listen, eventually):
 
 
 @pytest.mark.system
-def test_loss_is_a_share_of_what_it_says_and_hears(listen):
+def test_loss_is_a_share_of_both_directions(listen):
     listener = listen(faults=Faults(loss=0.3))
     count = listener.count(20.0)
     assert 0.6 < count / 400 < 0.8

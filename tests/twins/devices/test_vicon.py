@@ -74,7 +74,7 @@ bodies = st.lists(st.tuples(finite, finite, finite, st.lists(finite, min_size=9,
 
 
 @given(bodies, st.integers(0, 2**32 - 1), st.integers(1, 40))
-def test_what_is_packed_is_unpacked_however_it_is_cut(
+def test_packed_frames_are_unpacked_however_they_are_cut(
     bodies: list[tuple[float, float, float, list[float]]], number: int, cut: int
 ) -> None:
     sent = [Segment(0, (x, y, z), tuple(turn)) for x, y, z, turn in bodies]
@@ -125,7 +125,7 @@ def test_damage_is_malformed_and_nothing_else(noise: bytes, at: int, value: int)
             pass  # anything else would fail the test
 
 
-def test_the_root_segment_is_the_pose_of_a_subject_and_new_names_replace_the_old() -> None:
+def test_root_segment_is_subject_pose_and_names_update() -> None:
     def subject(number: int, name: str, segments: list[tuple[int, int]]) -> bytes:
         def text(words: str) -> bytes:
             return len(words).to_bytes(4, "little") + words.encode()
@@ -155,7 +155,7 @@ def test_the_root_segment_is_the_pose_of_a_subject_and_new_names_replace_the_old
 
 @pytest.mark.system
 @pytest.mark.skipif(find_spec("motioncapture") is None, reason="needs motioncapture, the vendor's client in a wheel")
-def test_the_vendors_client_and_ours_read_the_same_poses() -> None:
+def test_vendors_client_and_ours_read_same_poses() -> None:
     placed = {
         "exact": ([1.25, -0.5, 0.75], [1.0, 0.0, 0.0, 0.0]),  # these have no error as single precision either
         "high": ([0.0, 2.0, 1.5], [0.5, 0.5, 0.5, 0.5]),
@@ -184,7 +184,7 @@ def test_the_vendors_client_and_ours_read_the_same_poses() -> None:
 
 
 @pytest.mark.system
-def test_clients_come_and_go_and_a_slow_one_holds_nobody_up() -> None:
+def test_clients_come_and_go_without_blocking_each_other() -> None:
     with Camera(["CF01"], rate_hz=250.0) as camera:
         camera.place("CF01", [0.1, 0.2, 0.3], 0.5)
         slow = socket.create_connection(("127.0.0.1", camera.port))
@@ -222,7 +222,7 @@ def test_a_client_may_ask_for_single_frames() -> None:
 
 
 @pytest.mark.system
-def test_a_delayed_frame_comes_late_and_as_it_was() -> None:
+def test_delayed_frame_comes_late_but_unchanged() -> None:
     twin = ViconTwin(["CF01"], faults=Faults(delay_s=0.05))
     with socket.create_connection(("127.0.0.1", int(twin.address.rpartition(":")[2])), 2.0) as client:
         listener = twin.sockets()[0]
@@ -341,9 +341,7 @@ def test_the_process_shows_the_truth_that_it_hears(process: subprocess.Popen[str
 @pytest.mark.mechanism("lifeline: motion capture stays until the robots are down")
 @pytest.mark.parametrize("process", [["--lifeline"]], indirect=True)
 @pytest.mark.system
-def test_the_process_ends_with_its_starter_but_not_before_the_robots(
-    process: subprocess.Popen[str], router: RouterProcess
-) -> None:
+def test_process_ends_with_its_starter_after_the_robots(process: subprocess.Popen[str], router: RouterProcess) -> None:
     assert process.stdin is not None
     assert process.stdout is not None
     said = process.stdout.readline()
@@ -360,7 +358,7 @@ def test_the_process_ends_with_its_starter_but_not_before_the_robots(
 
 
 @pytest.mark.system
-def test_what_a_user_can_mend_is_said_without_a_traceback() -> None:
+def test_user_errors_are_reported_without_a_traceback() -> None:
     endpoint = free_endpoint(preferred_port=0)
     for arguments, words in (
         (["--listen", "801"], "is not HOST:PORT"),

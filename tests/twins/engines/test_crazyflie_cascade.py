@@ -38,7 +38,7 @@ def test_a_pid_is_its_formula():
     np.testing.assert_allclose(pid.advance(np.array([[1.0, 1.0, 1.0]]), np.array([[0.0, 9.0, 0.0]])), first)
 
 
-def test_ahead_is_nose_down_and_left_is_left_side_down():
+def test_ahead_pitches_nose_down_and_left_rolls_left():
     roll, pitch = guided([[0.1, 0.0, 0.0]]).angles[0, :2]
     assert pitch == pytest.approx(25.0 * 0.2 + 1.0 * 0.2 * OUTER * DT)
     assert roll == 0.0
@@ -92,7 +92,7 @@ def test_yaw_turns_the_short_way(yaw, heading):
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12))
-def test_motors_stay_in_their_range_and_keep_their_torque(numbers):
+def test_motors_stay_in_range_and_keep_torque(numbers):
     values = np.array(numbers).reshape(4, 1, 3)
     made = Firmware(1, DT)
     made.advance_outer_loops(values[0], values[1], NONE, np.array([False]), values[2, :, 2])
@@ -101,7 +101,7 @@ def test_motors_stay_in_their_range_and_keep_their_torque(numbers):
     assert motors.max() <= 1.0
 
 
-def test_the_outer_loops_run_at_a_fifth_of_the_rate():
+def test_outer_loops_run_at_a_fifth_rate():
     made = guided([[0.1, 0.0, 0.0]])
     before = made.angles.copy()
     for _ in range(OUTER - 1):

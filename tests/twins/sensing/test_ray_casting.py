@@ -124,12 +124,12 @@ def test_reach_counts_from_the_centre_to_the_surface():
         np.testing.assert_allclose(seen[0], [expected], atol=1e-12)
 
 
-def test_nothing_is_seen_in_an_empty_room_or_alone():
+def test_empty_room_and_lone_robot_show_nothing():
     assert np.isnan(look([[0.0, 0.0, 0.0]], [fan(np.arange(12.0))])).all()
     assert look(np.zeros((1, 3)), [fan([])]).shape == (1, 0)
 
 
-def test_who_is_not_there_neither_sees_nor_is_seen():
+def test_absent_robot_neither_sees_nor_is_seen():
     seen = look(
         [[0.0, 0.0, 0.0], [np.nan] * 3, [1.0, 0.0, 0.0]],
         [fan([0.0, 0.0], elevation=[0.0, 0.5 * math.pi])],
@@ -167,7 +167,7 @@ def test_a_flying_robot_looks_from_its_own_height():
 UP, DOWN = 0.5 * math.pi, -0.5 * math.pi
 
 
-def test_vertical_rays_see_the_nearest_thing_over_and_under_them():
+def test_vertical_rays_see_nearest_things_above_and_below():
     scene = furnished(
         {
             "shelf": Obstacle(box=(1.0, 0.2), at=(0.0, 0.0), yaw=0.5 * math.pi, bottom=1.5, height=0.1),
@@ -190,12 +190,12 @@ def test_vertical_rays_see_the_nearest_thing_over_and_under_them():
     np.testing.assert_allclose(seen, expected, atol=1e-12)
 
 
-def test_there_is_no_ceiling_without_walls_but_a_floor():
+def test_room_without_walls_has_floor_but_no_ceiling():
     seen = look([[0.0, 0.0, 1.0]], [fan([0.0, 0.0], elevation=[UP, DOWN])])
     np.testing.assert_allclose(seen, [[np.nan, 1.01]], atol=1e-12)
 
 
-def test_a_ray_that_begins_inside_a_thing_does_not_see_it():
+def test_ray_beginning_inside_a_thing_misses_it():
     scene = furnished({"box": Obstacle(box=(1.0, 1.0)), "pillar": Obstacle(radius=0.4)}, walled=True)
     seen = look([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]], [fan([0.0, 1.5, -2.0], 5.0)], scene=scene)
     np.testing.assert_allclose(seen[0], [3.0, 3.0 / math.sin(1.5), 3.0 / math.sin(2.0)], atol=1e-12)
@@ -235,7 +235,7 @@ def test_turning_and_shifting_everything_changes_nothing(seed, turn):
     assert (close | (np.isnan(here) & np.isnan(there))).mean() > 0.98
 
 
-def test_rows_may_send_several_fans_and_fans_of_others_change_nothing():
+def test_rows_send_several_fans_without_affecting_each_other():
     position = [[0.0, 0.0, 0.0], [0.5, 0.3, 0.0], [-0.4, 0.6, 0.0]]
     near, wide = fan(np.linspace(0.0, 6.0, 25), 0.45), fan(np.linspace(-1.0, 5.0, 40), 3.0)
     both = look(position, [near, wide], row=[2, 0, 0], which=[1, 0, 1])

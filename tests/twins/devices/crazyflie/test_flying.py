@@ -333,7 +333,7 @@ def test_battery():
     assert wire.position[2] == 0.0
 
 
-def test_the_level_of_the_battery_is_that_of_the_firmware():
+def test_battery_level_is_that_of_the_firmware():
     """10 % from 3.00 to 3.78 V; 90 % is the most that it says; under load the voltage sags."""
     flock = Wire().flock
     levels = {1.0: 90, 0.95: 90, 0.85: 90, 0.55: 60, 0.15: 20, 0.09: 10, 0.01: 10, 0.0: 0}
@@ -410,7 +410,7 @@ def test_disarmed_in_the_air_it_locks():
 # ---------------------------------------------------------------------- where it believes to be
 
 
-def test_a_flow_deck_does_not_measure_where_it_is():
+def test_flow_deck_does_not_measure_where_it_is():
     """It believes to be where it was switched on, in the air too, until its estimator is reset elsewhere."""
     wire = Wire(start=[[0.5, 0.2, 0.0]]).hovering()
     assert wire.flock.estimate[0] == pytest.approx([0.0, 0.0, 1.0], abs=0.01)

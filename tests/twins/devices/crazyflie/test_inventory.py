@@ -95,7 +95,7 @@ def test_tables_of_a_real_firmware(files):
     assert wire.hovering().flock.estimate[0, 2] == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_built_in_tables_agree_with_a_real_firmware(files):
+def test_built_in_tables_agree_with_a_real_firmware(files):
     """Names and types; what is ours alone is known."""
     own, real = inventory(), inventory(tuple(files))
     for ours, theirs in ((own.parameters, real.parameters), (own.logs, real.logs)):

@@ -105,7 +105,7 @@ def test_thrust_needs_a_zero_first():
     assert wire.position[2] > 0.1
 
 
-def test_disarmed_in_the_air_it_falls_and_is_ready():
+def test_drone_disarmed_aloft_falls_and_is_ready():
     wire = Wire().hovering(0.5)
     wire.put(Port.SUPERVISOR, 1, int(Safety.ARM), 0)
     wire.wait(0.1)
