@@ -1,4 +1,4 @@
-"""The floor plan holds: imports go one way, nothing goes round in a circle, and no room is too full or too small."""
+"""The floor plan holds: imports go one way and in no circle, rooms are neither too full nor too small, names short."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 TOPS = ("agents", "twins", "bridges", "experiments", "tools")
 MOST, LEAST = 12, 60  # modules of a folder; lines of a module that only one other imports
+MOST_WORDS = 8  # of a test's name
 # Each line imports from lines above it and within each of its own folders.
 ORDER = """
 agents.errors agents.vectors
@@ -227,3 +228,17 @@ def test_experiments_are_compiled_once():
 def test_plug_ins_are_chosen_in_one_place():
     choosing = {"registry.build", "registry.split", "registry.struct"}
     assert {name for name in modules() if calls(name) & choosing} == CHOOSES_PLUGINS
+
+
+def names_of_tests() -> dict[str, list[str]]:
+    """Names of tests without `test_`, by file."""
+    files = {str(file.relative_to(ROOT)): file for file in (ROOT / "tests").rglob("test_*.py")}
+    definition = re.compile(r"^ *(?:async )?def test_(\w+)", re.MULTILINE)
+    return {name: definition.findall(file.read_text("utf-8")) for name, file in files.items()}
+
+
+def test_test_names_are_short_and_unique():
+    long = [name for names in names_of_tests().values() for name in names if name.count("_") >= MOST_WORDS]
+    assert not long, f"at most {MOST_WORDS} words: the subject first, then what happens"
+    twice = [file for file, names in names_of_tests().items() if len(set(names)) < len(names)]
+    assert not twice
