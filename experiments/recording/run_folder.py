@@ -121,6 +121,7 @@ class PastRun(msgspec.Struct, frozen=True):
     # of each case and seed what a reader of its figures must know: how much of its time it took, what spoiled it
     remarks: dict[str, dict[int, str]] = {}
     lengths: dict[str, dict[int, float]] = {}  # of each case by seed [s]; those of another version are not known
+    lost: int = 0  # poses that were sent and never received, of all cases
 
     def matches(self, words: Sequence[str]) -> bool:
         """Whether each word is one of its tags, or stands in its folder's name, its title or a case, in any case."""
@@ -169,7 +170,8 @@ def _past_run(folder: Path) -> PastRun | None:
         made = origin.begun if 0.0 < origin.begun < LATEST else source.stat().st_mtime
     except OSError:  # removed meanwhile
         return None
-    return PastRun(str(folder), origin, made, 1e-6 * _size(folder), recorded, seeds, figures, remarks, lengths)
+    megabytes, lost = 1e-6 * _size(folder), sum(each.lost for each in cases)
+    return PastRun(str(folder), origin, made, megabytes, recorded, seeds, figures, remarks, lengths, lost)
 
 
 def _size(folder: Path) -> int:
@@ -190,6 +192,7 @@ class CaseFigures(msgspec.Struct, frozen=True):
     duration_s: float = 0.0  # [s]; 0 in those of another version
     planned_s: float = 0.0  # [s]
     interrupted: bool = False
+    lost: int = 0  # poses
     spoiled: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
 

@@ -47,7 +47,9 @@ def report(
         float, typer.Option(min=2.0, max=12.0, metavar="INCHES", help="Of figures and LaTeX tables: 3.5 or 7.16.")
     ] = 3.5,
     pdf: Annotated[bool, typer.Option("--pdf", help="Write the figures as PDF as well, into figures/.")] = False,
-    as_latex: Annotated[bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs, adjustbox) instead.")] = False,
+    as_latex: Annotated[
+        bool, typer.Option("--latex", help="Print the tables as LaTeX (booktabs, adjustbox) instead.")
+    ] = False,
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown instead.")] = False,
     metrics: Annotated[
         str | None, typer.Option(metavar="NAMES", help="With --latex or --markdown: these alone, as f,iae,itae.")
@@ -515,7 +517,25 @@ def _show_past(words: Sequence[str], below: list[str] | None, *, as_json: bool) 
     say(*(columns([head, *rows]) if rows else ["no run"]))
     for folder in sweeps:
         say(f"{_minute((folder / SWEEP).stat().st_mtime)}  {folder}  a sweep: `./zenpark report {folder}`")
+    say(*_losses(found))
     print(f"runs: {len(found)}, {sum(run.megabytes for run in found):.1f} MB; sweeps: {len(sweeps)}")
+
+
+def _losses(found: Sequence[PastRun]) -> list[str]:
+    """A line: poses lost per hour of runs in real time, the oldest run first; none without such runs."""
+    flown_h, quiet_h, lost, count = 0.0, 0.0, 0, 0
+    for run in found:
+        hours = sum(sum(case.values()) for case in run.lengths.values()) / 3600.0
+        if run.origin.virtual or not hours:
+            continue
+        count += 1
+        flown_h += hours
+        quiet_h = 0.0 if run.lost else quiet_h + hours
+        lost += run.lost
+    if not count:
+        return []
+    rate = f"{lost} poses lost, {lost / flown_h:.3g} per hour"
+    return [f"real time: {flown_h:.2f} h in {count} runs; {rate}; the last {quiet_h:.2f} h without loss"]
 
 
 def _minute(at: float) -> str:

@@ -81,13 +81,17 @@ def test_whether_seeds_change_anything() -> None:
         assert Plan(msgspec.structs.replace(bare, **parts)).uses_chance
 
 
-def kept(folder: Path, *, seed: int = 1, text: str = 'title = "Two"\n[trigger]\nkind = "periodic"\n', **origin) -> Path:
-    """The folder of a run, without a recording that could be read."""
+PERIODIC = 'title = "Two"\n[trigger]\nkind = "periodic"\n'
+
+
+def kept(folder: Path, *, seed: int = 1, text: str = PERIODIC, lost: int = 0, **origin) -> Path:
+    """The folder of a run of an hour with two seeds, without a recording that could be read."""
     folder.mkdir(parents=True)
     (folder / run_folder.SOURCE).write_text(text)
     run_folder.keep_origin(folder, RunOrigin(title="Two", file="two.toml", **{"begun": 1e9, **origin}))
     mean = {"f_hz": 10.0 * seed, "iae": 1.5, "rmse": None}
-    figures = [{"case": "event", "seed": seed, "mean": mean}, {"case": "event", "seed": seed + 1, "mean": mean}]
+    each = {"case": "event", "mean": mean, "duration_s": 1800.0}
+    figures = [{**each, "seed": seed, "lost": lost}, {**each, "seed": seed + 1}]
     (folder / "metrics.json").write_bytes(msgspec.json.encode(figures))
     (folder / "event.mcap").write_bytes(b"0" * 1000)
     return folder
@@ -151,6 +155,15 @@ def test_past_runs_on_the_command_line(tmp_path: Path) -> None:
     assert "30.0 (× 3.000)" in said
     alone = zenpark("compare", str(a))
     assert "name two or more" in str(alone.exception)
+
+
+def test_past_runs_tell_losses_per_hour(tmp_path: Path) -> None:
+    for k, lost in enumerate((0, 9, 0, 0)):
+        kept(tmp_path / str(k), begun=1e9 + k, lost=lost)
+    kept(tmp_path / "virtual", begun=2e9, lost=5, virtual=True)
+    *_, line, _ = zenpark("runs", "--past", "--in", str(tmp_path)).stdout.splitlines()
+    assert line == "real time: 4.00 h in 4 runs; 9 poses lost, 2.25 per hour; the last 2.00 h without loss"
+    assert "real time" not in zenpark("runs", "virtual", "--in", str(tmp_path)).stdout
 
 
 def test_clean_removes_the_named_but_nothing_tagged(tmp_path: Path) -> None:
