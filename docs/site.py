@@ -112,8 +112,8 @@ def commands() -> Iterator[str]:
     """Every command with its options, and the exit codes."""
     import typer.main  # noqa: PLC0415
 
-    from tools.commands.options import PANELS  # noqa: PLC0415
     from tools.main import app  # noqa: PLC0415
+    from tools.options import PANELS  # noqa: PLC0415
 
     yield "# Commands\n"
     yield "`./zenpark COMMAND --help` prints the same.\n"

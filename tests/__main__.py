@@ -9,8 +9,8 @@ import typer
 from tests.bench.bench import bench
 from tests.reliability.chaos import chaos
 from tests.reliability.soak import soak
-from tools.commands.options import example
 from tools.main import call
+from tools.options import example
 
 MEASUREMENTS = {
     "--chaos": (chaos, ("triangle --faults 20 --seed 1", "triangle --kinds kill,freeze")),

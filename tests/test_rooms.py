@@ -50,6 +50,7 @@ experiments.api
 tools.terminal
 tools.live_table tools.consent
 tools.progress tools.completion
+tools.options
 tools.commands
 tools.main
 tools.guard

@@ -16,8 +16,8 @@ import typer
 from typer.models import CommandInfo
 
 from agents.errors import ExplainedError
-from tools.commands import check, hosts, lab, network, orders, processes, results, run, sweep, view
-from tools.commands.options import Command, Group, example, print_json, warn
+from tools.commands import author, check, explain, hosts, lab, network, orders, processes, results, run, sweep, view
+from tools.options import Command, Group, example, print_json, warn
 
 
 def _exit(code: object, **_: object) -> None:
@@ -34,7 +34,7 @@ app: Final = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _module in (run, results, view, sweep, check, processes, network, orders):
+for _module in (run, results, view, sweep, check, explain, author, processes, network, orders):
     app.add_typer(_module.app)
 app.add_typer(hosts.app, name="hosts")
 app.add_typer(lab.app, name="cert")

@@ -6,7 +6,6 @@ reference pages print the same entries.
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 import tomllib
@@ -32,30 +31,6 @@ _NAMES: Final = {  # tables whose keys are names, with the example of such a nam
     "anchors": ("ROBOT", "TB01"),
 }
 _LISTS: Final = ("timeline", "changes", "outages", "criteria")  # keys that are lists of tables
-_SYNONYMS: Final = {  # of words that users look for: words that keys and their texts have
-    "camera": ("positioning", "capture"),
-    "charge": ("battery",),
-    "collision": ("avoidance", "separation", "contact"),
-    "crash": ("avoidance", "separation", "contact"),
-    "delay": ("latency", "late"),
-    "emergency": ("safety", "cut"),
-    "event": ("trigger",),
-    "frequency": ("hz", "rate"),
-    "gps": ("positioning", "capture"),
-    "graph": ("links", "topology"),
-    "gust": ("drift", "jitter", "wind"),
-    "latency": ("delay", "late"),
-    "localisation": ("positioning", "position"),
-    "loss": ("drop", "lost"),
-    "mocap": ("positioning", "capture"),
-    "noise": ("sigma", "jitter", "scatter"),
-    "packet": ("message", "pose"),
-    "quantisation": ("resolution",),
-    "random": ("seed", "sigma", "scatter"),
-    "saturation": ("clamp", "limit", "speed"),
-    "velocity": ("speed",),
-    "wall": ("arena", "obstacle"),
-}
 _LIMITS: Final = {
     "minimum": "≥ {}",
     "exclusiveMinimum": "> {}",
@@ -124,50 +99,10 @@ def unit(asked: str) -> str:
     return units.pop() if len(units) == 1 else ""
 
 
-def nearest(asked: str, count: int = 3) -> list[str]:
-    """The keys most like `asked`, or like its last word, as users write them; the best first."""
-    end = asked.rpartition(".")[2]
-    plugins = [entry for entry in entries() if entry.key.endswith(")")]
-    known = dict.fromkeys(".".join(entry.words) for entry in entries())
-    known |= dict.fromkeys(".".join([*entry.words, _split(entry.key)[-1].strip("()")]) for entry in plugins)
-
-    def unlike(key: str) -> tuple[float, int]:
-        pairs = ((asked, key), (end, key.rpartition(".")[2]))
-        return -max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs), len(key)
-
-    return sorted(known, key=unlike)[:count]
-
-
-def about(asked: str, count: int = 6) -> list[Entry]:
-    """Keys that have every word of `asked`, or a synonym, in their name or else in their text; the best first."""
-    sought = [(word, *_SYNONYMS.get(word, ())) for word in _words(asked)]
-
-    def rank(entry: Entry) -> tuple[int, ...] | None:
-        """For each word 0, 1, 2: at the end of the key, elsewhere, in its text; 3 more for synonyms; None: nowhere."""
-        key = _split(entry.key)
-        places = (_words(key[-1]), _words(entry.key), _words(entry.text))
-        ranks = [
-            min(
-                (k + 3 * (n > 0) for n, word in enumerate(words) for k in range(3) if _begins(word, places[k])),
-                default=None,
-            )
-            for words in sought
-        ]
-        return None if None in ranks else tuple(each for each in ranks if each is not None)
-
-    found = [(ranks, len(entry.key), entry) for entry in entries() if sought and (ranks := rank(entry)) is not None]
-    once = {entry.text or entry.key: entry for *_, entry in sorted(found, key=lambda each: each[:2], reverse=True)}
-    return list(reversed(once.values()))[:count]
-
-
-def _words(text: str) -> list[str]:
-    return re.findall(r"[a-z]{2,}", text.lower())
-
-
-def _begins(word: str, place: Sequence[str]) -> bool:
-    """Whether one of the words of a place begins with `word`, its plural left out."""
-    stem = word.removesuffix("s") if len(word) > 4 else word
-    return any(each.startswith(stem) for each in place)
+def containing(asked: str) -> list[Entry]:
+    """Entries that have every word of `asked` in their key or text."""
+    words = re.findall(r"[a-z0-9]+", asked.lower())
+    return [each for each in entries() if words and all(word in f"{each.key} {each.text}".lower() for word in words)]
 
 
 def tables() -> list[Entry]:

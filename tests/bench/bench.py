@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from tests.bench import measuring, process, reactions
-from tools.commands.options import AsJson, known_words, print_json
+from tools.options import AsJson, known_words, print_json
 
 BENCHMARKS: Final = {
     "start": measuring.start,  # time until a command answers

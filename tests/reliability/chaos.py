@@ -18,7 +18,7 @@ from tests.reliability.chaos_report import ChaosResult, FaultResult, RoundResult
 from tests.reliability.chaos_round import ChaosRound
 from tests.reliability.faults import FAULTS, script
 from tests.reliability.spoilt_run import Setting
-from tools.commands.options import AsJson, File, Out, Settings, known_words, print_result
+from tools.options import AsJson, File, Out, Settings, known_words, print_result
 from tools.progress import columns, finding_lines
 
 BARREN: Final = 3  # rounds without any fault, and it gives up

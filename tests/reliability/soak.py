@@ -17,7 +17,7 @@ from experiments.real_time.conductor.run_view import RunFailed
 from experiments.recording.run_folder import new_folder
 from tests.reliability.soak_sampler import Sampler
 from tests.reliability.soak_verdict import judge, passed, table
-from tools.commands.options import AsJson, Bodies, Case, Out, Settings, print_result
+from tools.options import AsJson, Bodies, Case, Out, Settings, print_result
 from tools.progress import columns, finding_lines
 
 

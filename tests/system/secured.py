@@ -19,8 +19,8 @@ from agents.network.endpoints import free_endpoint
 from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights
 from experiments.file.document import load
+from experiments.real_time.hosts import authority
 from tests.system.lab import ENVIRONMENT, ROOT, RobotProcess, Watcher, until
-from tools.commands import authority
 
 FILE = ROOT / "tests" / "system" / "secured.toml"
 FLOWN = ("KH01", "KH02", "CF01")

@@ -13,10 +13,10 @@ from agents.network import messages
 from agents.network.endpoints import free_endpoint
 from agents.network.lab import Role
 from experiments.file import catalogue
+from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from tests.conftest import RouterProcess
 from tests.system.lab import PATIENCE_S, Flight, RobotProcess, Started, Watcher
-from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

@@ -16,11 +16,11 @@ from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
 from experiments.file.document import load
+from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from experiments.run import reopen
 from tests.conftest import RouterProcess
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, RobotProcess, Watcher, gone, until
-from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

@@ -20,8 +20,8 @@ from agents.network.endpoints import free_endpoint
 from agents.network.keys import Keys
 from agents.network.zenoh_config import config, settings
 from experiments.real_time.conductor import orders
+from experiments.real_time.hosts import authority
 from tests.system.secured import FLOWN, Laboratory, copy, elsewhere, flying, steady
-from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

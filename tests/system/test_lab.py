@@ -14,9 +14,9 @@ import zenoh
 from agents.network import messages, pubsub
 from agents.network import session as network
 from agents.network.keys import Keys
+from experiments.real_time.hosts import authority
 from tests.system.lab import ENVIRONMENT, ROOT, Flight, until, zenpark
 from tests.system.secured import FILE, Laboratory, copy
-from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

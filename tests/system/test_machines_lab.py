@@ -15,11 +15,11 @@ import pytest
 
 from agents.network.lab import register
 from experiments.file import catalogue
+from experiments.real_time.hosts import authority
 from experiments.recording import playback
 from tests.system.lab import typed, until
 from tests.system.machines import Machines, machines, why_not
 from tests.system.test_machines import busy, zenpark
-from tools.commands import authority
 from tools.commands.run import SPOILED
 
 LACKING = why_not()

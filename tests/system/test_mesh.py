@@ -20,9 +20,10 @@ from agents.network.lab import Role
 from agents.network.zenoh_config import config, settings
 from experiments.definition import access_rights, mesh
 from experiments.file.document import load
+from experiments.real_time.hosts import authority
 from experiments.run import reopen
 from tests.system.lab import Flight, Started, Watcher
-from tools.commands import authority, orders
+from tools.commands import orders
 from tools.commands.network import members
 
 pytestmark = pytest.mark.system

@@ -10,10 +10,10 @@ import pytest
 
 from agents.network.endpoints import free_endpoint
 from experiments.file.document import load
+from experiments.real_time.hosts import authority
 from experiments.run import reopen
 from tests.system import machines
 from tests.system.lab import PATIENCE_S, Flight, until
-from tools.commands import authority
 
 pytestmark = pytest.mark.system
 

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from agents.network.endpoints import EndpointError, free_endpoint
 from agents.plugins import registry
 from experiments.recording.version import SHOWN, digest, provenance
-from tools.commands.options import PANELS
 from tools.main import app, main, part_for
+from tools.options import PANELS
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = sorted(typer.main.get_command(app).commands)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tools.commands.options import print_result, warn
+from tools.options import print_result, warn
 from tools.terminal import printable, say
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x9b2J\u202e"

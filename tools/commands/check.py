@@ -1,4 +1,4 @@
-"""Commands that deal with experiment files: check them, begin new ones, list those that are ready-made."""
+"""Commands before a run: check an experiment file, check its robots."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from experiments.catalogue import index
-from tools.commands.options import (
+from tools.options import (
+    WIDEST,
     As,
     AsJson,
     Bodies,
@@ -24,7 +24,6 @@ from tools.commands.options import (
     check_bodies,
     example,
     print_json,
-    print_result,
     warn,
 )
 
@@ -32,12 +31,10 @@ if TYPE_CHECKING:
     from experiments.check.analysis import Analysis
     from experiments.check.findings import Figures, Finding
     from experiments.check.kept import KeptVerdict, Verdict
-    from experiments.file.reference import Entry
     from experiments.real_time.conductor.preflight_checks import RobotChecks
 
 app: Final = typer.Typer()
 
-WIDEST: Final = 110  # columns of print
 CHECKED: Final = {"ok": "✓", "warn": "!", "bad": "✗", "unknown": "·"}
 
 
@@ -299,193 +296,3 @@ def _differs(ideal: float | None, noisy: float | None) -> bool:
 
 def _redundancy_text(spare: int | None, vital: int) -> str:
     return "-" if spare is None else f"{spare} of {spare + vital}"
-
-
-@app.command(epilog=example("explain", "explain disturbance.hover_jitter", "explain plan.circle"))
-def explain(
-    key: Annotated[
-        str, typer.Argument(help="such as disturbance.hover_jitter, safety, trigger, circle; left out: all at the top")
-    ] = "",
-    as_json: AsJson = False,
-) -> int:
-    """Explain a key of the experiment file, a plug-in, a kind of robot or a metric: text, unit, limits, an example."""
-    import difflib
-
-    from experiments.file import json_schema, reference
-    from experiments.metrics.metric import known_metrics, short_name
-    from experiments.metrics.results import RobotMetrics
-
-    found = reference.matching(key) if key else reference.tables()
-    warn(json_schema.unusable())
-    metric = {short_name(name): each for name, each in known_metrics().items()}.get(short_name(key.lower()))
-    if not found and metric is not None:
-        print_result(
-            {"label": metric.label, "unit": metric.unit, "meaning": metric.meaning},
-            *(
-                f"metric: {metric.head}",
-                textwrap.fill(metric.meaning, WIDEST, initial_indent="  ", subsequent_indent="  "),
-            ),
-            as_json=as_json,
-        )
-        return 0
-    if not found:
-        nearest, about = reference.nearest(key), reference.about(key)
-        near = difflib.get_close_matches(key, nearest, 1, 0.75 if about else 0.6)
-        table = key.partition(".")[0]
-        listing = f"`./zenpark explain {table}`" if reference.matching(table) else "`./zenpark explain`"
-        hint = f"did you mean {near[0]!r}?" if near else f"{listing} lists what there is"
-        listed = () if near else about
-        if key.lower() in {
-            field for metric in RobotMetrics.__struct_fields__ for field in (metric, metric.split("_")[0])
-        }:
-            hint, listed = "a metric of a run: `./zenpark docs`, page 'Metrics and CSV columns'", ()
-        warn([f"nothing in the experiment file is named {key!r}; {'keys about it:' if listed else hint}"])
-        for entry in listed:
-            print(textwrap.shorten(f"  {entry.key}  {entry.text}", WIDEST, placeholder=" ..."), file=sys.stderr)
-        return 2
-    if as_json:
-        print_json(found)
-        return 0
-    if not key:
-        _print_entries(found)
-        return 0
-    first = found[0].text
-    alike = [entry for entry in found if entry.text == first and not entry.key.startswith(f"{found[0].key}.")]
-    print("\n".join(entry.key for entry in alike), "\n")
-    for paragraph in first.split("\n\n"):
-        print(textwrap.fill(paragraph, WIDEST, initial_indent="  ", subsequent_indent="  "))
-    rows = {"type": found[0].type, "limits": found[0].limits, "default": found[0].default}
-    print(*(f"  {name:8} {text}" for name, text in rows.items() if text), sep="\n")
-    print(textwrap.indent(f"\n{found[0].example}", "    "))
-    rest = [entry for entry in found if entry not in alike]
-    told = {(entry.key.removeprefix(alike[0].key), entry.text) for entry in rest if entry.key.startswith(alike[0].key)}
-    for other in alike[1:]:  # a plug-in in another place has the same parameters
-        again = f"{other.key}."
-        rest = [e for e in rest if not e.key.startswith(again) or (e.key.removeprefix(other.key), e.text) not in told]
-    if rest:
-        print()
-    _print_entries(rest)
-    return 0
-
-
-def _print_entries(entries: Sequence[Entry]) -> None:
-    """Lines of a table, one for each entry: cut at a terminal, in full for a file or a pipe."""
-    for entry in entries:
-        default = f"default: {entry.default}" if entry.default else ""
-        known = ", ".join(filter(None, (entry.limits, default)))
-        text = f"{entry.key}  {entry.text}" + (f" [{known}]" if known else "")
-        print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))
-
-
-@app.command(epilog=example("new triangle mine.toml", "new --hemisphere 40 swarm.toml"))
-def new(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="NAME",
-            help="A ready-made experiment (`./zenpark list`); TARGET behind a formation.",
-            autocompletion=index.names,
-        ),
-    ] = None,
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
-    *,
-    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
-    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
-    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
-    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
-    spacing: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Between neighbours [m].")] = 0.6,
-    scatter: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=1000.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]"),
-    ] = None,
-    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
-    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
-    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="[s]")] = 60.0,
-) -> None:
-    """Begin an experiment file from a ready-made one, or with a formation of any size."""
-    from experiments.authoring.generate import LayoutOptions, generate
-    from experiments.file import catalogue, json_schema
-
-    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere}
-    warn(json_schema.unusable())
-    formations = [(what, str(size)) for what, size in asked.items() if size is not None]
-    if not formations:
-        if name is None:
-            raise typer.BadParameter("give a NAME (`./zenpark list`), or a formation such as --hemisphere 40")
-        path = catalogue.copy_entry(name, Path(target) if target else Path(f"{name}.toml"))
-        print(f"{path}: a copy of {name}; change it, then `./zenpark check {path}` and `./zenpark run {path}`")
-        return
-    if len(formations) > 1 or target is not None:
-        what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
-        raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
-    wanted = LayoutOptions(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
-    path, made = generate(*formations[0], name, wanted)
-    print(f"{path}: {made.title}, {len(made.pairs)} links; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
-
-
-@app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
-def import_(
-    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
-    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
-    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="Their files do not say how long [s].")] = 60.0,
-    poses: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt)."),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
-    from experiments.authoring.robotic_park.convert import convert
-
-    path, notes = convert(file, target, duration, poses)
-    lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
-    if notes:
-        lines.append("Not carried over, or not as it was:")
-    lines += [textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    ") for note in notes]
-    print_result({"file": path, "notes": notes}, *lines, as_json=as_json)
-
-
-@app.command(name="list", epilog=example("list", "list --json"))
-def list_(as_json: AsJson = False) -> None:
-    """List the ready-made experiments and the plugins."""
-    from agents.plugins import registry
-
-    plugins = {
-        "Kinds of robots": registry.ROBOTS,
-        "Bodies": registry.BODIES,
-        "Protocol twins": registry.DEVICES,
-        "Triggers": registry.TRIGGERS,
-        "Predictors": registry.PREDICTORS,
-        "Laws": registry.LAWS,
-        "Planners": registry.PLANNERS,
-        "Avoidances": registry.AVOIDANCES,
-        "Engines": registry.ENGINES,
-        "Added metrics": registry.METRICS,
-    }
-    if registry.distributions():  # others' plug-ins may be unusable; to find out takes numpy, half a second
-        from experiments.file import json_schema
-        from experiments.metrics.metric import unusable_metrics
-
-        warn([*json_schema.unusable(), *unusable_metrics()])
-    experiments = index.titles()
-    found = {title: registry.names(group) for title, group in plugins.items()}
-    width = max(len(name) for name in experiments)
-    print_result(
-        {"experiments": [{"name": name, "title": title} for name, title in experiments.items()]}
-        | {title.lower().replace(" ", "_"): names for title, names in found.items()},
-        "Experiments (./zenpark run NAME, ./zenpark new NAME):",
-        *(f"  {name:<{width}}  {title}" for name, title in experiments.items()),
-        *(f"{title}: {', '.join(names)}" for title, names in found.items()),
-        as_json=as_json,
-    )
-
-
-@app.command(epilog=example("schema > zenpark.schema.json"))
-def schema() -> None:
-    """Print the JSON schema of the experiment file."""
-    import json
-
-    from experiments.file import json_schema
-
-    warn(json_schema.unusable())
-    print(json.dumps(json_schema.schema(), indent=2))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from tools.commands.lab import SOON_DAYS
-from tools.commands.options import AsJson, File, Lab, Settings, example, group, known_words, print_json
+from tools.options import AsJson, File, Lab, Settings, example, group, known_words, print_json
 
 if TYPE_CHECKING:
     from experiments.definition.experiment import Host

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from tools.commands.options import AsJson, example, group, print_json
+from tools.options import AsJson, example, group, print_json
 
 if TYPE_CHECKING:
     from agents.network.lab import Register, Role
@@ -38,7 +38,7 @@ def init(
 ) -> None:
     """Found a lab: its authority, a certificate per robot, and those of router, operator, observer and helpers."""
     from agents.network.lab import LabError
-    from tools.commands.authority import SERVICES, create
+    from experiments.real_time.hosts.authority import SERVICES, create
 
     place = Path(folder)
     identities: dict[str, Role] = {role: role for role in SERVICES}
@@ -68,7 +68,7 @@ def issue(
     """Make certificates for more robots, people or routers."""
     from agents.network.lab import ROLES, LabError
     from agents.plugins.registry import did_you_mean
-    from tools.commands.authority import issue as made
+    from experiments.real_time.hosts.authority import issue as made
 
     if role and role not in ROLES:
         raise LabError(f"no role '{role}' in a lab; {did_you_mean(role, ROLES)}")
@@ -90,7 +90,7 @@ def renew(
     as_json: AsJson = False,
 ) -> None:
     """Make new certificates for the same names; those before are valid until they end."""
-    from tools.commands.authority import renew as made
+    from experiments.real_time.hosts.authority import renew as made
 
     known = made(Path(folder), names or [], hosts=host or [], days=days, authority=authority)
     _print(Path(folder), known, names or list(known.identities), as_json=as_json)
@@ -99,7 +99,7 @@ def renew(
 @app.command(epilog=example("cert revoke lab KH01"))
 def revoke(folder: Folder, names: Names, days: Days = 90.0, as_json: AsJson = False) -> None:
     """Take all rights from certificates that are lost or stolen, and make new ones."""
-    from tools.commands.authority import revoke as made
+    from experiments.real_time.hosts.authority import revoke as made
 
     _print(Path(folder), made(Path(folder), names, days=days), names, as_json=as_json)
     _advise(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from agents.errors import ExplainedError
-from tools.commands.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
+from tools.options import As, AsJson, Connect, KeyExpression, Lab, Seconds, example, print_json, session
 from tools.terminal import printable
 
 if TYPE_CHECKING:

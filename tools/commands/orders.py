@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from tools import completion
-from tools.commands.options import (
+from tools.options import (
     CONNECT,
     As,
     AsJson,

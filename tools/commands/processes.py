@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from tools import completion
-from tools.commands.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers
 from tools.commands.orders import world_app
+from tools.options import CONNECT, As, Bodies, Case, Connect, File, Lab, Lifeline, Realm, example, routers
 
 if TYPE_CHECKING:
     from agents.network.access_control import Rights

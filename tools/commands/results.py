@@ -12,7 +12,7 @@ import typer
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.commands.options import AsJson, example, known_words, print_json, print_result, warn
+from tools.options import AsJson, example, known_words, print_json, print_result, warn
 from tools.terminal import say
 
 if TYPE_CHECKING:

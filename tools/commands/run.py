@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from tools.commands import view as viewing
-from tools.commands.options import (
+from tools.commands.results import summary, write_figures_of_merit, write_report
+from tools.options import (
     Anyway,
     As,
     AsJson,
@@ -32,7 +33,6 @@ from tools.commands.options import (
     print_result,
     warn,
 )
-from tools.commands.results import summary, write_figures_of_merit, write_report
 from tools.terminal import say
 
 if TYPE_CHECKING:

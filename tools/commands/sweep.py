@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from tools.commands.options import (
+from tools.options import (
     Anyway,
     AsJson,
     Cases,

@@ -13,7 +13,7 @@ import typer
 
 from agents.errors import ExplainedError
 from tools import completion
-from tools.commands.options import As, AsJson, Case, Connect, Lab, Realm, example, open_in_browser, print_json, routers
+from tools.options import As, AsJson, Case, Connect, Lab, Realm, example, open_in_browser, print_json, routers
 
 if TYPE_CHECKING:
     import zenoh

@@ -14,7 +14,7 @@ from agents.network.session import connected, tokens_present
 from agents.network.shutdown import leave
 from agents.network.zenoh_config import config, settings
 from agents.runtime.router import MOST_TOKENS, serve_router
-from tools.commands import authority
+from experiments.real_time.hosts import authority
 
 KEYS = Keys()
 

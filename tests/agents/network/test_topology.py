@@ -52,7 +52,7 @@ def test_robot_knows_its_neighbours_and_services():
 
 
 def test_lab_listeners_must_know_the_rights(tmp_path):
-    from tools.commands import authority  # noqa: PLC0415
+    from experiments.real_time.hosts import authority  # noqa: PLC0415
 
     folder = tmp_path / "lab"
     authority.create(folder, {"A": "robot"}, hosts=["127.0.0.1"])

@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from experiments.definition.experiment import Host
+from experiments.real_time.hosts import authority
 from experiments.real_time.hosts.hosts import HostError
 from tests.tools.commands.test_hosts import FAKE
-from tools.commands import authority
 from tools.commands.hosts import send
 
 

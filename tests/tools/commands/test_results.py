@@ -17,9 +17,9 @@ from experiments.file.problems import DocumentError
 from experiments.metrics.statistics import spread
 from experiments.report.tables import ratio_words
 from tests.experiments.recording.test_bundle import SHORT
-from tools.commands.options import known_words
 from tools.commands.run import _acquired
 from tools.main import app
+from tools.options import known_words
 
 pytestmark = pytest.mark.slow  # whole runs and their reports
 

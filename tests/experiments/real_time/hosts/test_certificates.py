@@ -7,6 +7,7 @@ import pytest
 
 from agents.network.lab import register
 from experiments.definition.experiment import Host
+from experiments.real_time.hosts import authority
 from experiments.real_time.hosts.certificates import (
     Holding,
     days_left,
@@ -18,7 +19,6 @@ from experiments.real_time.hosts.certificates import (
     strays,
     unnamed,
 )
-from tools.commands import authority
 
 ROBOTS = ["KH01", "CF01"]
 

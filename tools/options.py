@@ -19,6 +19,7 @@ from tools.terminal import say
 if TYPE_CHECKING:
     import zenoh
 
+WIDEST: Final = 110  # columns of print
 CONNECT: Final = "ZENPARK_CONNECT"  # environment: default of --connect, endpoints with spaces between them
 PANELS: Final = {
     "Experiments": "new check explain run sweep report compare export list schema import recover clean",

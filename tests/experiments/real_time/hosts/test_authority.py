@@ -8,7 +8,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from typer.testing import CliRunner
 
 from agents.network.lab import LabError, files, register
-from tools.commands import authority
+from experiments.real_time.hosts import authority
 from tools.main import app
 
 ROBOTS = {"router": "router", "operator": "operator", "CF01": "robot", "CF02": "robot"}

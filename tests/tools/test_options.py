@@ -4,7 +4,7 @@ import webbrowser
 
 import pytest
 
-from tools.commands.options import open_in_browser
+from tools.options import open_in_browser
 
 
 @pytest.mark.parametrize("opened", [True, False])

@@ -1,0 +1,82 @@
+"""Commands that write experiment files: a new one, or one of Robotic Park's authors."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from experiments.catalogue import index
+from tools.options import WIDEST, AsJson, example, print_result, warn
+
+app: Final = typer.Typer()
+
+
+@app.command(epilog=example("new triangle mine.toml", "new --hemisphere 40 swarm.toml"))
+def new(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NAME",
+            help="A ready-made experiment (`./zenpark list`); TARGET behind a formation.",
+            autocompletion=index.names,
+        ),
+    ] = None,
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [NAME.toml]")] = None,
+    *,
+    polygon: Annotated[int | None, typer.Option(metavar="N", help="Robots on a regular polygon.")] = None,
+    grid: Annotated[str | None, typer.Option(metavar="RxC", help="Robots on a grid, such as 5x8.")] = None,
+    hemisphere: Annotated[int | None, typer.Option(metavar="N", help="On a hemisphere, with Delaunay links.")] = None,
+    kind: Annotated[str, typer.Option(metavar="KIND", help="Of the robots of a formation.")] = "crazyflie",
+    spacing: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Between neighbours [m].")] = 0.6,
+    scatter: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1000.0, help="Starts are drawn this far around, by seed [m]. [0.3 spacing]"),
+    ] = None,
+    law: Annotated[str, typer.Option(metavar="distance|displacement", help="Of a formation.")] = "distance",
+    seed: Annotated[int, typer.Option(min=0, help="Of the file.")] = 1,
+    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="[s]")] = 60.0,
+) -> None:
+    """Begin an experiment file from a ready-made one, or with a formation of any size."""
+    from experiments.authoring.generate import LayoutOptions, generate
+    from experiments.file import catalogue, json_schema
+
+    asked = {"polygon": polygon, "grid": grid, "hemisphere": hemisphere}
+    warn(json_schema.unusable())
+    formations = [(what, str(size)) for what, size in asked.items() if size is not None]
+    if not formations:
+        if name is None:
+            raise typer.BadParameter("give a NAME (`./zenpark list`), or a formation such as --hemisphere 40")
+        path = catalogue.copy_entry(name, Path(target) if target else Path(f"{name}.toml"))
+        print(f"{path}: a copy of {name}; change it, then `./zenpark check {path}` and `./zenpark run {path}`")
+        return
+    if len(formations) > 1 or target is not None:
+        what = f"--{formations[1][0]}" if len(formations) > 1 else f"'{target}'"
+        raise typer.BadParameter(f"{what} is too much behind --{formations[0][0]}: one formation, one TARGET")
+    wanted = LayoutOptions(kind=kind, spacing=spacing, scatter=scatter, seed=seed, duration_s=duration, law=law)
+    path, made = generate(*formations[0], name, wanted)
+    print(f"{path}: {made.title}, {len(made.pairs)} links; `./zenpark check {path}`, `./zenpark run {path} --virtual`")
+
+
+@app.command(name="import", epilog=example("import park.yaml park.toml --duration 60"))
+def import_(
+    file: Annotated[str, typer.Argument(metavar="FILE.yaml", help="An experiment of Robotic Park's authors.")],
+    target: Annotated[str | None, typer.Argument(metavar="TARGET", help="The file to write. [FILE.toml]")] = None,
+    duration: Annotated[float, typer.Option(min=1.0, max=86400.0, help="Their files do not say how long [s].")] = 60.0,
+    poses: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Starts: an index of robots (.yaml), or a Webots world (.wbt)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Turn an experiment file of Robotic Park's authors into one of zenpark."""
+    from experiments.authoring.robotic_park.convert import convert
+
+    path, notes = convert(file, target, duration, poses)
+    lines = [f"{path}: from {file}; `./zenpark check {path}`, `./zenpark run {path} --virtual`"]
+    if notes:
+        lines.append("Not carried over, or not as it was:")
+    lines += [textwrap.fill(note, WIDEST, initial_indent="  - ", subsequent_indent="    ") for note in notes]
+    print_result({"file": path, "notes": notes}, *lines, as_json=as_json)
