@@ -154,7 +154,7 @@ experiments = {name: rendezvous(pairs, GAIN, DURATION_S) for name, pairs in GRAP
 print("\n".join(str(finding) for finding in check(experiments["ring"])))
 
 # %% [markdown]
-# `check` finds: the network is whole and has no leader, the loop settles. It warns that drones would
+# `check` finds: the network is whole and has no leader, the sampled loop is stable. It warns that drones would
 # land on each other, and it is right. Meeting is a law for a lesson and for particles; robots have a size and take
 # offsets that are not zero. Nothing below changes with them, see exercise 1.
 
@@ -335,7 +335,7 @@ for loop in LOOP:
     gain = figures(document.cases()["default"]).loop_gain
     assert gain is not None
     assert abs(gain - loop) < 1e-3
-    said.append({finding.code for finding in check(document)} & {"stable", "rings", "hunts"})
+    said.append({finding.code for finding in check(document)} & {"stable", "oscillates", "unstable"})
     trace = simulate(document).traces["default"]
     away = trace.true_position[..., :2] - trace.true_position[..., :2].mean(axis=1, keepdims=True)
     distance = np.linalg.norm(away, axis=2).max(axis=1)
@@ -343,7 +343,7 @@ for loop in LOOP:
     steps[loop] = trace
     print(f"h k λ_max = {loop}: {1e3 * left_over[-1]:9.5f} mm are left after 15 s; check says {said[-1].copy().pop()}")
 
-assert said == [{"stable"}] * 3 + [{"rings"}] * 2 + [{"hunts"}] * 2
+assert said == [{"stable"}] * 3 + [{"oscillates"}] * 2 + [{"unstable"}] * 2
 assert max(left_over[:3]) < 1e-4  # they meet
 assert left_over[3] < 0.01  # they still do, but take long
 assert min(left_over[5:]) > 0.03  # they never do

@@ -62,7 +62,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     spare_robots: int | None  # robots without any one of which it stays rigid
     vital_robots: tuple[str, ...]  # the other robots
     residual_mm: float | None  # worst link of the best shape
-    loop_gain: float | None  # h·μ·λ_max; 2 is where the formation hunts
+    loop_gain: float | None  # h·μ·λ_max; the loop is unstable from 2
     slowest_mode_s: float | None  # time constant of the slowest mode that moves
     free_modes: int  # modes that are slower than the run: nothing brings them back in time
     speed_needed: float | None  # of the fastest plan [m/s]

@@ -57,7 +57,7 @@ def closed_shares(kinds: Sequence[Kind], hz: float) -> Array:
 def bearable_factors(kinds: Sequence[Kind], hz: float) -> Array:
     """λ (N,): the largest factor with which goals g = p − λ p, decided at `hz`, leave a robot's loop stable.
 
-    On wheels a robot closes its share h of the error, and 2/h is where it hunts; a drone overshoots its goal, because
+    On wheels a robot closes its share h of the error, and is unstable from 2/h; a drone overshoots its goal, because
     it must tilt first, and bears less.
     """
     factor = 2.0 / closed_shares(kinds, hz)

@@ -28,7 +28,7 @@ class Modes:
     """The sampled loop near its target."""
 
     # largest real part of the eigenvalues of H M, what a decision takes from a mode, with the h of robots that bear as
-    # much as those of `bearable`: 2 is where it hunts
+    # much as those of `bearable`: the loop is unstable from 2
     gain: float
     radius: float  # largest |1 − λ| of modes whose sign stays: above 1 something grows
     slowest_s: float  # time constant of the slowest mode that moves [s]; infinity where none does

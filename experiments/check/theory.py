@@ -24,13 +24,15 @@ from twins.arrays import Index, Mask, norm
 FAR_OFF: Final = 0.01  # [m] a shape that misses a distance by more is another shape
 FEW: Final = 6  # names that are listed
 GAIN: Final = {"gain": "the gain", "stiffness": "the stiffness", "by link": "the gain or the stiffness"}  # of the file
-HUNTS: Final = 2.0  # of the share of an error that one decision corrects
+UNSTABLE_GAIN: Final = 2.0  # share of an error that one decision corrects
 # of a pose: running number, stamp [s], position [m] and velocity [m/s]
 LONG_POSE: Final = (1_000_000, 1.7e9 + 0.123456, (-1.234567,) * 3, (-0.123456,) * 3)
 LONG_YAW: Final = -1.234567  # [rad]
 LONG_NUMBER: Final = -1.234567e-05  # of what is said
 MILLIMETRES: Final = 50.0  # [m] a longer link is probably written in millimetres
-RINGS: Final = 1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
+OSCILLATING_GAIN: Final = (
+    1.2  # beyond 1 an error changes its sign; the rest to 2 is for lag that the model does not have
+)
 
 
 def network(analysis: Analysis) -> Iterator[Finding]:
@@ -73,12 +75,14 @@ def network(analysis: Analysis) -> Iterator[Finding]:
     isolated = [names[row] for row in analysis.without_neighbours if names[row] not in leaders]
     if isolated:
         message = f"{join_names(isolated)} has no links: it takes no part in the formation"
-        problems.append(Finding("warning", "hears-nobody", message, f'add "... > {isolated[0]}" to its links', path))
+        problems.append(
+            Finding("warning", "no-incoming-links", message, f'add "... > {isolated[0]}" to its links', path)
+        )
     for name in leaders:
         if names.index(name) not in links.sender:
             message, remedy = f"no robot receives from the leader {name}", f'add "{name} > ..." for one of the others'
             problems.append(
-                Finding("error" if len(leaders) == 1 else "warning", "leader-unheard", message, remedy, path)
+                Finding("error" if len(leaders) == 1 else "warning", "leader-not-received", message, remedy, path)
             )
     yield from problems
     if not problems:
@@ -357,21 +361,20 @@ def stability(analysis: Analysis) -> Iterator[Finding]:
         return
     name = gain_key(law, BY_DISTANCE if _measured(analysis).any() or not analysis.standing.any() else BY_RELATIVE)
     path, gain = ("formation", name), float(getattr(formation, name))
-    took = f"one decision takes {loop.gain:.3g} of the stiffest error (h·{'μ' if name == 'gain' else 'k'}·λ)"
-    calm = f"use a {name} below {gain * RINGS / max(loop.gain, 1e-12):.2g}"
+    took = f"gain {loop.gain:.3g} (h·{'μ' if name == 'gain' else 'k'}·λ)"
+    calm = f"use a {name} below {gain * OSCILLATING_GAIN / max(loop.gain, 1e-12):.2g}"
     if (own := strength(analysis)) not in GAIN.values():
-        took = f"one decision takes {loop.gain:.3g} of the stiffest error"
+        took = f"gain {loop.gain:.3g}"
         calm = f"the law '{choice}' does not use `links.gain`: let it ask for less by {own}"
         path = ("formation", "law")
-    if loop.gain >= HUNTS:
-        yield Finding("error", "hunts", f"the formation hunts: {took}, and from {HUNTS:g} on it grows", calm, path)
+    if loop.gain >= UNSTABLE_GAIN:
+        yield Finding("error", "unstable", f"the sampled loop is unstable: {took}, limit {UNSTABLE_GAIN:g}", calm, path)
     elif shape.worst <= FORGIVEN and loop.radius > 1.0 + FORGIVEN:
         message = f"the formation drifts away from its shape: an error grows by {loop.radius:.4f} with every decision"
         remedy = "give more links both ways; a ring of one-way links can turn for ever"
-        yield Finding("error", "unstable", message, remedy, ("formation", "links"))
-    elif loop.gain > RINGS:
-        yield Finding(
-            "warning", "rings", f"the formation rings: {took}, and its sign changes before it fades", calm, path
-        )
+        yield Finding("error", "diverges", message, remedy, ("formation", "links"))
+    elif loop.gain > OSCILLATING_GAIN:
+        message = f"the sampled loop oscillates before it settles: {took}, at most {OSCILLATING_GAIN:g} is calm"
+        yield Finding("warning", "oscillates", message, calm, path)
     else:
-        yield Finding("note", "stable", f"the loop settles: {took}, less than {RINGS:g}")
+        yield Finding("note", "stable", f"the sampled loop is stable: {took}, less than {OSCILLATING_GAIN:g}")

@@ -271,7 +271,7 @@ def _formatted(of: Figures) -> dict[str, str]:
         "single links it can lose": _redundancy_text(of.spare_links, len(of.vital_links)),
         "single robots it can lose": _redundancy_text(of.spare_robots, len(of.vital_robots)),
         "distances met to": number(of.residual_mm, ".1f", " mm"),
-        "loop gain, hunts at 2": number(of.loop_gain, ".3g"),
+        "loop gain (unstable from 2)": number(of.loop_gain, ".3g"),
         "slowest mode": number(of.slowest_mode_s, ".1f", " s to fall to 37 %; acquired is within the tolerance")
         + (f", {of.free_modes} slower than the run: free" if of.free_modes else ""),
         "speed of the fastest plan": number(of.speed_needed, ".3f", " m/s"),

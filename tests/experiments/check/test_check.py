@@ -109,13 +109,13 @@ def test_a_hover_above_the_limit_names_the_limit():
 @pytest.mark.usefixtures("unflown")
 @pytest.mark.parametrize(
     ("gain", "code"),
-    [(5.0, None), (8.0, "rings"), (12.0, "hunts")],  # of links without drones
+    [(5.0, None), (8.0, "oscillates"), (12.0, "unstable")],  # of links without drones
 )
 def test_gains(gain, code):
     found = bad(PARK, f"formation.gain={gain}")
-    assert found.keys() & {"rings", "hunts"} == ({code} if code else set())
+    assert found.keys() & {"oscillates", "unstable"} == ({code} if code else set())
     if code:
-        assert found[code][0] == ("error" if code == "hunts" else "warning")
+        assert found[code][0] == ("error" if code == "unstable" else "warning")
         assert "below 6.8" in found[code][2]
 
 
@@ -168,8 +168,8 @@ def test_uncompiled_law_is_noted_once(monkeypatch):
     [
         (
             "Steep",
-            "hunts",
-            "of the stiffest error, and from 2",
+            "unstable",
+            ", limit 2",
             "does not use `links.gain`: let it ask for less by the law's own",
         ),
         ("Undefined", "not-finite", "the law 'mine' gives for", "a length of 0"),
@@ -213,7 +213,7 @@ def test_remedy_for_a_users_law_names_the_law(monkeypatch, law, code, message, r
             "multiple of 0.02",
         ),
         (PARK, "rates.pose_hz=5", ("warning", "decides-unheard"), "at 5 Hz at most", "pose_hz"),
-        (PARK, "formation.leader=CF03", ("warning", "hears-nobody"), "TB01 has no links", "> TB01"),
+        (PARK, "formation.leader=CF03", ("warning", "no-incoming-links"), "TB01 has no links", "> TB01"),
     ],
 )
 @pytest.mark.usefixtures("unflown")
@@ -230,8 +230,8 @@ def test_followers_that_cannot_hear_of_the_leader():
 
 @pytest.mark.usefixtures("unflown")
 def test_a_leader_that_nobody_listens_to():
-    assert "leader-unheard" in ground({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, leader="A")
-    assert "hears-nobody" in ground({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, leader="A")
+    assert "leader-not-received" in ground({"B - C": 1.0, "C - D": 1.0, "B - D": 1.0}, leader="A")
+    assert "no-incoming-links" in ground({"A > B": 1.0, "A > C": 1.0, "B - C": 1.0}, leader="A")
 
 
 @pytest.mark.usefixtures("unflown")
@@ -255,8 +255,8 @@ def test_distances_that_contradict_one_another_without_a_triangle():
 @pytest.mark.usefixtures("unflown")
 def test_only_the_case_at_fault_is_named():
     found = bad(PARK, "cases.event.formation.gain=12")
-    assert found["hunts"][1].startswith("in case 'event': the formation hunts")
-    assert found["hunts"][3] == "--set cases.event.formation.gain=12"
+    assert found["unstable"][1].startswith("in case 'event': the sampled loop is unstable")
+    assert found["unstable"][3] == "--set cases.event.formation.gain=12"
 
 
 def test_only_the_cases_of_a_run_are_checked():
@@ -271,8 +271,8 @@ def test_place_is_in_the_case_that_changes_it(tmp_path):
     text = catalogue.path(PARK).read_text("utf-8")
     file = tmp_path / "mine.toml"
     file.write_text(f"{text}\n[cases.wild]\nformation = {{ gain = 12.0 }}\n", encoding="utf-8")
-    (hunts,) = (each for each in check(document.read(file)) if each.code == "hunts")
-    assert hunts.where == f"{file}:{text.count(chr(10)) + 3}:22"
+    (unstable,) = (each for each in check(document.read(file)) if each.code == "unstable")
+    assert unstable.where == f"{file}:{text.count(chr(10)) + 3}:22"
 
 
 # ------------------------------------------------------------------ the command
@@ -287,7 +287,7 @@ def test_the_table(capsys):
     assert "periodic 350.0 per second, event" in said
     assert said.endswith("no errors, 1 warning\n")
     assert commands.check(PARK, settings=["formation.gain=12"], as_json=False) == 1
-    assert "✗ the formation hunts" in capsys.readouterr().out
+    assert "✗ the sampled loop is unstable" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("unflown")

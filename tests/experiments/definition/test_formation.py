@@ -309,7 +309,7 @@ def test_what_check_says_of_formations(written):
     found = codes(written(odd + "[formation.anchors]\nD = 0.9\n"))
     assert found["change-not-realisable"].severity == "error"
     stiff = SQUARE.replace('"displacement"', '"displacement"\nstiffness = 9.0')
-    assert "stiffness" in codes(written(stiff))["hunts"].remedy
+    assert "stiffness" in codes(written(stiff))["unstable"].remedy
 
 
 def test_links_that_leave_robots_alone(written):

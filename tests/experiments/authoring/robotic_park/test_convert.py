@@ -35,7 +35,7 @@ def test_they_convert_and_pass_the_check(tmp_path, count):
     read, notes = converted(tmp_path, FILES[count]())
     assert len(read.experiment.robots) == count
     # their files have no disturbance; the gain of 8 and 20 is near or above what a real drone bears at their decisions
-    expected = {"not-random"} | {8: {"rings"}, 20: {"hunts", "not-acquired", "anchor-missed"}}.get(count, set())
+    expected = {"not-random"} | {8: {"oscillates"}, 20: {"unstable", "not-acquired", "anchor-missed"}}.get(count, set())
     if read.experiment.formation.update is not None:
         expected.add("not-acquired")  # what a chain of thresholds leaves
     assert {found.code for found in check(read) if found.severity != "note"} <= expected
@@ -52,7 +52,7 @@ def test_converted_formations_settle(tmp_path, count):
     plan = Plan(experiment)
     last = log.true_position[np.searchsorted(log.time, 19.9)]
     allowed = experiment.tolerance if experiment.formation.update is None else 0.15  # what a chain of thresholds leaves
-    if count == 20:  # hunts
+    if count == 20:  # unstable
         allowed = 0.1
     assert law_errors(plan.law, last, last[plan.links.sender], plan.links).max() < allowed
 
