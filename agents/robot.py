@@ -81,7 +81,7 @@ class Robot:
         self.neighbours: Neighbours = self.goals.neighbours
         self.guidance: Guidance | None = None
         if assignment.guided:
-            self.guidance = Guidance(flies=kind.flies, silence_s=limits.link_silence_s)
+            self.guidance = Guidance(flies=kind.flies, silence_s=limits.neighbour_timeout_s)
         self.keeping = StationKeeping(assignment.ground)
         self.lifecycle = Lifecycle(kind, assignment.hover, assignment.duration)
         stepping = self._stepping = self.goals.stepping

@@ -15,13 +15,13 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Limits of setpoints, and of what may happen to a robot before it holds, lands or has its motors cut."""
 
     speed: Annotated[Positive | None, Meta(description="[m/s], if lower than the kind's own")] = None
-    goal_step: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
+    max_goal_distance: Annotated[Positive, Meta(description="farthest goal from where the robot is [m]")] = 0.5
     margin: Annotated[NotNegative, Meta(description="how far inside the walls goals stay [m]")] = 0.05
-    own_silence_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
-    blind_s: Annotated[
+    position_timeout_s: Annotated[Positive, Meta(description="own position older than this is none: hold [s]")] = 0.5
+    land_without_position_s: Annotated[
         NotNegative, Meta(description="a flying robot that has no position of its own for this long lands [s]")
     ] = 0.3
-    link_silence_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
+    neighbour_timeout_s: Annotated[Positive, Meta(description="a neighbour gone for this long is left out [s]")] = 1.0
     lost_neighbour: Annotated[
         Literal["drop", "hold", "land"], Meta(description="what a robot does then: go on without it, hold, or land")
     ] = "drop"
@@ -38,7 +38,7 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             "than half of it, or touching, it lands [m]; left out: not watched"
         ),
     ] = None
-    cut_outside: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
+    cut_beyond_m: Annotated[Positive, Meta(description="a drone this far outside the arena has its motors cut [m]")] = (
         0.75
     )
     overspeed: Annotated[
@@ -57,7 +57,7 @@ class Safety(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         Positive,
         Meta(description="a landing drone that neither descends nor hovers for this long has its motors cut [s]"),
     ] = 20.0
-    loop_silence_s: Annotated[
+    loop_timeout_s: Annotated[
         Positive, Meta(description="a robot whose control loop hangs for this long is landed from outside of it [s]")
     ] = 0.5
 
@@ -67,7 +67,7 @@ class Limits(Safety, frozen=True):
 
     low: Vector  # smallest x, y, z of the arena [m]
     high: Vector  # largest x, y, z of the arena [m]
-    hold_s: float | None = None  # `blind_s` of this robot, where it differs [s]
+    hold_s: float | None = None  # `land_without_position_s` of this robot, where it differs [s]
 
     @property
     def top_speed(self) -> float:

@@ -195,7 +195,7 @@ class Centre:
             robot.pose_stamp = robot.stamp
         if held or not runs:
             computer.require_update()
-        again = runs and t - robot.sent_at >= 0.5 * assignment.limits.link_silence_s
+        again = runs and t - robot.sent_at >= 0.5 * assignment.limits.neighbour_timeout_s
         if not ((new or held or again) and is_finite(robot.goal)):
             return None
         robot.sent_at = t

@@ -51,7 +51,7 @@ class GoalComputer:
         self.law = cast(Gradient, assignment.law)
         self.stepping = None if isinstance(assignment.law, Gradient) else Stepping(assignment)
         self._anchors, self._predictor, self._changes = assignment.anchors, assignment.predictor, assignment.changes
-        self.neighbours = Neighbours(links, assignment.limits.link_silence_s)
+        self.neighbours = Neighbours(links, assignment.limits.neighbour_timeout_s)
         self.clamp, self.tracking_gain = assignment.clamp, assignment.tracking_gain
         self._flies, self.ground = assignment.kind.flies, assignment.ground
         linked, legs = any(link.in_law for link in links), assignment.legs

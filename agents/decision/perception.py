@@ -44,10 +44,10 @@ class Perception:
         "_height",
         "_horizon",
         "_in_time",
-        "_link_silence_s",
         "_links",
-        "_own_silence_s",
+        "_neighbour_timeout_s",
         "_points",
+        "_position_timeout_s",
         "_radius",
         "_scan",
         "avoidance",
@@ -66,7 +66,7 @@ class Perception:
     def __init__(self, assignment: Assignment) -> None:
         assert assignment.avoidance is not None
         kind, limits, self.avoidance = assignment.kind, assignment.limits, assignment.avoidance
-        self._own_silence_s, self._link_silence_s = limits.own_silence_s, limits.link_silence_s
+        self._position_timeout_s, self._neighbour_timeout_s = limits.position_timeout_s, limits.neighbour_timeout_s
         self._clearance = assignment.avoidance.clearance  # things farther above or below are ignored [m]
         self._radius, self._height = kind.radius, kind.height
         self.own, self.near = OwnState(), Nearby()
@@ -98,7 +98,7 @@ class Perception:
         )
         own.position, own.yaw = now.position, now.yaw
         before, near.count = near.count, 0
-        aware = isfinite(now.yaw) and t - state.time <= self._own_silence_s
+        aware = isfinite(now.yaw) and t - state.time <= self._position_timeout_s
         if aware:
             for sender in neighbours.all:
                 self._add_robot(t, now.position, sender)
@@ -130,7 +130,7 @@ class Perception:
         if not off_x * off_x + off_y * off_y <= REACH * REACH:
             return
         # a lost drone still hovers, has landed, or falls: it is in the way from the floor up
-        lost = t - sender.lost_since > self._link_silence_s or sender.stamp == -inf
+        lost = t - sender.lost_since > self._neighbour_timeout_s or sender.stamp == -inf
         believed = age <= BELIEVED_S
         low = z + DESCENT_S * vz if vz < -DESCENT and believed else z
         # its lower end under the own upper one, and the other way round; `up` is the own height above it

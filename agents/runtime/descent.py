@@ -58,7 +58,7 @@ class Descent:
         """Whether the process stood still since the last call; then it has waited until the ownership was certain.
 
         Until then it must not command its bodies, since another process may drive them. Without an answer those on
-        wheels halt after `link_silence_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
+        wheels halt after `neighbour_timeout_s`, and after `offline_s`, or `ANSWER_S` if it is told to end, all land:
         the process drives its bodies again then, until it learns that they belong to another one.
         """
         if not self._keeper.stood_still() or self.watchdog.tripped:  # the watchdog handles a loop that hangs
@@ -71,7 +71,7 @@ class Descent:
             if waited > limits.offline_s or (waited > ANSWER_S and self.reason_to_end() is not None):
                 self._recover(f"it stood still, and for {waited:.0f} s no router tells who owns its name")
                 break
-            if drives and waited > limits.link_silence_s:
+            if drives and waited > limits.neighbour_timeout_s:
                 self._body.land(drives)
                 drives = ()
             self.watchdog.beat()

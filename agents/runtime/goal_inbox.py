@@ -93,7 +93,7 @@ class GoalInbox:
         self._life = life
 
     def _check(self, row: int, now: float, goal: messages.Goal) -> None:
-        oldest_s = self._robots[row].assignment.limits.link_silence_s
+        oldest_s = self._robots[row].assignment.limits.neighbour_timeout_s
         validation.check_goal(goal, now=now, reach=self._reach, oldest_s=oldest_s)
         if goal.seq <= self._seq[row]:
             raise messages.Malformed(f"goal {goal.seq} after {self._seq[row]}")

@@ -77,7 +77,7 @@ class Setup:
     once: bool = False  # the process ends when its robots are down after an experiment
     rights: Rights | None = None  # enforced by the robots themselves in the mesh of a lab
     # [s] without a tick after which the watchdog lands the robots
-    loop_silence_s: float = SILENCE_S
+    loop_timeout_s: float = SILENCE_S
     wake: bool = False  # a pose of a neighbour wakes the loop
     lifeline_s: float = LIFELINE_S  # silence of the lifeline that counts as its loss [s]
 
@@ -112,7 +112,7 @@ class Runtime:
         self._everyone = tuple(range(len(self._names)))
         self._descent = Descent(
             self.robots, body, self._keeper, self._ticks,
-            silence_s=setup.loop_silence_s, alarm=self._call_for_help, recover=self._recover,
+            silence_s=setup.loop_timeout_s, alarm=self._call_for_help, recover=self._recover,
         )  # fmt: skip
         self._watchdog = self._descent.watchdog
 
@@ -172,7 +172,7 @@ class Runtime:
         self._conductor = pubsub.AliveWatch(session, keys.conductor)
         located = [row for row, there in enumerate(self._setup.located) if there]
         exact = [row for row, there in enumerate(self._setup.exact) if there]
-        silence_s = self._limits.own_silence_s
+        silence_s = self._limits.position_timeout_s
         self._located = (
             MeasuredPositions(session, keys, names, located, self._reach, exact=exact, silence_s=silence_s)
             if located
@@ -346,7 +346,7 @@ class Runtime:
             counts.missed += missed
             counts.late_s = max(counts.late_s, ticks.late_s)
             self._skip_ticks(missed)
-            if missed * self._dt > self._setup.loop_silence_s:
+            if missed * self._dt > self._setup.loop_timeout_s:
                 self._hold_after_suspend(missed * self._dt)
             t = ticks.t
             ticks.zero -= self._setup.clock.slew(self._dt)

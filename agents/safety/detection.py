@@ -181,8 +181,8 @@ class Detector:
         self.slow_squared = min(self.fastest_squared, SINKS * SINKS)
         half = sin(0.5 * limits.tilt)
         self.lean = half * half
-        self.battery_low, self.silence_s = limits.battery_low, limits.own_silence_s
-        self.behind_s = BEHIND * limits.own_silence_s
+        self.battery_low, self.silence_s = limits.battery_low, limits.position_timeout_s
+        self.behind_s = BEHIND * limits.position_timeout_s
         self.separation = 0.0 if limits.separation is None else limits.separation
         self.avoids = assignment.avoidance is not None and assignment.avoids
         self.obedience, self.ascent = Obedience(kind), Ascent(kind, assignment.hover)
@@ -395,7 +395,7 @@ class Detector:
             Cause.POSITION: lambda: lost_position(now),
             Cause.MARGIN: lambda: outside(0.0),
             Cause.OUTSIDE: lambda: outside(OUTSIDE_M),
-            Cause.FAR_OUTSIDE: lambda: outside(limits.cut_outside),
+            Cause.FAR_OUTSIDE: lambda: outside(limits.cut_beyond_m),
             Cause.SEPARATION: nearest,
             Cause.TOUCHING: nearest,
             Cause.OVERSPEED: lambda: f"{norm(now.velocity):.2f} m/s (limit {self.fastest:.2f} m/s)",

@@ -116,11 +116,13 @@ _LOST: Final[Mapping[str, Outcome]] = {
 def rules(limits: Limits) -> list[Rule]:
     """Rules of all causes, with the numbers and the choices of an experiment."""
     chosen = {
-        Cause.POSITION: {"then_s": limits.blind_s if limits.hold_s is None else limits.hold_s},
+        Cause.POSITION: {"then_s": limits.land_without_position_s if limits.hold_s is None else limits.hold_s},
         # robots of a world, which wait longer without a position, do not move while it is paused
-        Cause.STILL: {"then_s": 0.0 if limits.hold_s is None or limits.hold_s == limits.blind_s else NEVER},
+        Cause.STILL: {
+            "then_s": 0.0 if limits.hold_s is None or limits.hold_s == limits.land_without_position_s else NEVER
+        },
         Cause.NEIGHBOUR: {"first": _LOST[limits.lost_neighbour]},
-        Cause.ROUTER: {"after_s": limits.link_silence_s, "then_s": limits.offline_s},
+        Cause.ROUTER: {"after_s": limits.neighbour_timeout_s, "then_s": limits.offline_s},
         Cause.CONDUCTOR: {"first": _LOST[limits.lost_conductor]},
         Cause.UNSTARTED: {"after_s": limits.offline_s},
         Cause.LANDING: {"after_s": limits.landing_s},

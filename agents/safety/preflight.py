@@ -84,7 +84,7 @@ class Preflight:
             yield f"it is {now.excess:.2f} m outside the arena"
 
     def _nowhere(self, now: Situation) -> str:
-        state, silence_s = now.state, self._limits.own_silence_s
+        state, silence_s = now.state, self._limits.position_timeout_s
         if isnan(now.yaw) and is_finite(now.position) and now.t - state.time <= silence_s:
             return "it does not know which way it looks"
         text = "no position of its own"

@@ -26,7 +26,7 @@ class SetpointFilter:
     """Filter for the setpoints of a robot."""
 
     __slots__ = (
-        "_closes_s", "_cut_outside", "_drives", "_far", "_flies_to", "_high", "_low", "_own_silence_s", "_speed",
+        "_closes_s", "_cut_beyond_m", "_drives", "_far", "_flies_to", "_high", "_low", "_position_timeout_s", "_speed",
         "_step", "_turn_radius", "_turn_rate", "_walls_high", "_walls_low", "avoided", "changed", "not_finite",
     )  # fmt: skip
 
@@ -39,8 +39,8 @@ class SetpointFilter:
     _high: Vector  # likewise
     _walls_low: Vector  # of the arena [m]
     _walls_high: Vector  # likewise
-    _cut_outside: float  # [m] of the limits
-    _own_silence_s: float  # [s] of the limits
+    _cut_beyond_m: float  # [m] of the limits
+    _position_timeout_s: float  # [s] of the limits
     _speed: float  # [m/s]
     _turn_rate: float  # [rad/s]
     _turn_radius: float  # smallest [m]; 0: it turns on the spot
@@ -53,14 +53,14 @@ class SetpointFilter:
         self._speed, self._turn_rate = min(kind.speed, limits.top_speed), kind.turn_rate
         self._turn_radius = kind.turn_radius
         self._closes_s = 1.0 / kind.response
-        self._far = self._speed * (self._closes_s + limits.own_silence_s)
-        self._step = min(limits.goal_step, self._speed * self._closes_s)
+        self._far = self._speed * (self._closes_s + limits.position_timeout_s)
+        self._step = min(limits.max_goal_distance, self._speed * self._closes_s)
         low, high, margin = limits.low, limits.high, limits.margin
         # a goal on the floor would be flown into it; heights do not limit ground robots
         bottom, top = (low[2] + max(kind.height, FLOOR_M), high[2] - margin) if kind.flies else (-inf, inf)
         self._low, self._high = (low[0] + margin, low[1] + margin, bottom), (high[0] - margin, high[1] - margin, top)
         self._walls_low, self._walls_high = low, high
-        self._cut_outside, self._own_silence_s = limits.cut_outside, limits.own_silence_s
+        self._cut_beyond_m, self._position_timeout_s = limits.cut_beyond_m, limits.position_timeout_s
         self.changed = self.avoided = self.not_finite = False
 
     def judge(self, now: Situation) -> None:
@@ -71,7 +71,7 @@ class SetpointFilter:
         x, y, z = now.position
         (low_x, low_y, low_z), (high_x, high_y, high_z) = self._walls_low, self._walls_high
         inside = low_x <= x <= high_x and low_y <= y <= high_y and low_z <= z <= high_z
-        known = -ABSURD < now.yaw < ABSURD and abs(now.t - now.state.time) <= self._own_silence_s
+        known = -ABSURD < now.yaw < ABSURD and abs(now.t - now.state.time) <= self._position_timeout_s
         if inside and known:
             if not now.sound:
                 now.sound, now.excess = True, 0.0
@@ -84,7 +84,7 @@ class SetpointFilter:
             beside = max(low_x - x, x - high_x, low_y - y, y - high_y)
             now.excess = max(beside, low_z - z, z - high_z, 0.0)
             now.outside_wall = beside > 0.0 or z > high_z
-            now.outside, now.flyaway = now.excess > OUTSIDE_M, now.excess > self._cut_outside
+            now.outside, now.flyaway = now.excess > OUTSIDE_M, now.excess > self._cut_beyond_m
 
     def limit(self, setpoint: Setpoint, now: Situation) -> Setpoint:
         """Safe setpoint in place of a decided one, of a robot without avoidance; `now` was judged.

@@ -25,9 +25,9 @@ def safety(analysis: Analysis) -> Iterator[Finding]:
     if chosen.battery_min < chosen.battery_low:
         message = f"robots take off at {chosen.battery_min:.0%} of charge, and land below {chosen.battery_low:.0%}"
         yield Finding("warning", "battery", message, "raise battery_min above battery_low", ("safety", "battery_min"))
-    if chosen.cut_outside <= OUTSIDE_M:
-        message = f"motors are cut {chosen.cut_outside:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
-        yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_outside"))
+    if chosen.cut_beyond_m <= OUTSIDE_M:
+        message = f"motors are cut {chosen.cut_beyond_m:g} m outside the arena, but drones land {OUTSIDE_M:g} m outside"
+        yield Finding("warning", "cut-outside", message, f"raise it above {OUTSIDE_M:g}", ("safety", "cut_beyond_m"))
     if chosen.separation is not None:
         yield from _separation(analysis, chosen.separation)
 
@@ -119,15 +119,17 @@ def architecture(analysis: Analysis) -> Iterator[Finding]:
     all_guided, rate = len(guided) == len(experiment.robots), experiment.rates.coordination_hz
     subject = f"all {len(guided)} robots" if all_guided else join_names(guided)
     rest = "" if all_guided else "; the others decide for themselves, and receive their poses as before"
-    hold = f"if it is gone, or its goals are older than {experiment.safety.link_silence_s:g} s, they hold"
+    hold = f"if it is gone, or its goals are older than {experiment.safety.neighbour_timeout_s:g} s, they hold"
     what = "centralised" if all_guided else "hybrid"
     yield Finding(
         "note", what, f"{what}: a centre decides for {subject} {rate:g} times a second{rest}; {hold}", "", path
     )
-    if experiment.safety.link_silence_s <= 1.0 / rate:
-        message = f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.link_silence_s:g} s"
-        remedy = "give safety.link_silence_s more than twice that, or decide more often"
-        yield Finding("error", "goals-too-old", message, remedy, ("safety", "link_silence_s"))
+    if experiment.safety.neighbour_timeout_s <= 1.0 / rate:
+        message = (
+            f"goals come every {1.0 / rate:g} s, and are too old after {experiment.safety.neighbour_timeout_s:g} s"
+        )
+        remedy = "give safety.neighbour_timeout_s more than twice that, or decide more often"
+        yield Finding("error", "goals-too-old", message, remedy, ("safety", "neighbour_timeout_s"))
     if analysis.plan.trigger.JUDGES_ERRORS:
         kind = analysis.plan.trigger_name
         message = f"the trigger '{kind}' judges by the formation error, which is 0 where the centre guides"

@@ -361,7 +361,7 @@ class World(Part, frozen=True):
     sensor_noise: Annotated[
         NotNegative, Meta(description="of range sensors, as a multiple of the noise of real ones")
     ] = 1.0
-    wheels_stop_s: Annotated[
+    wheel_watchdog_s: Annotated[
         Positive | None,
         Meta(
             description="robots on wheels stop after so long without a command, as if each had a watchdog [s]; left "

@@ -379,7 +379,11 @@ class Plan:
     def _patience(self, name: str) -> float:
         """Time for which a robot holds without a position [s]; without its world it cannot move, and may wait."""
         experiment = self.experiment
-        return experiment.world.patience_s if experiment.robots[name].body == WORLD else experiment.safety.blind_s
+        return (
+            experiment.world.patience_s
+            if experiment.robots[name].body == WORLD
+            else experiment.safety.land_without_position_s
+        )
 
     def assignment(self, name: str, *, centrally: bool = False) -> Assignment:
         """The part of a robot.

@@ -268,7 +268,7 @@ def test_check_says_what_it_means(tmp_path):
     assert "decides for all 2 robots 10 times a second" in found["centralised"].message
     assert "decides for A 10 times" in found["hybrid"].message
     assert found["error-unknown"].where.endswith(":13:11")
-    late = check.check(document.read(file, ["safety.link_silence_s=0.1"]))
+    late = check.check(document.read(file, ["safety.neighbour_timeout_s=0.1"]))
     assert [each.code for each in late if each.severity == "error"] == ["goals-too-old"]
     assert not {"centralised", "hybrid"} & {each.code for each in check.check(document.read("robotic-park"))}
 

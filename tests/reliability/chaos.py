@@ -25,7 +25,7 @@ BARREN: Final = 3  # rounds without any fault, and it gives up
 
 
 # pymunk measures contacts; a busy machine is no fault; rounds are long, for starts take time
-ALWAYS: Final = ('world.engine="pymunk"', "world.wheels_stop_s=0.5", "start.deadline_s=60", "duration_s=90")
+ALWAYS: Final = ('world.engine="pymunk"', "world.wheel_watchdog_s=0.5", "start.deadline_s=60", "duration_s=90")
 # without one, robots cannot keep clear of a dead one that stands in their way, nor of one that lands below them
 AVOIDANCE: Final = 'avoidance={ kind = "barrier", hears = "all", clearance = 1.0 }'
 BODY_HZ: Final = 50.0  # relays, world and robots share one machine: at 100 Hz two cores are full, and ticks are missed

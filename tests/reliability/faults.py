@@ -23,7 +23,7 @@ from twins.arrays import Array
 HELD_M: Final = 0.25  # largest distance of a robot that no process steers
 NOTICE_S: Final = 1.0  # after which it must have stopped
 DEAF_S: Final = 1.0  # after the return of a robot its receivers have a pose of it
-NOTICED_S: Final = 1.0  # a robot without a router holds `link_silence_s` and so much later
+NOTICED_S: Final = 1.0  # a robot without a router holds `neighbour_timeout_s` and so much later
 STATUS_S: Final = 1.5  # a status is this old at most
 REFUSED: Final = 2  # exit code of a process whose name is taken
 GAP_S: Final = (0.5, 2.0)  # from when a fault has healed to the next
@@ -145,7 +145,7 @@ class ActiveFault:
 
     def all_held(self) -> str:
         """Reason why not all robots have held for a silent router; a violation for each that was late."""
-        limit = self.run.experiment.safety.link_silence_s + NOTICED_S
+        limit = self.run.experiment.safety.neighbour_timeout_s + NOTICED_S
         free = []
         for name in sorted(self.live - self.run.shifted):
             since = [each.stamp - self.utc for each in self.incidents(name, "router")]

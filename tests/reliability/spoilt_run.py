@@ -130,7 +130,7 @@ class SpoiltRun:
         if stage == "motion capture":
             changes += [f'robots.{name}.position="external"' for name in self.measured]
             # robots land as they do without a world, in which they would wait for it
-            changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.blind_s}"]
+            changes += ['positioning="vicon-twin"', f"world.patience_s={experiment.safety.land_without_position_s}"]
         near = {
             role: {end: free_endpoint(preferred_port=0) for end in self.routers} for role in self._process_of.values()
         }

@@ -60,7 +60,7 @@ def test_a_victim_is_back_or_down(it):
 
 
 def test_all_hold_for_a_silent_router_in_time(it):
-    limit = it.run.experiment.safety.link_silence_s
+    limit = it.run.experiment.safety.neighbour_timeout_s
     it.observer.status["KH01"] = status(incidents=[Incident(1, it.utc + limit, "hold: no connection to a router")])
     assert it.all_held() == "KH02: never held while the router was frozen"
     assert it.violations == []

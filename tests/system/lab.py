@@ -274,5 +274,5 @@ def assert_held_in_time(flight: Flight, case: str, stopped: float) -> None:
         status = typed(flight.folder / f"{case}.mcap", f"/{name}/status")[-1]
         hold, over = [each for each in status.incidents if "no connection to a router" in each.text]
         assert hold.text.startswith("hold: ")
-        assert stopped < hold.stamp < stopped + trace.plan.experiment.safety.link_silence_s + 1.0
+        assert stopped < hold.stamp < stopped + trace.plan.experiment.safety.neighbour_timeout_s + 1.0
         assert over.text.startswith("over: ")

@@ -69,7 +69,7 @@ DRONES = """
 title = "A Crazyflie by radio and a Tello, under motion capture"
 duration_s = 30.0
 start = { deadline_s = 40.0 }
-safety = { own_silence_s = 4.0, blind_s = 4.0 }  # a busy machine holds up the radio, which is a process here
+safety = { position_timeout_s = 4.0, land_without_position_s = 4.0 }  # a busy machine holds up the radio
 [robots]
 CF01 = { kind = "crazyflie", start = [0.0, -0.6, 0.0], hover = 0.5 }
 T01 = { kind = "tello", start = [0.0, 0.6, 0.0], hover = 0.8 }

@@ -131,7 +131,7 @@ def test_intruder_gets_nothing_at_the_other_router_either(laboratory: tuple[Labo
 
 @pytest.mark.mechanism("router frozen")
 def test_robots_hold_while_a_long_lease_router_freezes(patient_router: RouterProcess, tmp_path: Path) -> None:
-    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "safety.link_silence_s=0.6")
+    changes = ("--set", f'network.connect=["{patient_router.endpoint}"]', "--set", "safety.neighbour_timeout_s=0.6")
     flight = Flight(tmp_path / "run", "triangle", "--case", "periodic", "--no-report", *NEAR_TRIANGLE, *changes)
     flight.until_said("phase conductor: formation")
     with patient_router.frozen() as stopped:

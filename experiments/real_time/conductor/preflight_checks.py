@@ -40,7 +40,7 @@ STICK_OFF: Final = 0.1  # largest error of the setting `stick_speed`, as a share
 STEADY_M: Final = 0.02  # largest spread of the position of a robot at rest without a warning,
 UNSTEADY_M: Final = 0.05  # and with which it must not fly
 TURNED: Final = math.radians(20.0)  # yaw farther than this from that of `start`: bad
-STALE: Final = 0.5  # share of `own_silence_s`: positions older than this at times are bad
+STALE: Final = 0.5  # share of `position_timeout_s`: positions older than this at times are bad
 OLD_MONTHS: Final = 24  # firmware older than this: a warning
 STOP_S: Final = 1.0  # a stop that takes longer is bad
 STOP_WAY_M: Final = 0.05  # a robot on wheels rolls no farther after a stop
@@ -187,7 +187,7 @@ def _position(each: Observed, safety: Safety) -> Check:
     ages = [seen.age_s for seen in each.inspections if seen.age_s is not None]
     oldest = max(ages, default=0.0)
     found = f"spread {1e3 * spread:.1f} mm, at most {1e3 * oldest:.0f} ms old"
-    if oldest > STALE * safety.own_silence_s:
+    if oldest > STALE * safety.position_timeout_s:
         return _bad("position", found, f"gaps in {source}: markers or stations hidden, network or radio overloaded")
     if spread > STEADY_M:
         remedy = f"{source} is unsteady for a robot at rest: calibrate it, remove reflections, look for lost markers"
@@ -249,7 +249,7 @@ def _clock(name: str, each: Observed, safety: Safety) -> Check:
     if not AHEAD_S < each.behind_s < BEHIND_S:
         return _bad("clock", f"its computer's is {-each.behind_s:+.2f} s off", "set it (chrony or NTP), or use [hosts]")
     ahead = math.nan if each.last.ahead_s is None else each.last.ahead_s
-    if clock_off(ahead, safety.own_silence_s):
+    if clock_off(ahead, safety.position_timeout_s):
         return _bad("clock", clock_text(name, ahead), "set the clock of the computer that measures positions")
     return Check(check="clock", verdict="ok", found=f"{1e3 * each.behind_s:.1f} ms from stamp to arrival")
 

@@ -227,12 +227,12 @@ class NetworkView:
         return missed
 
     def _watch_router(self, now: float) -> None:
-        """Report once that the router is silent for longer than `link_silence_s`, and once that it is back."""
+        """Report once that the router is silent for longer than `neighbour_timeout_s`, and once that it is back."""
         since, progress = self._router.silent_since(now), self._progress
         if since < inf:
             self._cut_off = now
             safety = self._safety
-            if progress.silent_since == inf and not self._mesh and now - since > safety.link_silence_s:
+            if progress.silent_since == inf and not self._mesh and now - since > safety.neighbour_timeout_s:
                 progress.silent_since = since
                 what = f"robots hold, and land after {safety.offline_s:g} s"
                 self.report("router", "conductor", f"no router answers for {now - since:.1f} s: {what}")

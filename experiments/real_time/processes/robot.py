@@ -116,7 +116,7 @@ def _run(plan: Plan, launch: RobotLaunch, endpoints: Sequence[str]) -> int:
         clock=clock,
         once=launch.once,
         rights=mesh.member_rights(plan, endpoints),
-        loop_silence_s=experiment.safety.loop_silence_s,
+        loop_timeout_s=experiment.safety.loop_timeout_s,
         wake=plan.wakes,
     )
     return Runtime(assignments, body, setup).run()

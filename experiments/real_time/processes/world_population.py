@@ -53,7 +53,7 @@ class Population:
         robots = list(experiment.robots.values())
         self._kinds = plan.kinds
         self.flies = tuple(kind.flies for kind in self._kinds)
-        wheels = [robot.device.get("watchdog_s") or experiment.world.wheels_stop_s or math.inf for robot in robots]
+        wheels = [robot.device.get("watchdog_s") or experiment.world.wheel_watchdog_s or math.inf for robot in robots]
         self.hold_s = tuple(HOLD_S if flies else wait for flies, wait in zip(self.flies, wheels, strict=True))
         self.carried = tuple(robot.body == WORLD for robot in robots)
         self.seen = tuple(robot.ranges == "world" or robot.body == WORLD for robot in robots)

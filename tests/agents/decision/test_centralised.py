@@ -94,7 +94,7 @@ def test_goals_that_stay_are_repeated(park):
     desk.hear(ALL, 0.0)
     goals = [desk.decide(0.1 * tick) for tick in range(13)]
     followers = [len(each.keys() - {0}) for each in goals]
-    assert followers == [6, 0, 0, 0, 0, 6, 0, 0, 0, 0, 6, 0, 0]  # every half of link_silence_s
+    assert followers == [6, 0, 0, 0, 0, 6, 0, 0, 0, 0, 6, 0, 0]  # every half of neighbour_timeout_s
     assert {goals[10][row].pose_stamp for row in ALL[1:]} == {0.0}  # they rest on what was known at the computation
 
 

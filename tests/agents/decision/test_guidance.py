@@ -159,7 +159,7 @@ def test_safety_limits_received_goals():
     guide(bench, (3.0, 0.1, 0.8))
     bench.step()
     assert bench.robot.changed
-    assert bench.robot.setpoint[0] == pytest.approx(0.9, abs=1e-3)  # goal_step from where it is
+    assert bench.robot.setpoint[0] == pytest.approx(0.9, abs=1e-3)  # max_goal_distance from where it is
 
 
 def test_guided_robot_receives_for_avoidance_alone():

@@ -81,7 +81,7 @@ def run(body: Airborne, silence_s: float = 5.0) -> Net:
     experiment = pair(robots={"F": Robot(kind="crazyflie", start=[0.1, 0.2], hover=0.5)}, formation=Formation())
     with Net().worn() as net:
         body.net = net
-        setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_silence_s=silence_s)
+        setup = Setup(Keys("park"), [], "json", 50.0, lifeline=False, located=[False], loop_timeout_s=silence_s)
         Runtime([Plan(experiment).assignment("F")], body, setup).run()
     return net
 

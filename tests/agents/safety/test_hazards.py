@@ -109,9 +109,9 @@ def test_choices_of_an_experiment():
     for lost, outcome in (("drop", "WARN"), ("hold", "HOLD"), ("land", "LAND")):
         assert Bench(lost_neighbour=lost).see(0.1, Cause.NEIGHBOUR).changes == [(0, outcome)]
     assert Bench(lost_conductor="land").see(3.0, Cause.CONDUCTOR).changes == [(200, "LAND")]
-    assert Bench(offline_s=3.0, link_silence_s=0.5).see(4.0, Cause.ROUTER).changes == [(50, "HOLD"), (300, "LAND")]
+    assert Bench(offline_s=3.0, neighbour_timeout_s=0.5).see(4.0, Cause.ROUTER).changes == [(50, "HOLD"), (300, "LAND")]
     assert Bench(landing_s=5.0).see(6.0, Cause.LANDING).changes == [(500, "CUT")]
-    assert Bench(blind_s=1.0).see(3.0, Cause.POSITION).changes == [(0, "HOLD"), (100, "LAND")]
+    assert Bench(land_without_position_s=1.0).see(3.0, Cause.POSITION).changes == [(0, "HOLD"), (100, "LAND")]
     assert Bench(hold_s=2.0).see(3.0, Cause.POSITION).changes == [(0, "HOLD"), (200, "LAND")]
 
 

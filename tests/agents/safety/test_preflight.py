@@ -37,7 +37,7 @@ class Standing:
             )
         )  # fmt: skip
         self.filter, self.now, self.health = SetpointFilter(kind, limits), Situation(), ProcessHealth()
-        self.neighbours = Neighbours([Incoming(1, "G", kind, 0.25)], limits.link_silence_s)
+        self.neighbours = Neighbours([Incoming(1, "G", kind, 0.25)], limits.neighbour_timeout_s)
         self.neighbours.mark_alive(0)
         self.values = {"battery": 0.8}
         self.t = 1.0

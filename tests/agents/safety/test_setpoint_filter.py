@@ -18,7 +18,7 @@ from agents.safety.setpoint_filter import FLOOR_M, OUTSIDE_M, SetpointFilter
 
 FEW = settings(max_examples=100)
 EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
-LIMITS = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05, speed=0.5, goal_step=0.4)
+LIMITS = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05, speed=0.5, max_goal_distance=0.4)
 ROOMY = Limits(low=(-1.0, -1.0, 0.0), high=(1.0, 1.0, 2.5), margin=0.05)
 anything = st.one_of(
     st.floats(-3.0, 3.0), st.floats(), st.sampled_from([nan, inf, -inf, 1e308, -1e308, 1e6, 0.0, -0.0])
@@ -69,7 +69,7 @@ def test_lawful_setpoint_for_whatever_comes(kind, setpoint, position, yaw, age):
     made, now = judged(kind, position, yaw=yaw, age=age)
     safe = made.limit(setpoint, now)
     believable = all(abs(each) < 1e6 for each in (*position, yaw))
-    assert now.invalid == (not (believable and abs(age) <= LIMITS.own_silence_s))
+    assert now.invalid == (not (believable and abs(age) <= LIMITS.position_timeout_s))
     if now.invalid:
         assert all(map(isnan, safe)) if kind.takes == "position" else safe == (0.0, 0.0, 0.0, 0.0)
         return
@@ -83,7 +83,9 @@ def test_lawful_setpoint_for_whatever_comes(kind, setpoint, position, yaw, age):
         assert abs(safe[3]) <= kind.turn_rate
     else:
         far = max(map(abs, position))
-        assert dist(safe[:3], position) <= min(LIMITS.goal_step, speed / kind.response) * (1 + 1e-9) + 1e-9 * far
+        assert (
+            dist(safe[:3], position) <= min(LIMITS.max_goal_distance, speed / kind.response) * (1 + 1e-9) + 1e-9 * far
+        )
         for goal, here, low, high in zip(safe[:3], position, *bounds(kind), strict=True):
             if low <= here <= high:
                 assert low - 1e-12 <= goal <= high + 1e-12
@@ -136,7 +138,7 @@ def test_goals_are_pulled_into_the_arena():
     far, made = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     assert far == pytest.approx((0.25, 0.0, 1.0, 0.0))
     assert made.changed
-    short = Limits(low=LIMITS.low, high=LIMITS.high, goal_step=0.1)
+    short = Limits(low=LIMITS.low, high=LIMITS.high, max_goal_distance=0.1)
     near, _ = limited(CRAZYFLIE, (0.9, 0.0, 1.0, 0.0), (0.0, 0.0, 1.0), limits=short)
     assert near == pytest.approx((0.1, 0.0, 1.0, 0.0))
 

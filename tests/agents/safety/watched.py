@@ -27,7 +27,7 @@ class Watched:
         )
         self.avoids = avoids
         self.detector, self.hazards = Detector(assignment), Hazards(kind, limits)
-        self.neighbours, self.health = Neighbours(incoming, limits.link_silence_s), ProcessHealth()
+        self.neighbours, self.health = Neighbours(incoming, limits.neighbour_timeout_s), ProcessHealth()
         self.now, self.status = Situation(), Status()
         self.status.cruising, self.status.goal_height = True, hover
         self.position, self.velocity, self.yaw = (0.0, 0.0, hover), (0.0, 0.0, 0.0), 0.0

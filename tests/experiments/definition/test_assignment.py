@@ -105,11 +105,11 @@ def test_starts_are_on_the_floor_with_a_yaw():
 
 
 def test_limits_are_arena_and_safety_of_the_file():
-    given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, goal_step=0.2, margin=0.1))
+    given = experiment(arena=Arena(size=(2.0, 3.0, 4.0)), safety=Safety(speed=0.3, max_goal_distance=0.2, margin=0.1))
     made = Plan(given).limits("A")
     assert (made.low, made.high) == ((-1.0, -1.5, 0.0), (1.0, 1.5, 4.0))
-    assert (made.speed, made.goal_step, made.margin) == (0.3, 0.2, 0.1)
-    assert (made.own_silence_s, made.link_silence_s) == (0.5, 1.0)
+    assert (made.speed, made.max_goal_distance, made.margin) == (0.3, 0.2, 0.1)
+    assert (made.position_timeout_s, made.neighbour_timeout_s) == (0.5, 1.0)
     assert Plan(experiment()).limits("A").top_speed == np.inf
 
 

@@ -82,7 +82,7 @@ def test_drone_that_lands_is_lost_to_the_formation(architecture):
 
 FINDINGS = {
     "battery": ({"battery_low": 0.5}, "battery"),
-    "cut": ({"cut_outside": 0.2}, "cut-outside"),
+    "cut": ({"cut_beyond_m": 0.2}, "cut-outside"),
     "start": ({"separation": 0.9}, "separation-start"),
     "link": ({"separation": 0.6}, "separation-link"),
 }

@@ -163,7 +163,7 @@ def test_wheels_stop_with_a_watchdog_alone(world: Population) -> None:
     assert world.hold_s[flying] == 0.5
     assert world.hold_s[row(world, "KH01")] == np.inf
     watched = experiment()
-    watched = msgspec.structs.replace(watched, world=msgspec.structs.replace(watched.world, wheels_stop_s=0.7))
+    watched = msgspec.structs.replace(watched, world=msgspec.structs.replace(watched.world, wheel_watchdog_s=0.7))
     assert Population(Plan(watched)).hold_s[row(world, "KH01")] == 0.7
     go(world, 10, KH01=(0.2, 0.0, 0.0, 0.0))
     go(world, 300)
