@@ -423,7 +423,8 @@ class Robot:
             life.set_missing(failing)
             return life.phase == READY and not lost
         if life.phase == IDLE and not self.goals.is_sound(t, self.now.position):
-            life.set_missing("its law wants something that is not finite")
+            reads = self.goals.unknown_reads(t, self.now.position)
+            life.set_missing(f"its law wants something that is not finite{reads}")
             return False
         return True
 
@@ -435,7 +436,8 @@ class Robot:
             if cause is Cause.BELOW:
                 return self.landing.robot_below()
             if cause is Cause.SETPOINT and self._stepping is not None and not self._stepping.sound:
-                return f"the law {type(self.assignment.law).__name__} decides what is not finite"
+                reads = self.goals.unknown_reads(now.t, now.position)
+                return f"the law {type(self.assignment.law).__name__} decides what is not finite{reads}"
             return self._detector.words(cause, now, status, self.neighbours, self.health)
 
         serious = self.hazards.update(now.t, self.causes, words, active=life.active, landing=life.phase == LANDING)

@@ -1,6 +1,6 @@
 """Pages of the documentation site that are generated, the reference from the code's own texts; and its formulas.
 
-A hook of mkdocs (`mkdocs.yml`): the pages exist only in the site.
+A hook of mkdocs (`mkdocs.yml`): the pages exist only in the site. As a program it prints those that are named.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from html import unescape
 from importlib import import_module
@@ -260,3 +261,6 @@ PAGES: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "network": network,
     "api": api,
 }
+
+if __name__ == "__main__":
+    print("\n".join(line for name in sys.argv[1:] or PAGES for line in PAGES[name]()))

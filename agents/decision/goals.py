@@ -15,6 +15,7 @@ from agents.decision.neighbours import Neighbours
 from agents.decision.stepping import Stepping, is_sound
 from agents.formation.changes import change_target, exists, planned_at
 from agents.formation.link import Link
+from agents.plugins.calls import unknown_reads
 from agents.plugins.law import NeighbourView, View
 from agents.plugins.laws import Gradient, goal_position, tracking_offset
 from agents.plugins.planners import Itinerary, Leg, Waypoints
@@ -211,6 +212,20 @@ class GoalComputer:
         if self.stepping is None:
             return is_finite(self.law_offset(t, position))
         return is_sound(self.stepping.rehearse(self._view(t, position, ZERO, 0.0, t)))
+
+    def unknown_reads(self, t: float, position: Vector) -> str:
+        """Words on what the law reads although it is unknown, asked as in `is_sound`; empty without."""
+        stepping, law = self.stepping, self.law
+        if stepping is not None:
+            view = self._view(t, position, ZERO, 0.0, t)
+            return unknown_reads(law, lambda watched: stepping.rehearse(watched(view)))
+        senders = [each for each in self.neighbours.all if each.active]
+        return unknown_reads(
+            law,
+            lambda watched: [
+                law.pull(each.apart(position, self._predictor, t), watched(each.link)) for each in senders
+            ],
+        )
 
     def _view(self, t: float, position: Vector, velocity: Vector, yaw: float, start: float) -> View:
         stepping, predictor = cast(Stepping, self.stepping), self._predictor

@@ -129,9 +129,10 @@ class Analysis:
 
     @property
     def pull(self) -> Array:
-        """(N,) the speed at which each robot follows a goal that is a full clamp away [m/s]."""
+        """(N,) the speed at which each robot follows its law [m/s]: a velocity, or a goal that is a full clamp away."""
         hz = self.plan.experiment.rates.coordination_hz
-        return np.minimum(self.speed, closed_shares(self.kinds, hz) * self.plan.experiment.formation.clamp * hz)
+        clamped = np.minimum(self.speed, closed_shares(self.kinds, hz) * self.plan.experiment.formation.clamp * hz)
+        return np.where(self.prediction.velocities or False, self.speed, clamped)
 
     @property
     def legs(self) -> list[tuple[int, str, Planner]]:

@@ -45,6 +45,7 @@ class Prediction:
     messages_hz: float = (
         0.0  # transmissions of all robots with the noise of the experiment, which makes robots transmit
     )
+    velocities: tuple[bool, ...] = ()  # (N) robots whose law ordered a velocity at its last step; empty where stuck
     stuck: str = ""  # reason why the run does not begin; the robots stay at their starts then
     noisy: Prediction | None = None  # the flight beside it with the noise of the experiment and its seed, if there was
 
@@ -177,7 +178,7 @@ def fly(bare: Plan, seed: int, *, quiet: bool = False) -> Prediction:
         if each.outcome > Outcome.NONE and 0.0 <= each.time < experiment.duration_s
     )
     sent = sent_in_run(log.sent, experiment.duration_s)
-    return Prediction(log.time[run], log.true_position[run], tuple(begun), len(sent))
+    return Prediction(log.time[run], log.true_position[run], tuple(begun), len(sent), velocities=log.velocities)
 
 
 PASSES_ABOVE: Final = 1e3  # [m] more than the sum of two radii

@@ -12,10 +12,11 @@ import numpy as np
 from agents.decision.stepping import Stepping
 from agents.formation.link import BY_BEARING, BY_DISTANCE, BY_RELATIVE
 from agents.network import messages
+from agents.plugins.calls import unknown_reads
 from experiments.check.analysis import Analysis
 from experiments.check.findings import FORGIVEN, Finding, Severity, join_names
 from experiments.check.realisation import OFF, Conflict, Shape, conflicts, contradictions
-from experiments.definition.formation import law_offsets
+from experiments.definition.formation import law_offsets, unlinked
 from experiments.definition.graph import components, reachable
 from experiments.definition.links import gain_key
 from experiments.file.problems import Path
@@ -351,11 +352,17 @@ def stability(analysis: Analysis) -> Iterator[Finding]:
         return
     law, choice = analysis.law, analysis.plan.law_name
     if not math.isfinite(loop.gain):
-        place = shape.position
-        offset = law_offsets(law, place, place[analysis.asked.sender], analysis.asked)
+        place, links = shape.position, analysis.asked
+        offset = law_offsets(law, place, place[links.sender], links)
         bad = join_names([analysis.names[row] for row in np.flatnonzero(~np.isfinite(offset).all(axis=1))])
         what = f"for {bad} no number" if bad else "numbers that jump between neighbouring places"
         message = f"the law '{choice}' gives {what} where the formation is met"
+        apart = [tuple(each) for each in (place[links.receiver] - place[links.sender]).tolist()]
+        reads = unknown_reads(
+            law,
+            lambda watched: [law.pull(each, watched(link)) for each, link in zip(apart, unlinked(links), strict=True)],
+        )
+        message += reads
         remedy = "look for a length of 0 and for fields of `links` that are NaN (docs/plugins.md)"
         yield Finding("error", "not-finite", message, remedy, ("formation", "law"))
         return

@@ -114,7 +114,10 @@ def _kind(kind: Kind) -> Entry:
     text = (
         f"A kind of robot that {'flies' if kind.flies else 'drives on wheels'} and takes a {kind.takes} as setpoint: "
         f"radius {kind.radius:g} m, height {kind.height:g} m, {kind.mass:g} kg, at most {kind.speed:.3g} m/s and "
-        f"{kind.turn_rate:.3g} rad/s, {kind.endurance_s / 60.0:g} min with a full battery."
+        f"{kind.turn_rate:.3g} rad/s, {kind.endurance_s / 60.0:g} min with a full battery.\n\n"
+        f"Its position controller closes an error at response = {kind.response:.3g} 1/s, of yaw at turn_response = "
+        f"{kind.turn_response:.3g} 1/s; its velocity follows commands with lag = {kind.lag:.3g} s"
+        + (f"; smallest turning radius {kind.turn_radius:.3g} m." if kind.turn_radius else ".")
     )
     chosen = f"kind = {written(kind.name)}"
     example = f"[robots.R01]\n{chosen}\nstart = [0.0, 0.0]" + "\nhover = 0.5" * kind.flies

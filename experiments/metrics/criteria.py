@@ -9,8 +9,8 @@ import msgspec
 
 from agents.plugins.files import plain
 from experiments.definition.experiment import MEAN, WORST, Criterion
-from experiments.metrics.metric import known_metrics
-from experiments.metrics.results import CaseMetrics, RobotMetrics
+from experiments.metrics.metric import known_metrics, metrics_of_criteria
+from experiments.metrics.results import CaseMetrics, Judged, RobotMetrics
 from experiments.metrics.statistics import by_case, ratio
 
 
@@ -25,7 +25,12 @@ class Judgement(msgspec.Struct, frozen=True):
     @property
     def failed(self) -> list[int]:
         """Seeds that do not keep the limit, or whose value is unknown."""
-        return [seed for seed, value in self.values.items() if value is None or self.criterion.excess(value) > 0.0]
+        return [seed for seed in self.values if not self.keeps(seed)]
+
+    def keeps(self, seed: int) -> bool | None:
+        """Whether the value of a seed is known and keeps the limit; None if it was not judged."""
+        value = self.values.get(seed)
+        return (value is not None and self.criterion.excess(value) <= 0.0) if self.values else None
 
     @property
     def passed(self) -> bool | None:
@@ -36,8 +41,9 @@ class Judgement(msgspec.Struct, frozen=True):
     def what(self) -> str:
         """The number that is judged, in words."""
         asked = self.criterion
-        metric = known_metrics().get(asked.metric or "")
-        name = metric.head if metric else plain(asked.metric or "") or asked.measure
+        name = plain(asked.metric or "") or asked.measure
+        metric = (known_metrics() | metrics_of_criteria([asked])[0]).get(name or "")
+        name = metric.head if metric else name
         where = {MEAN: "", WORST: " of the worst robot"}.get(asked.of, f" of {asked.of}")
         return f"{name}{where} in {self.case or asked.case}"
 
@@ -61,6 +67,22 @@ def judge(cases: Sequence[CaseMetrics]) -> list[Judgement]:
         if not names:
             found.append(Judgement(asked, "", {}))
     return found
+
+
+def with_judgements(cases: Sequence[CaseMetrics]) -> list[CaseMetrics]:
+    """The same runs, each with the values that its criteria judge."""
+    found = judge(cases)
+    return [
+        msgspec.structs.replace(
+            case,
+            judged=tuple(
+                Judged(each.what, each.limit, each.values.get(case.seed), each.keeps(case.seed))
+                for each in found
+                if each.case == case.case
+            ),
+        )
+        for case in cases
+    ]
 
 
 def document(judged: Sequence[Judgement]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ Console, files, reports, sweeps and searches draw from `known_metrics`. A distri
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import cache
 from math import isfinite
@@ -133,9 +133,9 @@ TAKEN: Final = {  # columns of tables
 }  # fmt: skip
 
 
-def known_metrics() -> dict[str, Metric]:
-    """All metrics by name: ours, then those of other distributions."""
-    return {**OURS, **_installed()[0]}
+def known_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
+    """All metrics by name: ours, those of other distributions, and those in files that criteria of the cases name."""
+    return {**OURS, **foreign_metrics(cases)}
 
 
 def swept_metrics() -> dict[str, Metric]:
@@ -143,9 +143,9 @@ def swept_metrics() -> dict[str, Metric]:
     return {name: metric for name, metric in known_metrics().items() if metric.swept}
 
 
-def foreign_metrics() -> dict[str, Metric]:
-    """Metrics of other distributions."""
-    return _installed()[0]
+def foreign_metrics(cases: Iterable[CaseMetrics] = ()) -> dict[str, Metric]:
+    """Metrics of other distributions, and those in files that criteria of the cases name."""
+    return _installed()[0] | metrics_of_criteria([each for case in cases for each in case.criteria])[0]
 
 
 def console_metrics() -> dict[str, Metric]:
@@ -154,7 +154,7 @@ def console_metrics() -> dict[str, Metric]:
     return {name: OURS[name] for name in CONSOLE} | added
 
 
-def metrics_of_criteria(criteria: Sequence[Criterion]) -> tuple[dict[str, Metric], tuple[str, ...]]:
+def metrics_of_criteria(criteria: Iterable[Criterion]) -> tuple[dict[str, Metric], tuple[str, ...]]:
     """Metrics in files beside an experiment that its criteria name, by name, and why others cannot be used."""
     found, left_out = {}, []
     for name in dict.fromkeys(each.metric for each in criteria if each.metric):

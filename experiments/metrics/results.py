@@ -161,6 +161,15 @@ class Passage(msgspec.Struct, frozen=True):
     delay_max: float | None  # [s]
 
 
+class Judged(msgspec.Struct, frozen=True):
+    """Number of a run that a criterion of its experiment judges."""
+
+    what: str
+    limit: str
+    value: float | None  # over the reference where the limit is; None: unknown
+    passed: bool | None  # None: not judged, since the reference was not run
+
+
 class CaseMetrics(msgspec.Struct, frozen=True):
     """Metrics of a case of a run."""
 
@@ -223,3 +232,4 @@ class CaseMetrics(msgspec.Struct, frozen=True):
     measures: dict[str, LawMeasure] = {}  # of the law by name, means over the robots in the means
     metric_faults: tuple[str, ...] = ()  # metrics of other distributions that failed or cannot be used, a sentence each
     criteria: tuple[Criterion, ...] = ()  # of the experiment
+    judged: tuple[Judged, ...] = ()  # those that are for this case, as written with all cases of the run

@@ -25,7 +25,8 @@ def ratios(runs: Sequence[CaseMetrics], reference: Sequence[CaseMetrics], index:
     None for runs that were spoiled, for those that are shorter than others, and of metrics that add up for those of
     which less is known than of others; such a run of the reference is left out.
     """
-    every, metric = [*runs, *reference], known_metrics().get(index)
+    every = [*runs, *reference]
+    metric = known_metrics(every[:1]).get(index)
     sums = metric is not None and metric.sums
     longest, most = max(run.duration_s for run in every), max(coverage(run) for run in every)
 

@@ -156,7 +156,7 @@ def _bar_metrics(cases: Sequence[CaseMetrics]) -> list[tuple[str, str, str]]:
     judged = any(case.j2 is not None for case in cases)
     return [
         (name, f"${metric.label}$" if len(metric.label) == 1 else plain(metric.label), metric.unit.translate(FORMULA))
-        for name, metric in known_metrics().items()
+        for name, metric in known_metrics(cases).items()
         if metric.figure and (judged or name not in ERRORS)
     ]
 
@@ -167,7 +167,7 @@ def robot_bars(cases: Sequence[CaseMetrics], width: float = WIDTH) -> Figure:
     grouped = by_case(cases)
     names = list(dict.fromkeys(robot.robot for case in cases for robot in case.robots))
     out = {name for case in cases for name in (*case.leaders, *case.died)}
-    bars = [each for each in _bar_metrics(cases) if known_metrics()[each[0]].per == "robot"]
+    bars = [each for each in _bar_metrics(cases) if known_metrics(cases)[each[0]].per == "robot"]
     figure = Drawing(figsize=(width, min(1.075 * len(bars), TALLEST)), layout="constrained")
     panels = figure.subplots(len(bars), 1, sharex=True, squeeze=False)[:, 0]
     share = 0.8 / max(1, len(grouped))

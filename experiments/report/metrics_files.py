@@ -122,7 +122,8 @@ def _flat_shadow(shadow: ShadowMetrics | None) -> dict[str, object]:
 
 def write_json(path: Path, cases: Sequence[CaseMetrics]) -> None:
     """All metrics, one object per case."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(cases), indent=2) + b"\n")
+    text = msgspec.json.encode(criteria.with_judgements(cases))
+    path.write_bytes(msgspec.json.format(text, indent=2) + b"\n")
 
 
 def read_json(path: Path) -> list[CaseMetrics]:

@@ -143,7 +143,7 @@ def write(
         *_of_worlds(cases, drawings, len(pictures)),
         *_tables("Clocks of other machines", CLOCKS, [clocks_table(first)]),
         Section("Experiment file", listing=listing, folded=f"{len(listing.splitlines())} lines"),
-        _defined(),
+        _defined(cases),
     ]
     first_of_all, verdict = [*failures(cases), *spoiled(cases), *interruptions(cases)], findings(cases)
     if len(seeds) > 1 and not (experiment.start.scatter or experiment.start.scatter_yaw):
@@ -230,7 +230,7 @@ def compare(
         *_results(cases),
         Section("Figures", pictures=numbered(zip(drawn, captions, strict=True))),
         *_details(cases),
-        _defined(),
+        _defined(cases),
     ]
     target.parent.mkdir(parents=True, exist_ok=True)
     return render(
@@ -261,8 +261,8 @@ def _tables(title: str, prose: str, tables: Iterable[Table | None], *, folded: b
     return [Section(title, (prose,), shown, folded=rows if folded else "")] if shown else []
 
 
-def _defined() -> Section:
-    terms = definitions()
+def _defined(cases: Sequence[CaseMetrics]) -> Section:
+    terms = definitions(cases)
     return Section("Definitions", terms=terms, folded=f"{len(terms)} terms")
 
 

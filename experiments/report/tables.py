@@ -64,9 +64,9 @@ RUN: Final = (
 )  # fmt: skip
 
 
-def definitions() -> tuple[tuple[str, str], ...]:
+def definitions(cases: Sequence[CaseMetrics] = ()) -> tuple[tuple[str, str], ...]:
     """Terms of a report and what they mean, all metrics among them."""
-    return (*FORMATION, *((metric.label, metric.meaning) for metric in known_metrics().values()), *RUN)
+    return (*FORMATION, *((metric.label, metric.meaning) for metric in known_metrics(cases).values()), *RUN)
 
 
 EXTREMES: Final = "Of worst, largest, longest and closest values too the mean over seeds."
@@ -92,9 +92,10 @@ def _over_seeds(values: Sequence[float | None], scale: float = 1.0) -> str:
     return interval(found, scale) + (f" ({found.n} of {len(values)})" if 0 < found.n < len(values) else "")
 
 
-def summary_metrics() -> dict[str, Metric]:
+def summary_metrics(cases: Sequence[CaseMetrics] = ()) -> dict[str, Metric]:
     """Metrics of the first table of a report: all but those that add up over robots."""
-    return {name: metric for name, metric in known_metrics().items() if metric.mean != "sum" or metric.per == "case"}
+    known = known_metrics(cases).items()
+    return {name: metric for name, metric in known if metric.mean != "sum" or metric.per == "case"}
 
 
 def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> Table:
@@ -108,7 +109,7 @@ def summary_table(cases: Sequence[CaseMetrics], chosen: Sequence[str] = ()) -> T
             return text
         return text, f"× {ratio_words(share)}"
 
-    shown = {name: metric for name, metric in summary_metrics().items() if not chosen or name in chosen}
+    shown = {name: metric for name, metric in summary_metrics(cases).items() if not chosen or name in chosen}
     rows = [
         Row((metric.head + " of the case" * (metric.per == "case"), *(cell(runs, name) for runs in grouped.values())))
         for name, metric in shown.items()
@@ -181,8 +182,8 @@ def whole_tables(cases: Sequence[CaseMetrics]) -> tuple[Table, ...]:
     ]
     sums = [
         Row((metric.head, *(number(_total(runs, name)) for runs in by_case(cases).values())))
-        for name, metric in known_metrics().items()
-        if name not in summary_metrics()
+        for name, metric in known_metrics(cases).items()
+        if metric.mean == "sum" and metric.per == "robot"
     ]
     tables.append(Table((f"Sum over all robots{' and seeds' if several else ''}", *by_case(cases)), tuple(sums)))
     # a formation that was never acquired is a result; without errors of links there is none
@@ -308,10 +309,8 @@ def _robot_table(case: str, runs: Sequence[CaseMetrics]) -> Table:
     left_out = {name for run in runs for name in (*run.leaders, *run.died)}
     columns: list[Column] = [
         (metric.head, _measured(name))
-        for name, metric in known_metrics().items()
-        if metric.per == "robot"
-        and (metric.shown or metric.figure)
-        and (name in summary_metrics() or _total(runs, name))
+        for name, metric in known_metrics(runs).items()
+        if metric.per == "robot" and (metric.shown or metric.figure) and (metric.mean != "sum" or _total(runs, name))
     ]
     later = range(1, max(len(run.starts_s) for run in runs))
     columns += [(f"{_phase(runs, k).strip()} [s]", partial(_acquired_again, k=k)) for k in later]

@@ -71,6 +71,7 @@ class Log:
     # of laws that remember, by name: variables (K, N, k), and measures (K, N), NaN where unknown; empty if lean
     memory: Mapping[str, Array] = field(default_factory=dict)
     measures: Mapping[str, Array] = field(default_factory=dict)
+    velocities: tuple[bool, ...] = ()  # (N) robots whose law ordered a velocity at its last step
     centre: CentreLog | None = None  # None if each robot decides for itself
     incidents: tuple[tuple[int, Incident], ...] = ()  # hazards, each with the row of its robot, in order of time
 
@@ -296,6 +297,7 @@ class Flight:
             ended=self._tick * self.dt - begin,
             memory=_columns([[memory for memory, _ in each] for each in self._remembered]),
             measures=_columns([[measures for _, measures in each] for each in self._remembered]),
+            velocities=tuple(law is not None and law.control.velocity is not None for law in self._laws),
             incidents=tuple(
                 (row, each._replace(time=each.time - begin))
                 for row, each in sorted(incidents, key=lambda pair: pair[1].time)

@@ -86,12 +86,21 @@ def explain(
 
 
 def _print_entries(entries: Sequence[Entry]) -> None:
-    """Lines of a table, one for each entry: cut at a terminal, in full for a file or a pipe."""
+    """Lines of a table, one for each entry at its top: cut at a terminal, in full for a file or a pipe."""
+    below: dict[str, int] = {}  # entries that others hold, by the first of these
     for entry in entries:
+        holder = next((key for key in below if entry.key.startswith((f"{key}.", f"{key}("))), None)
+        below[holder or entry.key] = below[holder] + 1 if holder else 0
+    for entry in (each for each in entries if each.key in below):
         default = f"default: {entry.default}" if entry.default else ""
-        known = ", ".join(filter(None, (entry.limits, default)))
+        more = f"{below[entry.key]} keys below" if below[entry.key] else ""
+        limits = "" if entry.limits.startswith("matches") else entry.limits
+        known = ", ".join(filter(None, (limits, default, more)))
         text = f"{entry.key}  {entry.text}" + (f" [{known}]" if known else "")
         print(textwrap.shorten(text, WIDEST if sys.stdout.isatty() else len(text), placeholder=" ..."))
+    if whole := next((key for key, count in below.items() if count), ""):
+        name = whole.replace("(", ".").replace(")", "")
+        print(f"\n`./zenpark explain {name}`, and so on, for the keys below; --json prints all {len(entries)}")
 
 
 @app.command(name="list", epilog=example("list", "list --json"))

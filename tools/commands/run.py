@@ -453,7 +453,8 @@ def _case_line(name: str, runs: Sequence[Run], found: dict[str, Any]) -> str:
         line += ", no link was measured"
     else:
         line += f", IAE {mean['iae']} m s, RMSE {mean['rmse']} m, {_acquired(mean['acquired_s'], measured)}"
-    added = {name: metric for name, metric in foreign_metrics().items() if metric.shown and name in mean}
+    foreign = foreign_metrics(measured).items()
+    added = {name: metric for name, metric in foreign if metric.shown and name in mean}
     line += "".join(f", {metric.label} {mean[name]} {metric.unit}".rstrip() for name, metric in added.items())
     line += f", lost {sum(each.lost for each in measured)}"
     if missed := sum(each.missed_deadlines for each in measured):

@@ -1,12 +1,17 @@
 """Errors of a tick name the plug-in to blame."""
 
+from math import nan
 from pathlib import Path
+from typing import ClassVar
 
 import msgspec
 import pytest
 
-from agents.plugins.calls import explain, failure, wrong
+from agents.formation.link import BY_NOTHING, Link
+from agents.plugins.calls import explain, failure, unknown_reads, wrong
+from agents.plugins.law import Control, Law, NeighbourView, RobotFacts, Said, View
 from agents.plugins.registry import PluginError
+from agents.vectors import ZERO
 
 
 class Spring(msgspec.Struct, frozen=True):
@@ -81,3 +86,40 @@ def test_other_errors_stay_what_they_are():
 def test_wrong_result_is_shown(result, text):
     error = wrong("law", LAW["short"], "pull", result, "three numbers")
     assert str(error) == f"`pull` of the law Spring must give three numbers, not {text} ({__file__})"
+
+
+class Reader(Law):
+    """A law that reads one thing of what it sees."""
+
+    SAYS: ClassVar = {"x": Said()}
+    reads: str
+
+    def step(self, view, memory):
+        found = {
+            "distance": lambda: [each.link.distance for each in view.neighbours],
+            "bearing": lambda: [each.link.bearing for each in view.known()],
+            "said": lambda: [each.said["x"] for each in view.neighbours],
+            "target": lambda: view.target,
+            "position": lambda: [each.position for each in view.neighbours],
+        }[self.reads]()
+        return Control(velocity=(nan * len(found), 0.0, nan))
+
+
+@pytest.mark.parametrize(
+    ("reads", "words"),
+    [
+        ("distance", 'link.distance, unknown with NEEDS = "nothing": give the law NEEDS = "distance"'),
+        ("bearing", 'link.bearing, unknown with NEEDS = "nothing": give the law NEEDS = "bearing"'),
+        ("said", "said['x'] of neighbours that have not said it yet: ask view.known for them"),
+        ("target", "view.target of a robot without a plan: ask math.isfinite before"),
+        ("position", ""),
+    ],
+)
+def test_unknown_reads_name_field_and_remedy(reads, words):
+    link = Link(nan, wants=BY_NOTHING)
+    view = View(
+        RobotFacts("A", 0, 2, False, 1.0, 0.1), {"x": (0.0,)},
+        [NeighbourView(1, "B", ZERO, ZERO, 0.0, 0.0, {"x": (nan,)}, link)],
+    )  # fmt: skip
+    law = Reader(reads)
+    assert unknown_reads(law, lambda watched: law.step(watched(view), {})) == (words and f": Reader reads {words}")

@@ -201,6 +201,15 @@ def test_changeable_plug_in_is_refused(foreign):
         registry.build(foreign, "keeper")
 
 
+def test_plug_ins_inherit_frozen_from_their_base(monkeypatch):
+    class Plain(Law):
+        gain: float = 1.0
+
+    monkeypatch.setattr(registry, "load", lambda group, name: Plain)
+    with pytest.raises(AttributeError, match="immutable"):
+        registry.build(LAWS, "plain").gain = 2.0
+
+
 def test_unusable_plug_ins_are_named_with_remedy(foreign, monkeypatch):
     monkeypatch.setattr(registry, "CHOSEN", (foreign,))
     lines = registry.unusable(registry.struct)

@@ -38,6 +38,12 @@ PARK, TRIANGLE = "robotic-park", "triangle"
 # ------------------------------------------------------------------ experiments that work
 
 
+def test_laws_of_velocities_are_not_clamped():
+    plan = document.read(TRIANGLE, ['formation.law="consensus"']).plan
+    found = figures(plan)
+    assert found.speed_available == min(kind.speed for kind in plan.kinds)
+
+
 @pytest.fixture(scope="module")
 def examined():
     """Findings on the reference experiment and figures of both cases."""

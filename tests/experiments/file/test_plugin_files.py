@@ -1,6 +1,7 @@
 """Plug-ins in a Python file beside an experiment: adopted where it is read, loaded by digest, and nowhere else."""
 
 import os
+import re
 import shutil
 import sys
 
@@ -14,6 +15,7 @@ from experiments.file.structure import plugin_files
 from experiments.metrics.criteria import judge
 from experiments.recording import bundle
 from experiments.recording.reader import RecordingError
+from experiments.report.tables import summary_table
 from experiments.run import reopen, simulate
 from experiments.sweep import runs
 from tools.main import main
@@ -286,13 +288,23 @@ def refused_criterion(task, metric):
     return refused(task)
 
 
-def test_a_run_keeps_the_metrics_of_its_criteria(spread, tmp_path, monkeypatch):
+def test_a_run_keeps_the_metrics_of_its_criteria(spread, tmp_path, monkeypatch, capsys):
     spread.write_text(TASK + '[[criteria]]\nmetric = "spread.py:Spread"\nat_most = 1.0\n', "utf-8")
     out = tmp_path / "run"
+    out.mkdir()  # an empty folder is taken
     assert call(monkeypatch, "run", spread, "--virtual", "--no-report", "--out", out) == 0
+    (shown,) = re.findall(r"^ +fast: f .*, Spread (0\.\d+) m, .*$", capsys.readouterr().out, re.MULTILINE)
     assert (out / "spread.py").is_file()
     assert "spread.py:Spread" in (out / "metrics.csv").read_text("utf-8").partition("\n")[0]
-    assert reopen(out).summary()["passed"] is True
+    for case in msgspec.json.decode((out / "metrics.json").read_bytes()):
+        (judged,) = case["judged"]
+        assert judged["what"] == f"Spread [m] in {case['case']}"
+        assert judged["value"] == case["mean"]["spread.py:Spread"]
+        assert judged["passed"] is True
+    again = reopen(out)
+    assert again.summary()["passed"] is True
+    (row,) = [row for row in summary_table([again.metrics["fast"]]).rows if row.cells[0] == "Spread [m] of the case"]
+    assert float(row.cells[1]) == pytest.approx(float(shown), rel=1e-2)
 
 
 OTHERS = """

@@ -6,6 +6,7 @@ from importlib.metadata import EntryPoint
 import pytest
 from typer.testing import CliRunner
 
+from agents.body.kinds import KINDS
 from agents.plugins import registry
 from experiments.file import reference
 from experiments.file.document import loads
@@ -77,6 +78,24 @@ def test_no_key_is_explained_twice():
 def test_a_pipe_receives_the_whole_texts():
     said = CliRunner().invoke(app, ["explain", "formation.law"])
     assert not any(line.endswith("...") for line in said.output.splitlines())
+
+
+def test_table_is_explained_on_one_screen():
+    lines = CliRunner().invoke(app, ["explain", "formation"]).output.splitlines()
+    assert len(lines) < 24
+    keys = [line.partition(" ")[0] for line in lines]
+    assert {"formation.law", "formation.gain", "formation.links"} <= {*keys}
+    assert not any("(" in key for key in keys)
+    assert "`./zenpark explain formation.law`" in lines[-1]
+    assert len(CliRunner().invoke(app, ["explain", "formation", "--json"]).output) > 30_000
+
+
+def test_kind_is_explained_with_its_dynamics():
+    said = CliRunner().invoke(app, ["explain", "ackermann"]).output
+    kind = KINDS["ackermann"]
+    for name in ("response", "turn_response", "lag"):
+        assert f"{name} = {getattr(kind, name):.3g}" in " ".join(said.split())
+    assert f"turning radius {kind.turn_radius:.3g} m" in said
 
 
 def test_explain_without_a_key_lists_the_top_level():
